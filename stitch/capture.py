@@ -1,0 +1,58 @@
+"""Scans of one session with the robot's poses: what every stage after reading works on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.scan import Scan, prepare
+from stitch.session import Session
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The V views of one session. `T_reference_scanner = T_reference_mount @ T_mount_scanner`.
+
+    The reference frame is the flange (eye_to_hand) or the base (eye_in_hand); the mount frame, on
+    which the hand-eye sits, is the other one.
+    """
+
+    name: str
+    scans: tuple[Scan, ...]
+    T_reference_mount: Array  # (V, 4, 4) from the robot
+    T_reference_flange: Array  # (V, 4, 4) carries a twist of the flange into the reference frame
+
+    @property
+    def spacing(self) -> float:
+        """Median distance between neighbouring points, length_unit."""
+        return float(np.median([scan.spacing for scan in self.scans]))
+
+    def poses(self, T_mount_scanner: Array) -> Array:
+        """T_reference_scanner (V, 4, 4) under a hand-eye."""
+        return np.asarray(self.T_reference_mount @ T_mount_scanner)
+
+    def without(self, left_out: int) -> "Capture":
+        """The capture less one view."""
+        keep = [v for v in range(len(self.scans)) if v != left_out]
+        return replace(
+            self,
+            scans=tuple(self.scans[v] for v in keep),
+            T_reference_mount=self.T_reference_mount[keep],
+            T_reference_flange=self.T_reference_flange[keep],
+        )
+
+
+def capture(session: Session) -> Capture:
+    """Prepare the scans of a cloud session and place them on the chain of frames."""
+    T_base_flange = np.array([view.T_base_flange for view in session.views])
+    return place(session.name, prepare(session), T_base_flange, session.mount)
+
+
+def place(name: str, scans: Sequence[Scan], T_base_flange: Array, mount: str) -> Capture:
+    """A capture from scans and flange poses (V, 4, 4)."""
+    if mount == "eye_in_hand":
+        return Capture(name, tuple(scans), T_base_flange, T_base_flange)
+    still = np.broadcast_to(np.eye(4), T_base_flange.shape)
+    return Capture(name, tuple(scans), frames.inverse(T_base_flange), still)

@@ -1,0 +1,62 @@
+"""`stitch check SESSION`: read everything, compute nothing, say what is there or what is wrong."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch.errors import InputError
+from stitch.session import Session, load_session
+
+
+def check(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+) -> None:
+    """Read sessions completely and say what is wrong; computes nothing."""
+    facts, errors = [], []
+    for path in sessions:
+        try:
+            facts.append(summary(load_session(path)))
+        except InputError as error:
+            errors.append(str(error))
+    if as_json:
+        print(json.dumps({"sessions": facts, "errors": errors}, indent=1))
+    else:
+        _print(facts)
+    for error in errors:
+        print(f"stitch: {error}", file=sys.stderr)
+    if errors:
+        raise typer.Exit(2)
+
+
+def summary(session: Session) -> dict[str, object]:
+    """What a session holds, in plain numbers."""
+    clouds = [view.cloud.points for view in session.views if view.cloud is not None]
+    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds]
+    return {
+        "session": session.name,
+        "mount": session.mount,
+        "length_unit": session.length_unit,
+        "views": len(session.views),
+        "points": int(sum(len(points) for points in clouds)),
+        "median_range": round(float(np.median(ranges)), 3) if ranges else None,
+        "joints": session.views[0].joints is not None,
+        "robot": session.robot.name if session.robot else None,
+        "hand_eye_given": session.scanner.T_mount is not None,
+        "covariates": sorted({name for view in session.views for name in view.covariates}),
+    }
+
+
+def _print(facts: list[dict[str, object]]) -> None:
+    console = Console(stderr=True)
+    for fact in facts:
+        table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
+        for key, value in fact.items():
+            table.add_row(key, ", ".join(value) if isinstance(value, list) else str(value))
+        console.print(table)

@@ -1,0 +1,68 @@
+"""Progress on a terminal, as one of the recorders."""
+
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from stitch.frames import Array
+from stitch.recorder import Recorder
+from stitch.result import Run, StageResult
+from stitch.session import Session
+
+MICROMETRES = {"mm": 1e3, "m": 1e6}
+
+
+class Progress:
+    """One changing line on standard error; silent when that is no terminal."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        self.status = self.console.status("reading") if self.console.is_terminal else None
+        self.to_um = 1e3
+
+    def start(self, session: Session) -> None:
+        """Name what is being done."""
+        self.to_um = MICROMETRES[session.length_unit]
+        if self.status:
+            self.status.start()
+            self.status.update(f"{session.name}: {len(session.views)} views, finding the hand-eye")
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Show where the iteration stands."""
+        if self.status:
+            self.status.update(f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms, partners within {gate * self.to_um:.4g} µm")
+
+    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+        """A stage has ended."""
+
+    def finish(self, run: Run) -> None:
+        """Clear the line."""
+        if self.status:
+            self.status.stop()
+
+
+class Tee:
+    """Several recorders at once."""
+
+    def __init__(self, recorders: Sequence[Recorder]) -> None:
+        self.recorders = recorders
+
+    def start(self, session: Session) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.start(session)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.iteration(stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.stage(result, poses, residuals)
+
+    def finish(self, run: Run) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.finish(run)

@@ -1,0 +1,90 @@
+"""`stitch run SESSION...`: coarse → correct → register → fuse, one run folder per call."""
+
+import json
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import run_folder
+from stitch.cli.progress import MICROMETRES, Progress, Tee
+from stitch.errors import InputError
+from stitch.mesh import write_mesh
+from stitch.model import read_model, write_model
+from stitch.pipeline import run_rig
+from stitch.recorder import Recorder
+from stitch.result import Run
+from stitch.session import Session, load_session
+
+
+def run(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders of one rig.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")] = None,
+    hand_eye: Annotated[Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")] = None,
+    effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
+    recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")] = False,
+) -> None:  # fmt: skip
+    """Find and correct the hand-eye, register the views, fuse them."""
+    if effects:
+        raise InputError(f"--effects {effects}: this version has no effects to fit; leave the option out")
+    loaded = [load_session(path) for path in sessions]
+    names = [session.name for session in loaded]
+    if len(set(names)) < len(names):
+        raise InputError(f"two sessions are named {max(names, key=names.count)!r}; give each its own name in session.toml")
+    target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
+    model = read_model(hand_eye) if hand_eye else None
+    with run_folder.new_folder(target) as scratch:
+        folders = [scratch] if len(loaded) == 1 else [scratch / name for name in names]
+        for folder in folders:
+            folder.mkdir(exist_ok=True)
+        runs = run_rig(loaded, model, [_recorder(folder, recording) for folder in folders])
+        for result, folder in zip(runs, folders, strict=True):
+            _write(result, folder, mesh)
+        if len(runs) > 1:
+            write_model(run_folder.model_of(runs[0]), scratch / "model.toml")
+    documents = [run_folder.result_document(result) for result in runs]
+    if as_json:
+        print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1))
+    else:
+        show(runs, target)
+
+
+def _recorder(folder: Path, recording: bool) -> Recorder:
+    recorders: list[Recorder] = [Progress()]
+    if recording:
+        recorders += [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
+    return Tee(recorders)
+
+
+def _write(result: Run, folder: Path, mesh: bool) -> None:
+    run_folder.write_run(result, folder)
+    if mesh:
+        write_mesh(result.fused, folder / "mesh.ply")
+    for entry in entry_points(group="stitch.reports"):
+        entry.load()(result, folder / "report.html")
+
+
+def show(runs: list[Run], target: Path) -> None:
+    """The stage table, the verdict and the paths, for people."""
+    console = Console(stderr=True)
+    for result in runs:
+        session: Session = result.session
+        to_um = MICROMETRES[session.length_unit]
+        table = Table(title=session.name, title_justify="left")
+        for heading in ("stage", "rms (µm)", "correspondences", "iterations", "seconds"):
+            table.add_column(heading, justify="left" if heading == "stage" else "right")
+        for s in result.stages:
+            table.add_row(s.name, f"{s.rms * to_um:.1f}", str(s.correspondences), str(s.iterations), f"{s.seconds:.2f}")
+        console.print(table)
+        console.print(result.verdict, soft_wrap=True, highlight=False)
+        for line in (*(f"Not observable from these motions: {u}." for u in result.unobservable), *result.notes):
+            console.print(line, soft_wrap=True, highlight=False)
+        folder = target if len(runs) == 1 else target / session.name
+        for name in ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"):
+            if (folder / name).exists():
+                console.print(f"  {folder / name}", soft_wrap=True, highlight=False)

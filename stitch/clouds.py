@@ -1,0 +1,86 @@
+"""Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch.cloud import Cloud
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.pcd import read_pcd
+
+_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+_TEXT = (".xyz", ".csv", ".txt", ".asc")
+
+
+def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
+    """Read one scan; `scale` turns the file's unit into the session's.
+
+    Raises:
+        InputError: missing or broken file, no x, y, z, no points, or points that are not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such cloud file")
+    readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": _read_ply, ".pcd": read_pcd}
+    readers |= dict.fromkeys(_TEXT, _read_text)
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use PLY, PCD, XYZ or CSV")
+    try:
+        columns = reader(path)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read ({error or type(error).__name__}); export it again") from None
+    return _cloud(path, columns, scale)
+
+
+def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
+    missing = [axis for axis in "xyz" if axis not in columns]
+    if missing:
+        raise InputError(f"{path}: no column {', '.join(missing)}; a cloud needs x, y, z")
+    points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64)
+    if not len(points):
+        raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
+    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    if bad:
+        raise InputError(f"{path}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
+    normals = None
+    for names in _NORMALS:
+        if all(name in columns for name in names):
+            normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)
+    scalars = {name: np.asarray(column, np.float64) for name, column in columns.items() if column.ndim == 1}
+    return Cloud(points * scale, normals, scalars)
+
+
+def _read_ply(path: Path) -> dict[str, Array]:
+    from plyfile import PlyData
+
+    data: NDArray[np.void] = PlyData.read(path)["vertex"].data
+    # List properties have no column of numbers.
+    return {name: data[name] for name in data.dtype.names or () if data.dtype[name] != object}
+
+
+def _read_text(path: Path) -> dict[str, Array]:
+    """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …"""
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    if not lines:
+        return {axis: np.empty(0) for axis in "xyz"}
+    separator = next((s for s in ",;" if s in lines[0]), None)
+    first = [cell.strip() for cell in lines[0].split(separator)]
+    header = any(_not_number(cell) for cell in first)
+    names = [name.lower() if name.lower() in "xyz" else name for name in first]
+    if not header:
+        names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
+    table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
+    return dict(zip(names, table.T, strict=True))
+
+
+def _not_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return True
+    return False

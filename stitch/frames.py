@@ -1,0 +1,135 @@
+"""Rigid motions SE(3) as 4x4 arrays; `T_a_b` maps coordinates of frame b into frame a.
+
+A twist is ξ = (rotation, translation), rotation first, in rad and length units. All functions
+broadcast over leading axes and compute in float64. Formulas: Barfoot, *State Estimation for
+Robotics* (2017), chapter 7, reordered to rotation first.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+# Below this angle (rad) the closed forms lose digits; their Taylor series to θ⁴ are exact there.
+_SMALL_ANGLE = 1e-3
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices: `skew(v) @ w == cross(v, w)`; (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def make(rotation: Array, translation: Array) -> Array:
+    """4x4 transforms from rotation matrices (..., 3, 3) and translations (..., 3)."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    T = np.zeros((*shape, 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
+    return T
+
+
+def _left_jacobian_terms(angle: Array) -> tuple[Array, Array]:
+    """(1−cos θ)/θ² and (θ−sin θ)/θ³, by series near zero."""
+    small = angle < _SMALL_ANGLE
+    safe = np.where(small, 1.0, angle)
+    square = angle**2
+    first = np.where(small, 0.5 - square / 24 + square**2 / 720, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6 - square / 120 + square**2 / 5040, (safe - np.sin(safe)) / safe**3)
+    return first, second
+
+
+def exp(xi: Array) -> Array:
+    """Exponential of twists (..., 6) -> transforms (..., 4, 4)."""
+    xi = np.asarray(xi, float)
+    rotation, translation = xi[..., :3], xi[..., 3:]
+    angle = np.linalg.norm(rotation, axis=-1)
+    first, second = _left_jacobian_terms(angle)
+    hat = skew(rotation)
+    hat2 = hat @ hat
+    sinc = np.sinc(angle / np.pi)
+    eye = np.eye(3)
+    R = eye + sinc[..., None, None] * hat + first[..., None, None] * hat2
+    V = eye + first[..., None, None] * hat + second[..., None, None] * hat2
+    return make(R, np.einsum("...ij,...j->...i", V, translation))
+
+
+def log(T: Array) -> Array:
+    """Logarithm of transforms (..., 4, 4) -> twists (..., 6); rotation angle in [0, π]."""
+    T = np.asarray(T, float)
+    R = T[..., :3, :3]
+    rotation = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    angle = np.linalg.norm(rotation, axis=-1)
+    first, second = _left_jacobian_terms(angle)
+    hat = skew(rotation)
+    V = np.eye(3) + first[..., None, None] * hat + second[..., None, None] * (hat @ hat)
+    translation = np.linalg.solve(V, T[..., :3, 3:])[..., 0]
+    return np.concatenate([rotation, translation], axis=-1)
+
+
+def inverse(T: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4), without a general matrix inverse."""
+    Rt = np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2)
+    return make(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
+
+
+def adjoint(T: Array) -> Array:
+    """(..., 6, 6) with `T · exp(ξ) · T⁻¹ = exp(adjoint(T) @ ξ)`, rotation-first twists."""
+    T = np.asarray(T, float)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = skew(T[..., :3, 3]) @ R
+    return out
+
+
+def transform(T: Array, points: Array) -> Array:
+    """Map points (..., N, 3) by T (..., 4, 4)."""
+    T = np.asarray(T, float)
+    return np.asarray(points) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def rotate(T: Array, vectors: Array) -> Array:
+    """Turn directions (..., N, 3) by the rotation of T (..., 4, 4)."""
+    return np.asarray(vectors) @ np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2)
+
+
+def from_quaternion(position: Array, quaternion: Array) -> Array:
+    """Poses from positions (..., 3) and quaternions (..., 4) in the order x, y, z, w."""
+    quaternion = np.asarray(quaternion, float)
+    R = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
+    return make(R.reshape(*quaternion.shape[:-1], 3, 3), position)
+
+
+def to_quaternion(T: Array) -> Array:
+    """Quaternions (..., 4) in the order x, y, z, w, with w ≥ 0."""
+    R = np.asarray(T, float)[..., :3, :3]
+    quaternion = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return quaternion.reshape(*R.shape[:-2], 4)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation closest to a 3x3 matrix in the Frobenius norm (polar factor by SVD)."""
+    U, _, Vt = np.linalg.svd(np.asarray(matrix, float))
+    sign = np.linalg.det(U @ Vt)
+    U = U.copy()
+    U[..., :, 2] *= np.sign(sign)[..., None]
+    return np.asarray(U @ Vt)
+
+
+def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
+    """True if one 4x4 matrix is a proper rigid motion within `tolerance`."""
+    T = np.asarray(T, float)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < tolerance
+    return bool(orthonormal and np.linalg.det(R) > 0 and np.abs(T[3] - [0, 0, 0, 1]).max() < tolerance)
+
+
+def angle_between(T_a: Array, T_b: Array) -> Array:
+    """Rotation angle (rad) between transforms (..., 4, 4)."""
+    return np.asarray(np.linalg.norm(log(inverse(T_a) @ T_b)[..., :3], axis=-1))

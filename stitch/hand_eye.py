@@ -1,0 +1,115 @@
+"""The hand-eye from per-view evidence: generalised least squares, covariance, held-out error.
+
+The poses of the views scatter by the robot's repeatability, which no number of points averages
+out: views are the samples. Estimates with one view left out at a time give the held-out error and
+show whether the covariance is too small for these data (jackknife; Efron & Stein 1981): a robot
+whose pose errors are not independent from view to view has a larger one, never a smaller.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch import frames
+from stitch.capture import Capture
+from stitch.frames import Array
+from stitch.repeatability import PoseChannel, Repeatability, covariance_of, estimate, pose_channel
+from stitch.solve import Gram, pair_squares
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """Hand-eye and its statistics; twists are right perturbations T·exp(ξ), rotation first."""
+
+    T_mount: Array  # (4, 4) T_mount_scanner
+    covariance: Array  # (6, 6)
+    inflation: float  # factor on the covariance that the left-out views asked for, ≥ 1
+    repeatability: tuple[Repeatability, ...]  # per capture
+    heldout_ratio: float  # rms of left-out views over rms of the fit, same correspondences
+
+
+def jacobian(poses: Array, centre: Array) -> Array:
+    """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
+    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ poses)))
+
+
+def fit_hand_eye(captures: Sequence[Capture], grams: Sequence[Gram], T_mount: Array) -> HandEye:
+    """One generalised least-squares step over the pose channels of all captures.
+
+    Args:
+        grams: normal equations at `T_mount`, one per capture.
+        T_mount: (4, 4) hand-eye at which the correspondences were measured.
+    """
+    channels = [
+        pose_channel(g, c.poses(T_mount), c.T_reference_flange) for c, g in zip(captures, grams, strict=True)
+    ]
+    scatter = [estimate(channel) for channel in channels]
+    prior = _weak_prior(captures, grams, T_mount)
+    blocks = [_information(ch, s) for ch, s in zip(channels, scatter, strict=True)]
+    xi, covariance = _combine(blocks, prior)
+    left_out = []
+    outside = np.zeros(2)
+    for k, (c, g, s) in enumerate(zip(captures, grams, scatter, strict=True)):
+        for v in range(g.views):
+            blocks_v = [*blocks[:k], _without(c, g, s, T_mount, v), *blocks[k + 1 :]]
+            xi_v, _ = _combine(blocks_v, prior)
+            left_out.append(xi_v)
+            outside += _view_squares(c, g, T_mount, v, xi_v, xi)
+    inflation = _jackknife_inflation(np.array(left_out), covariance)
+    ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+    return HandEye(T_mount @ frames.exp(xi), covariance * inflation, inflation, tuple(scatter), ratio)
+
+
+def _weak_prior(captures: Sequence[Capture], grams: Sequence[Gram], T_mount: Array) -> Array:
+    """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else."""
+    ranges = [
+        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), g.centre[None]), axis=-1)
+        for c, g in zip(captures, grams, strict=True)
+    ]
+    distance = float(np.median(np.concatenate(ranges)))
+    return np.diag([1.0] * 3 + [distance**-2.0] * 3)
+
+
+def _information(channel: PoseChannel, scatter: Repeatability) -> tuple[Array, Array]:
+    """Information matrix and vector of ξ from one pose channel."""
+    sigma = covariance_of(channel, scatter)
+    whitened = np.linalg.solve(sigma, np.column_stack([channel.hand_eye, channel.z]))
+    return channel.hand_eye.T @ whitened[:, :6], channel.hand_eye.T @ whitened[:, 6]
+
+
+def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
+    information = prior + sum(block[0] for block in blocks)
+    covariance = np.linalg.inv(information)
+    return covariance @ sum(block[1] for block in blocks), covariance
+
+
+def _without(c: Capture, g: Gram, s: Repeatability, T_mount: Array, v: int) -> tuple[Array, Array]:
+    """The information of one capture less one view, at the repeatability of all."""
+    keep = (g.pairs != v).all(axis=1)
+    pairs = g.pairs[keep] - (g.pairs[keep] > v)
+    fewer = replace(
+        g, views=g.views - 1, pairs=pairs, matrix=g.matrix[keep], vector=g.vector[keep],
+        square=g.square[keep], weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
+    )  # fmt: skip
+    if not len(pairs):
+        return np.zeros((6, 6)), np.zeros(6)
+    rest = c.without(v)
+    return _information(pose_channel(fewer, rest.poses(T_mount), rest.T_reference_flange), s)
+
+
+def _view_squares(c: Capture, g: Gram, T_mount: Array, v: int, xi_v: Array, xi: Array) -> Array:
+    """Σ w e² of the pairs of view v: under the fit without it, and under the fit with it."""
+    touched = (g.pairs == v).any(axis=1)
+    J = jacobian(c.poses(T_mount), g.centre)
+    return np.array([pair_squares(g, (J @ x).reshape(-1, 6))[touched].sum() for x in (xi_v, xi)])
+
+
+def _jackknife_inflation(left_out: Array, covariance: Array) -> float:
+    """Mean ratio of the jackknife's covariance to the model's over the six directions, at least 1."""
+    count = len(left_out)
+    if count < 4:
+        return 1.0
+    centred = left_out - left_out.mean(axis=0)
+    jackknife = (count - 1) / count * centred.T @ centred
+    return float(max(1.0, np.trace(np.linalg.solve(covariance, jackknife)) / 6))

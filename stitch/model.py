@@ -1,0 +1,101 @@
+"""The model of a cell: hand-eye and effects in use; `model.toml` is its form for people."""
+
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from stitch.errors import InputError
+from stitch.frames import Array, is_rigid
+
+FORMAT = "stitch-model/1"
+_HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
+# coordinates into the {carrier} frame. sigma and covariance belong to a right perturbation
+# T·exp(ξ), ξ = (rotation in rad, translation in {unit}), in the scanner frame.
+"""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Hand-eye (4, 4) in length_unit with its covariance, and the effects with their parameters."""
+
+    length_unit: str
+    mount: str  # eye_to_hand | eye_in_hand
+    T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
+    T_mount_coarse: Array  # (4, 4)
+    covariance: Array  # (6, 6)
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+def write_model(model: Model, path: Path) -> None:
+    """Write `model.toml`, commented, with all digits."""
+    carrier = "base" if model.mount == "eye_to_hand" else "flange"
+    document = {
+        "format": FORMAT,
+        "length_unit": model.length_unit,
+        "mount": model.mount,
+        "hand_eye": {
+            "corrected": model.T_mount.tolist(),
+            "coarse": model.T_mount_coarse.tolist(),
+            "sigma": np.sqrt(np.diag(model.covariance)).tolist(),
+            "covariance": model.covariance.tolist(),
+        },
+        "effects": model.effects,
+    }
+    header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
+    path.write_text(header + tomli_w.dumps(document), encoding="utf-8")
+
+
+def read_model(path: Path) -> Model:
+    """Read `model.toml`, or that of a run folder.
+
+    Raises:
+        InputError: the file is missing, not a model, or its hand-eye is not a rigid motion.
+    """
+    path = path / "model.toml" if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(f"{path}: no such model; name a run folder that `stitch run` wrote")
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    if document.get("format") != FORMAT:
+        raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"')
+    hand_eye = document.get("hand_eye", {})
+    corrected = _matrix(path, hand_eye, "corrected", 4)
+    coarse = _matrix(path, hand_eye, "coarse", 4) if "coarse" in hand_eye else corrected
+    for name, T in (("corrected", corrected), ("coarse", coarse)):
+        if not is_rigid(T):
+            raise InputError(f"{path}: hand_eye.{name} is not a rigid motion; its 3x3 part must be a rotation")
+    covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
+    return Model(
+        str(document.get("length_unit")), str(document.get("mount")), corrected, coarse, covariance,
+        document.get("effects", {}),
+    )  # fmt: skip
+
+
+def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
+    try:
+        matrix = np.array(table[key], float)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: hand_eye.{key} must be a {size}x{size} list of numbers") from None
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise InputError(f"{path}: hand_eye.{key} must be {size}x{size} finite numbers, is {matrix.shape}")
+    return matrix
+
+
+def in_unit(model: Model, length_unit: str) -> Model:
+    """The model with lengths in another unit."""
+    if model.length_unit == length_unit:
+        return model
+    factor = {"mm": 1e-3, "m": 1.0}[model.length_unit] / {"mm": 1e-3, "m": 1.0}[length_unit]
+    scale = np.array([1.0] * 3 + [factor] * 3)
+    moved = []
+    for T in (model.T_mount, model.T_mount_coarse):
+        T = T.copy()
+        T[:3, 3] *= factor
+        moved.append(T)
+    return Model(length_unit, model.mount, moved[0], moved[1], model.covariance * np.outer(scale, scale), model.effects)

@@ -1,0 +1,58 @@
+"""Everything two views of one capture have in common, under one set of poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.capture import Capture
+from stitch.errors import NoResultError
+from stitch.frames import Array
+from stitch.match import Match, match, overlapping_pairs
+from stitch.solve import Gram, gram, robust_scale
+
+# Queries per view for the final normal equations and statistics.
+FINE_SAMPLES = 3000
+# Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
+_GATE_SPACINGS = 1.5
+_GATE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Correspondences of all overlapping pairs with their normal equations."""
+
+    pairs: list[tuple[int, int]]
+    matches: list[Match]
+    gram: Gram
+    gate: float
+
+
+def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Array]) -> Overlaps:
+    """Match all overlapping pairs within `gate` and accumulate their normal equations.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    pairs = overlapping_pairs(capture.scans, poses, gate)
+    matches = list(match(capture.scans, poses, pairs, gate, samples))
+    if not matches:
+        raise NoResultError(
+            f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
+            "and scanner.pose, or leave scanner.pose out to have it searched"
+        )
+    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
+    return Overlaps(pairs, matches, gram(matches, len(capture.scans), centre, robust_scale(matches)), gate)
+
+
+def next_gate(overlaps: Overlaps, capture: Capture) -> float:
+    """The distance that partners may have, from the spacing and the residuals' robust sigma."""
+    return _GATE_SPACINGS * capture.spacing + _GATE_SIGMAS * overlaps.gram.scale
+
+
+def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
+    """Root mean square over the correspondences of all captures, inside the robust gate."""
+    square = sum(o.gram.raw_square.sum() for o in overlaps)
+    return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))
+
+

@@ -1,0 +1,132 @@
+"""Serial robots: forward kinematics, joint axes, Jacobian and gravity torques, vectorised over poses.
+
+One joint is `before · Rz(q + theta) · after`: standard DH has before = 1 and after = Tz(d)Tx(a)Rx(α)
+(Denavit & Hartenberg 1955), modified DH before = Rx(α)Tx(a) and after = Tz(d) (Craig 1986), URDF
+before = origin with the joint axis turned to z and after = its inverse turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.errors import InputError
+from stitch.frames import Array
+
+METRES = {"mm": 1e-3, "m": 1.0}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A chain of n revolute joints. Lengths in length_unit, angles in rad, masses in kg."""
+
+    name: str
+    convention: str  # standard | modified | urdf
+    before: Array  # (n, 4, 4)
+    after: Array  # (n, 4, 4)
+    theta: Array  # (n,) offset added to the joint angle
+    mass: Array  # (n,) of link i, which joint i moves
+    com: Array  # (n, 3) in the link's own frame, after joint i
+    payload_mass: float
+    payload_com: Array  # (3,) in the flange frame
+    gravity: Array  # (3,) m/s² in the base frame
+    metres_per_unit: float
+    a: Array | None = None  # (n,) DH parameters, None for URDF
+    alpha: Array | None = None
+    d: Array | None = None
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.theta)
+
+    @property
+    def has_masses(self) -> bool:
+        """True if any link or payload mass is known, so that torques mean something."""
+        return bool(self.mass.any() or self.payload_mass)
+
+
+def elementary(axis: str, angle: Array = 0.0, shift: Array = 0.0) -> Array:
+    """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
+    angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
+    unit = np.eye(3)["xyz".index(axis)]
+    R = Rotation.from_rotvec(angle.reshape(-1, 1) * unit).as_matrix().reshape(*angle.shape, 3, 3)
+    return frames.make(R, shift[..., None] * unit)
+
+
+def robot_from_dh(
+    name: str, convention: str, joints: Sequence[dict[str, Any]], payload: dict[str, Any] | None,
+    gravity: Array, length_unit: str,
+) -> Robot:  # fmt: skip
+    """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
+
+    Raises:
+        InputError: unknown convention.
+    """
+    a, alpha, d, theta = (
+        np.array([float(j.get(key, 0.0)) for j in joints]) for key in ("a", "alpha_deg", "d", "theta_deg")
+    )
+    alpha, theta = np.radians(alpha), np.radians(theta)
+    still = np.broadcast_to(np.eye(4), (len(a), 4, 4))
+    if convention == "standard":
+        before, after = still, elementary("z", 0, d) @ elementary("x", alpha, a)
+    elif convention == "modified":
+        before, after = elementary("x", alpha, a), elementary("z", 0, d)
+    else:
+        raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
+    mass = np.array([float(j.get("mass", 0.0)) for j in joints])
+    com = np.array([j.get("com", (0.0, 0.0, 0.0)) for j in joints], float)
+    payload = payload or {}
+    return Robot(
+        name, convention, before, after, theta, mass, com, float(payload.get("mass", 0.0)),
+        np.array(payload.get("com", (0.0, 0.0, 0.0)), float), np.asarray(gravity, float),
+        METRES[length_unit], a, alpha, d,
+    )  # fmt: skip
+
+
+def link_frames(robot: Robot, joints: Array) -> Array:
+    """T_base_link (..., n+1, 4, 4) for joint angles (..., n) in rad; index 0 is the base itself."""
+    joints = np.asarray(joints, float)
+    out = [np.broadcast_to(np.eye(4), (*joints.shape[:-1], 4, 4))]
+    for i in range(robot.n_joints):
+        turn = elementary("z", joints[..., i] + robot.theta[i])
+        out.append(out[-1] @ robot.before[i] @ turn @ robot.after[i])
+    return np.stack(out, axis=-3)
+
+
+def forward(robot: Robot, joints: Array) -> Array:
+    """T_base_flange (..., 4, 4) for joint angles (..., n) in rad."""
+    return np.asarray(link_frames(robot, joints)[..., -1, :, :])
+
+
+def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
+    """A point on each joint axis and its direction, both (..., n, 3), in the base frame."""
+    axis_frame = link_frames(robot, joints)[..., :-1, :, :] @ robot.before
+    return axis_frame[..., :3, 3], axis_frame[..., :3, 2]
+
+
+def jacobian(robot: Robot, joints: Array) -> Array:
+    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first."""
+    point, axis = joint_axes(robot, joints)
+    T = forward(robot, joints)
+    lever = T[..., None, :3, 3] - point
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)[..., None, :, :]
+    turned = [(Rt @ v[..., None])[..., 0] for v in (axis, np.cross(axis, lever))]
+    return np.swapaxes(np.concatenate(turned, axis=-1), -1, -2)
+
+
+def gravity_torques(robot: Robot, joints: Array) -> Array:
+    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond."""
+    link = link_frames(robot, joints)
+    point, axis = joint_axes(robot, joints)
+    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
+    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
+    centres = np.concatenate([centres, tool[..., None, :]], axis=-2)
+    mass = np.append(robot.mass, robot.payload_mass)
+    # Link k is moved by joint i if k ≥ i; the payload by all.
+    beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]
+    moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
+    moment -= (beyond @ mass)[:, None] * point
+    return np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity)) * robot.metres_per_unit

@@ -1,0 +1,183 @@
+"""The run folder on disk: written whole or not at all."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from plyfile import PlyData, PlyElement
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.model import Model, write_model
+from stitch.result import FusedCloud, Run
+
+FORMAT = "stitch-run/1"
+_VERSIONS = ("stitch", "numpy", "scipy", "open3d-cpu", "open3d", "pykdtree", "rerun-sdk", "kiss-icp", "trimesh")
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
+
+    Raises:
+        InputError: `path` holds something that is not a run.
+    """
+    if path.exists() and not _is_run(path):
+        raise InputError(f"{path}: exists and is not a run folder; name another with -o")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield scratch
+        _replace(scratch, path)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _is_run(path: Path) -> bool:
+    return path.is_dir() and ((path / "model.toml").is_file() or not any(path.iterdir()))
+
+
+def _replace(scratch: Path, path: Path) -> None:
+    # A folder cannot replace a full one in one step: the old run steps aside until the new one stands.
+    scratch.chmod(0o777 & ~_umask())
+    old = path.with_name(f".{path.name}.old-{os.getpid()}")
+    if path.exists():
+        path.rename(old)
+    scratch.rename(path)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_run(run: Run, folder: Path) -> None:
+    """Write model.toml, result.json, ledger.json, stitched.ply and residuals.parquet into `folder`."""
+    write_model(model_of(run), folder / "model.toml")
+    _write_json(result_document(run), folder / "result.json")
+    _write_json(ledger(run), folder / "ledger.json")
+    write_cloud(run.fused, folder / "stitched.ply")
+    write_residuals(run, folder / "residuals.parquet")
+
+
+def model_of(run: Run) -> Model:
+    """The model that a run fitted."""
+    return Model(run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance)
+
+
+def result_document(run: Run) -> dict[str, Any]:
+    """result.json as a dictionary."""
+    unit = run.session.length_unit
+    return {
+        "format": FORMAT,
+        "session": str(run.session.path.resolve()),
+        "name": run.session.name,
+        "length_unit": unit,
+        "mount": run.session.mount,
+        "reference_frame": "flange" if run.session.mount == "eye_to_hand" else "base",
+        "hand_eye": run.T_mount.tolist(),
+        "hand_eye_coarse": run.T_mount_coarse.tolist(),
+        "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
+        "unobservable": list(run.unobservable),
+        "stages": [
+            {"name": s.name, "rms": s.rms, "correspondences": s.correspondences, "iterations": s.iterations,
+             "seconds": round(s.seconds, 3)}
+            for s in run.stages
+        ],
+        "residual_rms": run.residual_rms,
+        "heldout_rms": run.heldout_rms,
+        "noise_floor": run.noise_floor,
+        "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
+        "effects": {},
+        "views": [
+            {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),
+             "points": 0 if view.cloud is None else len(view.cloud.points)}
+            for view, pose, correction, rms in zip(
+                run.session.views, run.poses, run.corrections, run.view_rms, strict=True)
+        ],
+        "targets": [],
+        "convergence": run.convergence,
+        "verdict": run.verdict,
+        "notes": list(run.notes),
+        "versions": _versions(),
+    }  # fmt: skip
+
+
+def ledger(run: Run) -> list[dict[str, Any]]:
+    """Step 0 of the model's history."""
+    return [{"step": 0, "effects": [], "residual_rms": run.residual_rms, "heldout_rms": run.heldout_rms,
+             "noise_floor": run.noise_floor, "hand_eye": run.T_mount.tolist()}]  # fmt: skip
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _VERSIONS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _write_json(document: Any, path: Path) -> None:
+    path.write_text(json.dumps(_without_nan(document), indent=1) + "\n", encoding="utf-8")
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON has no NaN: what is not known is null."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def write_cloud(cloud: FusedCloud, path: Path) -> None:
+    """Binary PLY with normals, `residual` and `count`."""
+    names = ("x", "y", "z", "nx", "ny", "nz", "residual")
+    columns = np.column_stack([cloud.points, cloud.normals, cloud.residual])
+    vertex = np.empty(len(cloud.points), [(name, "<f4") for name in names] + [("count", "<u2")])
+    for name, column in zip(names, columns.T, strict=True):
+        vertex[name] = column
+    vertex["count"] = cloud.count
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+
+
+def write_residuals(run: Run, path: Path) -> None:
+    """One row per residual of the model, before the register stage moves single views."""
+    names = np.array([view.name for view in run.session.views])
+    covariates = sorted({key for view in run.session.views for key in view.covariates})
+    table: dict[str, list[Any]] = {}
+
+    def add(key: str, values: Array | Sequence[str]) -> None:
+        table.setdefault(key, []).append(values)
+
+    for m in run.overlaps.matches:
+        size = len(m.residual)
+        add("view", np.repeat(names[m.v], size))
+        add("partner", np.repeat(names[m.w], size))
+        for axis, column in zip("xyz", m.middle.T, strict=True):
+            add(axis, column)
+        for axis, column in zip("xyz", m.normal.T, strict=True):
+            add(f"n{axis}", column)
+        add("residual", m.residual)
+        for key in covariates:
+            add(key, np.full(size, run.session.views[m.v].covariates.get(key, np.nan)))
+        if run.session.views[m.v].time_s is not None:
+            add("time_s", np.full(size, run.session.views[m.v].time_s))
+    columns = {key: np.concatenate(parts) for key, parts in table.items()}
+    arrays = {key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()}
+    pq.write_table(pa.table(arrays), path, compression="zstd")

@@ -1,0 +1,193 @@
+"""Find a coarse hand-eye from nothing, or take the given one.
+
+Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
+of one fixed target, minimised from many starting rotations; (2) relative scan motions against the
+robot's (AX = XB, five solvers; `relative_motion.py`). Every candidate is then closed in on the scans
+at low resolution, and the consistency of the whole set decides: the truncated mean square distance
+between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.capture import Capture
+from stitch.errors import NoResultError
+from stitch.frames import Array
+from stitch.match import sample
+from stitch.relative_motion import motion_candidates
+from stitch.stages.correct import close_in
+
+_STARTS = 24
+_SEARCH_SAMPLES = 200
+_SEARCH_ITERATIONS = 14
+# First gate of the search and truncation of the score, as shares of the part's size.
+_GATE_SHARE = 0.35
+_SCORE_SHARE = 0.05
+# Restarts about the best centroid solution: its error on real parts was 2–17°.
+_RESTART_DEG = 15.0
+# Two candidates are the same answer if they place the part within this share of its size.
+_SAME_SHARE = 0.03
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One hand-eye that was tried: its origin and how well all views fall together."""
+
+    source: str
+    T_mount: Array  # (4, 4) after closing in
+    score: float  # length_unit, lower is better
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """The coarse hand-eye; `candidates` best first, one per distinct answer."""
+
+    T_mount: Array  # (4, 4)
+    gate: float  # length_unit: first distance between partners for the correction
+    source: str
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def runner_up_ratio(self) -> float:
+        """Score of the second distinct answer over the best; inf if there is none."""
+        return self.candidates[1].score / self.candidates[0].score if len(self.candidates) > 1 else np.inf
+
+
+def given(captures: Sequence[Capture], T_mount: Array) -> Coarse:
+    """Take a hand-eye that somebody measured: the gate is wide enough for 5° and 30 mm."""
+    return Coarse(T_mount, _GATE_SHARE * part_size(captures), "given in session.toml", ())
+
+
+def part_size(captures: Sequence[Capture]) -> float:
+    """Median diameter of the scans' point sets: twice the rms distance from their centroids."""
+    spread = [np.sqrt(scan.points.var(axis=0).sum()) for c in captures for scan in c.scans]
+    return 2 * float(np.median(spread))
+
+
+def coarse(captures: Sequence[Capture]) -> Coarse:
+    """Search the hand-eye.
+
+    Raises:
+        NoResultError: fewer than three views, or no candidate makes the views overlap.
+    """
+    if sum(len(c.scans) for c in captures) < 3:
+        raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
+    size = part_size(captures)
+    tried: list[Candidate] = []
+    for source, T_mount in _starts(captures):
+        candidate = _close(captures, source, T_mount, size)
+        if candidate:
+            tried.append(candidate)
+    if not tried:
+        raise NoResultError(
+            "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
+            "convention and that scans and poses are paired rightly, or give scanner.pose"
+        )
+    distinct = _distinct(captures, sorted(tried, key=lambda c: c.score), _SAME_SHARE * size)
+    return Coarse(distinct[0].T_mount, 0.2 * size, distinct[0].source, tuple(distinct))
+
+
+def _starts(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
+    """Starting hand-eyes with the name of the idea behind each."""
+    centroids = centroid_hand_eyes(captures)
+    starts = [("centroids", T) for T in centroids[:3]]
+    centre = scanner_centre(captures)
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        starts.append(("centroids, turned", centroids[0] @ _turn_about(axis * np.radians(_RESTART_DEG), centre)))
+    starts += [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
+    return starts
+
+
+def scanner_centre(captures: Sequence[Capture]) -> Array:
+    """Mean centroid of the scans in the scanner frame (3,)."""
+    return np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0)
+
+
+def _turn_about(rotation: Array, centre: Array) -> Array:
+    T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
+    T[:3, 3] = centre - T[:3, :3] @ centre
+    return T
+
+
+def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
+    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
+
+    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
+    """
+    centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
+
+    def residual(x: Array) -> Array:
+        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
+        rows = []
+        for c, centroid in zip(captures, centroids, strict=True):
+            placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
+            rows.append((placed - placed.mean(axis=0)).ravel())
+        return np.concatenate(rows)
+
+    fits = []
+    for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
+        fit = least_squares(residual, np.r_[start.as_rotvec(), np.zeros(3)], method="trf", max_nfev=100, x_scale="jac")
+        fits.append((float(fit.cost), fit.x))
+    fits.sort(key=lambda pair: pair[0])
+    found: list[Array] = []
+    for _, x in fits:
+        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
+        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
+            found.append(T)
+    return found
+
+
+def _close(captures: Sequence[Capture], source: str, T_mount: Array, size: float) -> Candidate | None:
+    """Close in from one start; None if the views do not overlap there."""
+    try:
+        T_mount, _, _ = close_in(
+            captures, T_mount, [_GATE_SHARE * size] * len(captures), _SEARCH_SAMPLES, _SEARCH_ITERATIONS
+        )
+    except NoResultError:
+        return None
+    return Candidate(source, T_mount, consistency(captures, T_mount, _SCORE_SHARE * size))
+
+
+def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
+    """Root mean square distance of points to every other view, truncated at `limit`.
+
+    Views that fail to meet count with the limit, so falling apart cannot pay.
+    """
+    squares = []
+    for c in captures:
+        poses = c.poses(T_mount)
+        picked = [sample(scan, _SEARCH_SAMPLES) for scan in c.scans]
+        for v, scan in enumerate(c.scans):
+            for w, other in enumerate(c.scans):
+                if v == w or not len(picked[v]):
+                    continue
+                T_w_v = frames.inverse(poses[w]) @ poses[v]
+                query = np.ascontiguousarray(frames.transform(T_w_v, scan.points[picked[v]]))
+                distance, index = other.tree.query(query, k=1, distance_upper_bound=limit)
+                found = np.isfinite(distance)
+                index = np.where(found, index, 0).astype(np.int64)
+                normal = frames.rotate(T_w_v, scan.normals[picked[v]])
+                facing = np.einsum("ij,ij->i", normal, other.normals[index]) > 0
+                squares.append(np.mean(np.where(found & facing, distance, limit) ** 2))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _distinct(captures: Sequence[Capture], ranked: Sequence[Candidate], tolerance: float) -> list[Candidate]:
+    """The best candidate of every distinct answer: those that place the part elsewhere."""
+    out: list[Candidate] = []
+    for candidate in ranked:
+        if all(_separation(captures, candidate.T_mount, other.T_mount) > tolerance for other in out):
+            out.append(candidate)
+    return out
+
+
+def _separation(captures: Sequence[Capture], T_a: Array, T_b: Array) -> float:
+    """Largest displacement of the scans' mean centroid box between two hand-eyes."""
+    centre = scanner_centre(captures)
+    corners = centre + part_size(captures) / 2 * np.vstack([np.eye(3), -np.eye(3)])
+    return float(np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1).max())

@@ -1,0 +1,109 @@
+"""Correct the hand-eye from the scans themselves: symmetric point-to-plane over one common ξ.
+
+All overlapping pairs, nearest neighbours in both directions, one ξ for every view of every session
+of the rig, T ← T·exp(ξ) (source A, step 3). Matching tightens from the data's own scale; a last
+generalised least-squares step weighs the views by the robot's own scatter (`hand_eye.py`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.capture import Capture
+from stitch.frames import Array
+from stitch.hand_eye import HandEye, fit_hand_eye, jacobian
+from stitch.match import sample
+from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.recorder import Recorder, Silent
+from stitch.solve import assemble, least_squares
+
+# Queries per view while the gate closes; the final normal equations take FINE_SAMPLES.
+COARSE_SAMPLES = 600
+_MAXIMUM_ITERATIONS = 40
+# A step that moves the part by less than this share of the robust sigma changes nothing.
+_CONVERGED = 2e-3
+
+
+@dataclass(frozen=True)
+class Correction:
+    """The corrected hand-eye; `overlaps` and `poses` in the order of the captures."""
+
+    hand_eye: HandEye
+    overlaps: tuple[Overlaps, ...]
+    history: tuple[float, ...]  # rms per iteration
+    start_rms: tuple[tuple[float, int], ...]  # per capture: rms and correspondences under the start
+
+
+def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
+    """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
+    D, b, moved = np.zeros((6, 6)), np.zeros(6), []
+    jacobians = [jacobian(c.poses(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
+    for J, o in zip(jacobians, overlaps, strict=True):
+        # Sessions of different noise count by their own variance.
+        H, vector = assemble(o.gram)
+        D += J.T @ H @ J / o.gram.scale**2
+        b += J.T @ vector / o.gram.scale**2
+    xi = least_squares(D, b)
+    moved = [(J @ xi).reshape(-1, 6)[:, 3:] / o.gram.scale for J, o in zip(jacobians, overlaps, strict=True)]
+    return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
+
+
+def close_in(
+    captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], samples: int = COARSE_SAMPLES,
+    maximum: int = _MAXIMUM_ITERATIONS, recorder: Recorder | None = None,
+) -> tuple[Array, list[Overlaps], list[float]]:  # fmt: skip
+    """Iterate matching and the common step until it no longer moves the parts.
+
+    Args:
+        T_mount: (4, 4) start, T_mount_scanner.
+        gates: first distance between partners per capture, length_unit.
+
+    Returns:
+        T_mount (4, 4), the last overlaps per capture and the rms per iteration.
+    """
+    recorder = recorder or Silent()
+    picked = [[sample(scan, samples) for scan in capture.scans] for capture in captures]
+    gates, history = list(gates), []
+    for index in range(maximum):
+        overlaps = [
+            collect(c, c.poses(T_mount), gate, s) for c, gate, s in zip(captures, gates, picked, strict=True)
+        ]
+        history.append(pooled_rms(overlaps))
+        recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
+        xi, moved = common_step(captures, overlaps, T_mount)
+        T_mount = T_mount @ frames.exp(xi)
+        tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
+        settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
+        if moved < _CONVERGED and settled:
+            break
+        # Not faster than 0.6 a step: the first fits at a wide gate are still far off.
+        gates = [max(new, 0.6 * old) for new, old in zip(tighter, gates, strict=True)]
+    return T_mount, overlaps, history
+
+
+def correct(
+    captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None
+) -> Correction:
+    """Correct one hand-eye from all overlapping pairs of all captures of a rig.
+
+    Args:
+        captures: one per session; all carry the same scanner on the same mount.
+        T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
+        gate: first distance between partners, length_unit: the coarse error at the part.
+
+    Raises:
+        NoResultError: no two views of a capture overlap.
+    """
+    start = [collect(c, c.poses(T_mount), gate, [sample(s, COARSE_SAMPLES) for s in c.scans]).gram for c in captures]
+    T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
+    gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
+    T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 6, recorder)
+    hand_eye = fit_hand_eye(captures, [o.gram for o in overlaps], T_mount)
+    final = tuple(
+        collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
+        for c, o in zip(captures, overlaps, strict=True)
+    )
+    start_rms = tuple((g.rms, int(g.count.sum())) for g in start)
+    return Correction(hand_eye, final, (*history, *fine, pooled_rms(final)), start_rms)

@@ -1,0 +1,45 @@
+"""Use a hand-eye that was corrected on another object of the same rig, without correcting again."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.capture import Capture
+from stitch.hand_eye import HandEye
+from stitch.match import sample
+from stitch.model import Model
+from stitch.repeatability import estimate, pose_channel
+from stitch.stages.coarse import part_size
+from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.stages.correct import Correction
+
+# A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
+_GATE_SHARE = 0.05
+_TIGHTENINGS = 4
+
+
+def reuse(captures: Sequence[Capture], model: Model) -> Correction:
+    """Overlaps and pose scatter of `captures` under the model's hand-eye, as `correct` returns them.
+
+    Raises:
+        NoResultError: no two views overlap under the hand-eye.
+    """
+    size = part_size(captures)
+    overlaps = tuple(_settle(c, model, _GATE_SHARE * size) for c in captures)
+    channels = [
+        pose_channel(o.gram, c.poses(model.T_mount), c.T_reference_flange)
+        for c, o in zip(captures, overlaps, strict=True)
+    ]
+    scatter = tuple(estimate(channel) for channel in channels)
+    hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
+    rms = tuple((o.gram.rms, int(o.gram.count.sum())) for o in overlaps)
+    return Correction(hand_eye, overlaps, (pooled_rms(overlaps),), rms)
+
+
+def _settle(capture: Capture, model: Model, gate: float) -> Overlaps:
+    samples = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
+    poses = capture.poses(model.T_mount)
+    for _ in range(_TIGHTENINGS):
+        overlaps = collect(capture, poses, gate, samples)
+        gate = float(np.minimum(gate, next_gate(overlaps, capture)))
+    return collect(capture, poses, gate, samples)

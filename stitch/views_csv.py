@@ -1,0 +1,175 @@
+"""views.csv: one row per scan, columns by name."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch import frames
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.robot import Robot, forward
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_JOINT = re.compile(r"j(\d+)_deg$")
+_APPROACH = re.compile(r"j(\d+)_approach$")
+# A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
+_UNIT_TOLERANCE = 1e-3
+# Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
+# degrees and percents of the reach are another convention.
+_ANGLE_TOLERANCE = np.radians(2.0)
+_REACH_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row, checked; lengths in length_unit, joints in rad."""
+
+    line: int
+    name: str
+    cloud: str
+    T_base_flange: Array
+    joints: Array | None
+    approach: Array | None
+    time_s: float | None
+    covariates: dict[str, float]
+
+
+def read_views(file: Path, robot: Robot | None) -> list[Row]:
+    """Read and check views.csv.
+
+    Columns that hold text in every row (notes) are left alone. Where joints and a reported pose both
+    stand, the reported pose is used and must agree with the joints.
+
+    Raises:
+        InputError: with the line, and the mend.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}: not found; a session needs a row per scan there")
+    with file.open(newline="", encoding="utf-8-sig") as stream:
+        reader = csv.reader(stream, skipinitialspace=True)
+        header = [name.strip() for name in next(reader, [])]
+        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    _check_header(file, header, robot)
+    if not lines:
+        raise InputError(f"{file}: no views; write one row per scan")
+    cells = [(line, _row_cells(file, line, header, row)) for line, row in lines]
+    covariates = _covariate_names(header, cells)
+    joints = [_joints(file, line, row, header) for line, row in cells]
+    rows, seen = [], {}
+    for i, (line, row) in enumerate(cells):
+        name = row.get("view", "")
+        if not name or name in seen:
+            mend = f"is used on line {seen[name]} already" if name else "is empty"
+            raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
+        seen[name] = line
+        time_s = _number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+        values = {c: _number(file, line, c, row[c]) for c in covariates if row[c]}
+        T_base_flange = _flange(file, line, name, row, joints[i], robot)
+        approach = _approach(file, line, row, joints, i)
+        rows.append(Row(line, name, row.get("cloud", ""), T_base_flange, joints[i], approach, time_s, values))
+    return rows
+
+
+def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> None:
+    if "view" not in header:
+        raise InputError(f"{file} line 1: no column 'view'; columns are {', '.join(header) or 'none'}")
+    double = sorted({name for name in header if header.count(name) > 1})
+    if double:
+        raise InputError(f"{file} line 1: column {double[0]!r} stands twice; rename one")
+    numbers = sorted(int(m.group(1)) for name in header if (m := _JOINT.match(name)))
+    pose = [name for name in _POSE if name in header]
+    if pose and len(pose) < len(_POSE):
+        missing = ", ".join(name for name in _POSE if name not in header)
+        raise InputError(f"{file} line 1: a pose needs {', '.join(_POSE)}; missing {missing}")
+    if not pose and not numbers:
+        raise InputError(f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(_POSE)}); one of them is needed")
+    if numbers and numbers != list(range(1, len(numbers) + 1)):
+        raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
+    if numbers and robot and len(numbers) != robot.n_joints:
+        raise InputError(f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints} joints")
+    if numbers and not pose and not robot:
+        raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
+
+
+def _row_cells(file: Path, line: int, header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
+    if len(row) != len(header):
+        raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
+    return {name: cell.strip() for name, cell in zip(header, row, strict=True)}
+
+
+def _covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
+    known = {"view", "cloud", "time_s", *_POSE}
+    rest = [n for n in header if n not in known and not _JOINT.match(n) and not _APPROACH.match(n)]
+    return [name for name in rest if any(_is_number(row[name]) for _, row in cells)]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(file: Path, line: int, column: str, cell: str) -> float:
+    if not _is_number(cell) or not np.isfinite(float(cell)):
+        raise InputError(f"{file} line {line}: {column} is {cell!r}; write a number")
+    return float(cell)
+
+
+def _joints(file: Path, line: int, row: dict[str, str], header: Sequence[str]) -> Array | None:
+    names = [f"j{i}_deg" for i in range(1, sum(bool(_JOINT.match(n)) for n in header) + 1)]
+    if not names or not any(row[name] for name in names):
+        return None
+    return np.radians([_number(file, line, name, row[name]) for name in names])
+
+
+def _approach(
+    file: Path, line: int, row: dict[str, str], joints: Sequence[Array | None], i: int
+) -> Array | None:
+    q = joints[i]
+    if q is None:
+        return None
+    before = joints[i - 1] if i else None
+    out = np.zeros(len(q)) if before is None else np.sign(q - before)
+    for k in range(len(q)):
+        cell = row.get(f"j{k + 1}_approach", "")
+        if cell:
+            out[k] = _number(file, line, f"j{k + 1}_approach", cell)
+            if out[k] not in (-1, 0, 1):
+                raise InputError(f"{file} line {line}: j{k + 1}_approach is {cell}; use -1, 0 or 1")
+    return out
+
+
+def _flange(
+    file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None
+) -> Array:
+    from_joints = forward(robot, joints) if robot and joints is not None else None
+    given = [row.get(column, "") for column in _POSE]
+    if not any(given):
+        if from_joints is None:
+            raise InputError(f"{file} line {line}: view {name} has no pose; fill {','.join(_POSE)} or the joints, or remove the row")
+        return from_joints
+    values = np.array([_number(file, line, c, cell) for c, cell in zip(_POSE, given, strict=True)])
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1) > _UNIT_TOLERANCE:
+        raise InputError(f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; write a unit quaternion, w last")
+    reported = frames.from_quaternion(values[:3], values[3:] / norm)
+    if from_joints is not None:
+        _agree(file, line, name, reported, from_joints)
+    return reported
+
+
+def _agree(file: Path, line: int, name: str, reported: Array, from_joints: Array) -> None:
+    angle = float(frames.angle_between(reported, from_joints))
+    distance = float(np.linalg.norm(reported[:3, 3] - from_joints[:3, 3]))
+    reach = float(np.linalg.norm(from_joints[:3, 3]))
+    if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
+        raise InputError(
+            f"{file} line {line}: view {name}: joints and reported pose differ by {distance:.4g} and "
+            f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
+        )

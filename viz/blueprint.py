@@ -1,0 +1,39 @@
+"""What the viewer opens on: the result and the verdict first, the way there on further tabs."""
+
+import os
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+import rerun.blueprint as rrb  # noqa: E402
+
+
+def blueprint() -> rrb.Blueprint:
+    """Result | before and after | every iteration."""
+    side = rrb.Vertical(
+        rrb.TextDocumentView(origin="verdict", name="Verdict"),
+        rrb.BarChartView(origin="views", contents=["views/correction_um"], name="Correction per view (µm)"),
+        rrb.BarChartView(origin="views", contents=["views/rms_um"], name="Rms per view after register (µm)"),
+        row_shares=[3, 1, 1],
+    )
+    result = rrb.Horizontal(
+        rrb.Spatial3DView(origin="fused", name="Stitched, by disagreement of the views"), side,
+        column_shares=[3, 2], name="Result",
+    )  # fmt: skip
+    compare = rrb.Horizontal(
+        rrb.Spatial3DView(origin="before", name="One hand-eye: before register"),
+        rrb.Spatial3DView(origin="after", name="After register, same colour scale"),
+        name="Before and after",
+    )
+    steps = rrb.Horizontal(
+        rrb.Vertical(
+            rrb.Spatial3DView(origin="scans", contents=["scans/**", "- scans/*/by_residual"], name="Scans by view"),
+            rrb.Spatial3DView(origin="scans", contents=["scans/**", "- scans/*/by_view"], name="Scans by residual"),
+        ),
+        rrb.Vertical(
+            rrb.TimeSeriesView(origin="convergence", contents=["convergence/*/rms_um"], name="Rms (µm)"),
+            rrb.TimeSeriesView(origin="convergence", contents=["convergence/*/gate_um"], name="Gate (µm)"),
+            rrb.Spatial3DView(origin="robot", name="Robot: flange poses in the base frame"),
+            rrb.TextLogView(origin="log", name="Stages"),
+        ),
+        column_shares=[3, 2], name="Every iteration",
+    )  # fmt: skip
+    return rrb.Blueprint(rrb.Tabs(result, compare, steps, active_tab=0), collapse_panels=True)

@@ -1,0 +1,42 @@
+"""Colours that mean the same in the recording, the figures and the page."""
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Grey: no other view sees this place, so there is nothing to compare.
+UNSEEN = (160, 160, 160)
+# Blue–white–red: below, at and above the surface of the other views.
+SIGNED = "RdBu_r"
+# Dark to bright: how far the views disagree.
+UNSIGNED = "viridis"
+
+
+def view_colours(count: int) -> NDArray[np.uint8]:
+    """(count, 3) distinct colours, the same for the same view everywhere."""
+    hues = (np.arange(count) * 0.618034) % 1.0
+    return np.asarray(colormaps["hsv"](hues)[:, :3] * 200 + 30, np.uint8)
+
+
+def signed_colours(values: Array, limit: float) -> NDArray[np.uint8]:
+    """(N, 3) for signed distances; full colour at ±limit, grey where NaN."""
+    return _mapped(SIGNED, 0.5 + np.asarray(values) / (2 * max(limit, 1e-12)), values)
+
+
+def unsigned_colours(values: Array, limit: float) -> NDArray[np.uint8]:
+    """(N, 3) for distances ≥ 0; brightest at `limit`, grey where NaN."""
+    return _mapped(UNSIGNED, np.asarray(values) / max(limit, 1e-12), values)
+
+
+def _mapped(name: str, share: Array, values: Array) -> NDArray[np.uint8]:
+    colours = np.asarray(colormaps[name](np.nan_to_num(np.clip(share, 0, 1)))[:, :3] * 255, np.uint8)
+    colours[~np.isfinite(values)] = UNSEEN
+    return colours
+
+
+def robust_limit(values: Array) -> float:
+    """The 95 % quantile of |values|: a scale that single edges do not stretch."""
+    seen = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(seen, 0.95)) if len(seen) else 1.0

@@ -1,0 +1,121 @@
+"""The Rerun recording of a run: every stage and iteration, on one timeline `step`."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.result import Run, StageResult
+from stitch.session import Session
+from viz.blueprint import blueprint
+from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
+from viz.units import to_micrometres
+from viz.words import run_markdown
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+import rerun as rr  # noqa: E402  (the switch above must be set before the import)
+
+# What a screen can show; the run folder keeps everything.
+_POINTS_PER_VIEW = 12_000
+_POINTS_FUSED = 400_000
+
+
+class RerunRecorder:
+    """A `stitch.recorder.Recorder` that writes one .rrd file.
+
+    Every cloud is stored once, in its scanner's frame; iterations only move its transform.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.recording = rr.RecordingStream("stitch")
+        self.recording.save(path, default_blueprint=blueprint())
+        self.step = 0
+        self.names: list[str] = []
+        self.picked: list[Array] = []
+        self.clouds: list[Array] = []
+        self.to_um = 1e3
+
+    def start(self, session: Session) -> None:
+        """Log the scans and the robot's path."""
+        self.to_um = to_micrometres(session.length_unit)
+        self.names = [view.name for view in session.views]
+        rec = self.recording
+        rec.log("scans", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        colours = view_colours(len(self.names))
+        for view, colour in zip(session.views, colours, strict=True):
+            points = view.cloud.points if view.cloud else np.zeros((0, 3))
+            pick = np.linspace(0, len(points) - 1, min(len(points), _POINTS_PER_VIEW)).astype(int)
+            self.picked.append(pick)
+            self.clouds.append(points[pick].astype(np.float32))
+            rec.log(f"scans/{view.name}/by_view", rr.Points3D(self.clouds[-1], colors=[colour]), static=True)
+        flange = np.array([view.T_base_flange for view in session.views])
+        rec.log("robot/flange_path", rr.LineStrips3D([flange[:, :3, 3]], colors=[(90, 90, 90)]), static=True)
+        size = 0.05 * float(np.ptp(flange[:, :3, 3], axis=0).max() + 1e-9)
+        for name, T in zip(self.names, flange, strict=True):
+            rec.log(f"robot/{name}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]), static=True)
+            rec.log(f"robot/{name}", rr.TransformAxes3D(size), static=True)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Move the scans, add a point to the curves."""
+        self._at_next_step()
+        self._move(poses)
+        self.recording.log(f"convergence/{stage}/rms_um", rr.Scalars(rms * self.to_um))
+        self.recording.log(f"convergence/{stage}/gate_um", rr.Scalars(gate * self.to_um))
+
+    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+        """Colour the scans by their distance from the other views, at the end of a stage."""
+        self._at_next_step()
+        self._move(poses)
+        rec = self.recording
+        limit = robust_limit(np.concatenate(residuals))
+        for name, cloud, pick, residual in zip(self.names, self.clouds, self.picked, residuals, strict=True):
+            colours = signed_colours(residual[pick], limit)
+            rec.log(f"scans/{name}/by_residual", rr.Points3D(cloud, colors=colours))
+        self._snapshot(result.name, poses, residuals, limit)
+        text = f"{result.name}: {result.rms * self.to_um:.1f} µm rms, full colour at ±{limit * self.to_um:.0f} µm"
+        rec.log("log", rr.TextLog(text))
+
+    def finish(self, run: Run) -> None:
+        """Log the fused cloud, the bars per view and the verdict, and close the file."""
+        self._at_next_step()
+        rec = self.recording
+        fused = run.fused
+        pick = np.linspace(0, len(fused.points) - 1, min(len(fused.points), _POINTS_FUSED)).astype(int)
+        colours = unsigned_colours(fused.residual[pick], robust_limit(fused.residual))
+        points = rr.Points3D(fused.points[pick].astype(np.float32), colors=colours)
+        rec.log("fused", points, static=True)
+        rec.log("views/rms_um", rr.BarChart(run.view_rms * self.to_um), static=True)
+        shift = np.linalg.norm(view_shifts(run), axis=1) * self.to_um
+        rec.log("views/correction_um", rr.BarChart(shift), static=True)
+        rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)
+        rec.disconnect()
+
+    def _snapshot(self, stage: str, poses: Array, residuals: list[Array], limit: float) -> None:
+        """The whole set as it stood at the end of a stage, on a static entity for side-by-side views."""
+        if stage not in ("correct", "register"):
+            return
+        placed = [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(self.clouds, poses, strict=True)]
+        values = np.concatenate([r[pick] for r, pick in zip(residuals, self.picked, strict=True)])
+        name = "before" if stage == "correct" else "after"
+        # One scale for both: that of the state before, or the change would not show.
+        self.shared_limit = limit if stage == "correct" else getattr(self, "shared_limit", limit)
+        points = rr.Points3D(np.concatenate(placed), colors=signed_colours(values, self.shared_limit))
+        self.recording.log(f"{name}", points, static=True)
+
+    def _move(self, poses: Array) -> None:
+        for name, T in zip(self.names, poses, strict=True):
+            self.recording.log(f"scans/{name}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+
+    def _at_next_step(self) -> None:
+        self.step += 1
+        self.recording.set_time("step", sequence=self.step)
+
+
+def view_shifts(run: Run) -> Array:
+    """(V, 3) how far register moved the middle of each view, reference frame, length_unit."""
+    out = []
+    for view, T_before, T_after in zip(run.session.views, run.poses_model, run.poses, strict=True):
+        middle = view.cloud.points.mean(axis=0) if view.cloud else np.zeros(3)
+        out.append((T_after - T_before)[:3, :3] @ middle + (T_after - T_before)[:3, 3])
+    return np.array(out)

@@ -1,0 +1,74 @@
+"""The report: one self-contained page."""
+
+import base64
+import io
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+
+from stitch.result import Run
+from viz import figures
+from viz.recording import view_shifts
+from viz.units import to_micrometres, to_millimetres
+
+
+def write_report(run: Run, path: Path) -> None:
+    """Write the page: verdict, stages, hand-eye, views and pictures; needs nothing beside it."""
+    environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
+    template = environment.get_template("report.html.j2")
+    path.write_text(template.render(**_content(run)), encoding="utf-8")
+
+
+def _content(run: Run) -> dict[str, object]:
+    um = to_micrometres(run.session.length_unit)
+    shift = view_shifts(run)
+    rows = [
+        {"view": view.name, "points": len(view.cloud.points) if view.cloud else 0, "rms": rms * um,
+         "shift": np.linalg.norm(moved) * um, "turn": np.linalg.norm(twist[:3]) * 1e3}
+        for view, rms, moved, twist in zip(run.session.views, run.view_rms, shift, run.corrections, strict=True)
+    ]  # fmt: skip
+    return {
+        "run": run, "um": um, "views": rows, "hand_eye": _hand_eye(run),
+        "largest": max((row["shift"] for row in rows), default=1.0) or 1.0,
+        "pictures": [
+            ("Steps between the views", _png(figures.residual_maps(run), 130)),
+            ("Convergence", _svg(figures.convergence(run))),
+            ("Views", _svg(figures.per_view(run))),
+        ],
+        "version": version("stitch"),
+    }  # fmt: skip
+
+
+def _hand_eye(run: Run) -> list[dict[str, object]]:
+    """Rows of the hand-eye table: name, coarse, corrected, sigma, unit."""
+    mm = to_millimetres(run.session.length_unit)
+    sigma = np.sqrt(np.diag(run.mount_covariance))
+    values = []
+    for T in (run.T_mount_coarse, run.T_mount):
+        values.append([*(T[:3, 3] * mm), *np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec())])
+    sigmas = [*(sigma[3:] * mm), *np.degrees(sigma[:3])]
+    names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "°") for axis in "xyz"]
+    return [
+        {"name": name, "unit": unit, "coarse": coarse, "corrected": corrected, "sigma": s}
+        for (name, unit), coarse, corrected, s in zip(names, values[0], values[1], sigmas, strict=True)
+    ]
+
+
+def _svg(figure: Figure) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return _uri("svg+xml", buffer.getvalue().encode())
+
+
+def _png(figure: Figure, dpi: int) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return _uri("png", buffer.getvalue())
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
