@@ -73,7 +73,8 @@ def _finish(
     before = correction.start_rms[index]
     stages = [
         StageResult("coarse", before[0], before[1], len(start.candidates), seconds[0], _coarse_note(start)),
-        StageResult("correct", overlaps.gram.rms, int(overlaps.gram.count.sum()), len(correction.history), seconds[1]),
+        StageResult("correct", overlaps.gram.rms, int(overlaps.gram.count.sum()), len(correction.history), seconds[1],
+                    _correct_note(before[0], overlaps.gram.rms)),
     ]
     _show(recorder, stages[0], own, own.poses(start.T_mount), before[0])
     _show(recorder, stages[1], own, poses_model, overlaps.gram.rms)
@@ -122,12 +123,22 @@ def _fused_rms(residual: Array) -> float:
     return float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
 
 
+def _correct_note(before: float, after: float) -> str:
+    if after > before:
+        return "views weighed by the robot's scatter: the hand-eye is more certain, single overlaps fit less tightly"
+    return ""
+
+
 def _coarse_note(start: Coarse) -> str:
+    """Where the hand-eye came from, and how far the second answer was."""
     if not start.candidates:
         return start.source
+    best = start.candidates[0]
+    tried = sum(c.reached for c in start.candidates)
+    found = f"found from {best.source}; {best.reached} of {tried} starts ended there"
     if len(start.candidates) == 1:
-        return f"found by {start.source}; every start that closed reached the same hand-eye"
-    return f"found by {start.source}; the runner-up ({start.candidates[1].source}) is {start.runner_up_ratio:.2f} times worse"
+        return f"{found}, no other answer"
+    return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
 
 
 def _notes(start: Coarse, inflation: float) -> tuple[str, ...]:

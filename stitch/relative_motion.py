@@ -21,7 +21,7 @@ from stitch.native import load_open3d
 _ANGLE_TOLERANCE = np.radians(3.0)
 _MINIMUM_MOTIONS = 3
 _FEATURE_SPACINGS = 6.0
-_POINTS = 4000
+_POINTS = 1500
 
 
 def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
@@ -96,7 +96,7 @@ def _feature_motion(o3d, target, source, size):  # type: ignore[no-untyped-def]
         registration.TransformationEstimationPointToPoint(False), 3,
         [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
          registration.CorrespondenceCheckerBasedOnDistance(1.5 * size)],
-        registration.RANSACConvergenceCriteria(20000, 0.999),
+        registration.RANSACConvergenceCriteria(10000, 0.99),
     )  # fmt: skip
     return registration.registration_icp(
         source[0], target[0], size, result.transformation,

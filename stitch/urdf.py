@@ -1,5 +1,6 @@
 """Robots from URDF, and to URDF. URDF counts in metres and radians."""
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,10 @@ def to_urdf(robot: Robot) -> str:
 def _add_joint(root: Any, name: str, kind: str, parent: str, child: str, T: Array, metres: float) -> None:
     ElementTree.SubElement(root, "link", name=child)
     joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
-    rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+    with warnings.catch_warnings():
+        # At a pitch of 90° roll and yaw are one angle: any split of it is the same rotation.
+        warnings.simplefilter("ignore", UserWarning)
+        rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
     xyz = T[:3, 3] * metres
     ElementTree.SubElement(joint, "origin", xyz=" ".join(repr(float(x)) for x in xyz), rpy=" ".join(repr(float(x)) for x in rpy))
     ElementTree.SubElement(joint, "parent", link=parent)

@@ -8,7 +8,7 @@ between all views that ought to meet. Objects without features (sphere, cone, pl
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,8 +23,9 @@ from stitch.relative_motion import motion_candidates
 from stitch.stages.correct import close_in
 
 _STARTS = 24
-_SEARCH_SAMPLES = 200
-_SEARCH_ITERATIONS = 14
+_SEARCH_SAMPLES = 120
+# The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
+_SEARCH_ITERATIONS = 7
 # First gate of the search and truncation of the score, as shares of the part's size.
 _GATE_SHARE = 0.35
 _SCORE_SHARE = 0.05
@@ -41,6 +42,7 @@ class Candidate:
     source: str
     T_mount: Array  # (4, 4) after closing in
     score: float  # length_unit, lower is better
+    reached: int = 1  # starts that ended here
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
         raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
     size = part_size(captures)
     tried: list[Candidate] = []
-    for source, T_mount in _starts(captures):
+    for source, T_mount in _starts(captures, _SAME_SHARE * size):
         candidate = _close(captures, source, T_mount, size)
         if candidate:
             tried.append(candidate)
@@ -88,19 +90,30 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
-    distinct = _distinct(captures, sorted(tried, key=lambda c: c.score), _SAME_SHARE * size)
+    distinct = _distinct(captures, tried, _SAME_SHARE * size)
     return Coarse(distinct[0].T_mount, 0.2 * size, distinct[0].source, tuple(distinct))
 
 
-def _starts(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
-    """Starting hand-eyes with the name of the idea behind each."""
+def _starts(captures: Sequence[Capture], tolerance: float) -> list[tuple[str, Array]]:
+    """Distinct starting hand-eyes with the name of the idea behind each.
+
+    Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
+    the runner-up is.
+    """
     centroids = centroid_hand_eyes(captures)
     starts = [("centroids", T) for T in centroids[:3]]
     centre = scanner_centre(captures)
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         starts.append(("centroids, turned", centroids[0] @ _turn_about(axis * np.radians(_RESTART_DEG), centre)))
-    starts += [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
-    return starts
+    for quarter in (1, 2, 3):
+        turn = centre / np.linalg.norm(centre) * np.pi / 2 * quarter
+        starts.append((f"turned by {90 * quarter}° about the line of sight", centroids[0] @ _turn_about(turn, centre)))
+    motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
+    kept: list[tuple[str, Array]] = []
+    for name, T in motions:
+        if all(_separation(captures, T, other) > tolerance for _, other in kept):
+            kept.append((name, T))
+    return starts + kept
 
 
 def scanner_centre(captures: Sequence[Capture]) -> Array:
@@ -177,13 +190,20 @@ def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> fl
     return float(np.sqrt(np.mean(squares)))
 
 
-def _distinct(captures: Sequence[Capture], ranked: Sequence[Candidate], tolerance: float) -> list[Candidate]:
-    """The best candidate of every distinct answer: those that place the part elsewhere."""
-    out: list[Candidate] = []
-    for candidate in ranked:
-        if all(_separation(captures, candidate.T_mount, other.T_mount) > tolerance for other in out):
-            out.append(candidate)
-    return out
+def _distinct(captures: Sequence[Capture], tried: Sequence[Candidate], tolerance: float) -> list[Candidate]:
+    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
+    groups: list[list[Candidate]] = []
+    for candidate in tried:
+        for group in groups:
+            if _separation(captures, candidate.T_mount, group[0].T_mount) < tolerance:
+                group.append(candidate)
+                break
+        else:
+            groups.append([candidate])
+    best = [
+        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=len(group)) for group in groups
+    ]
+    return sorted(best, key=lambda c: c.score)
 
 
 def _separation(captures: Sequence[Capture], T_a: Array, T_b: Array) -> float:

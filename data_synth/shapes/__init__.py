@@ -1,0 +1,1 @@
+"""Parts as triangle meshes, in millimetres."""
