@@ -14,6 +14,7 @@ import numpy as np
 from stitch import frames
 from stitch.capture import Capture
 from stitch.frames import Array
+from stitch.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, Repeatability, covariance_of, estimate, pose_channel
 from stitch.solve import Gram, pair_squares
 
@@ -34,38 +35,72 @@ def jacobian(poses: Array, centre: Array) -> Array:
     return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ poses)))
 
 
-def fit_hand_eye(captures: Sequence[Capture], grams: Sequence[Gram], T_mount: Array) -> HandEye:
-    """One generalised least-squares step over the pose channels of all captures.
+def fit_hand_eye(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array) -> HandEye:
+    """Generalised least squares over the pose channels of all captures.
 
     Args:
-        grams: normal equations at `T_mount`, one per capture.
-        T_mount: (4, 4) hand-eye at which the correspondences were measured.
+        freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
+        T_mount: (4, 4) hand-eye at which that began.
     """
-    channels = [
-        pose_channel(g, c.poses(T_mount), c.T_reference_flange) for c, g in zip(captures, grams, strict=True)
-    ]
-    scatter = [estimate(channel) for channel in channels]
-    prior = _weak_prior(captures, grams, T_mount)
-    blocks = [_information(ch, s) for ch, s in zip(channels, scatter, strict=True)]
+    evidence = [_Evidence(c, f.overlaps.gram, f.twists, c.poses(T_mount)) for c, f in zip(captures, freed, strict=True)]
+    scatter = [estimate(e.channel()) for e in evidence]
+    prior = _weak_prior(captures, freed, T_mount)
+    blocks = [_information(e.channel(), s) for e, s in zip(evidence, scatter, strict=True)]
     xi, covariance = _combine(blocks, prior)
     left_out = []
     outside = np.zeros(2)
-    for k, (c, g, s) in enumerate(zip(captures, grams, scatter, strict=True)):
-        for v in range(g.views):
-            blocks_v = [*blocks[:k], _without(c, g, s, T_mount, v), *blocks[k + 1 :]]
-            xi_v, _ = _combine(blocks_v, prior)
+    for k, (e, s) in enumerate(zip(evidence, scatter, strict=True)):
+        for v in range(e.gram.views):
+            fewer = e.without(v)
+            block = _information(fewer.channel(), s) if len(fewer.gram.pairs) else (np.zeros((6, 6)), np.zeros(6))
+            xi_v, _ = _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)
             left_out.append(xi_v)
-            outside += _view_squares(c, g, T_mount, v, xi_v, xi)
+            outside += e.squares(v, (xi_v, xi))
     inflation = _jackknife_inflation(np.array(left_out), covariance)
     ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
     return HandEye(T_mount @ frames.exp(xi), covariance * inflation, inflation, tuple(scatter), ratio)
 
 
-def _weak_prior(captures: Sequence[Capture], grams: Sequence[Gram], T_mount: Array) -> Array:
+def scatter_of(capture: Capture, freed: FreePoses, model_poses: Array) -> Repeatability:
+    """The repeatability of one capture's poses, whatever its hand-eye."""
+    return estimate(_Evidence(capture, freed.overlaps.gram, freed.twists, model_poses).channel())
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """One capture's pairs and freed views."""
+
+    capture: Capture
+    gram: Gram
+    twists: Array  # (V, 6)
+    poses: Array  # (V, 4, 4) of the model
+
+    def channel(self) -> PoseChannel:
+        return pose_channel(self.gram, self.twists, self.poses, self.capture.T_reference_flange)
+
+    def without(self, v: int) -> "_Evidence":
+        g = self.gram
+        keep = (g.pairs != v).all(axis=1)
+        pairs = g.pairs[keep] - (g.pairs[keep] > v)
+        fewer = replace(
+            g, views=g.views - 1, pairs=pairs, matrix=g.matrix[keep], vector=g.vector[keep], square=g.square[keep],
+            weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
+        )  # fmt: skip
+        return _Evidence(self.capture.without(v), fewer, np.delete(self.twists, v, 0), np.delete(self.poses, v, 0))
+
+    def squares(self, v: int, corrections: Sequence[Array]) -> Array:
+        """Σ w e² of the pairs of view v with the robot's poses and each of the hand-eye corrections ξ."""
+        touched = (self.gram.pairs == v).any(axis=1)
+        J = jacobian(self.poses, self.gram.centre)
+        moved = [(J @ xi).reshape(-1, 6) - self.twists for xi in corrections]
+        return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
+
+
+def _weak_prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array) -> Array:
     """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else."""
     ranges = [
-        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), g.centre[None]), axis=-1)
-        for c, g in zip(captures, grams, strict=True)
+        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
+        for c, f in zip(captures, freed, strict=True)
     ]
     distance = float(np.median(np.concatenate(ranges)))
     return np.diag([1.0] * 3 + [distance**-2.0] * 3)
@@ -82,27 +117,6 @@ def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array
     information = prior + sum(block[0] for block in blocks)
     covariance = np.linalg.inv(information)
     return covariance @ sum(block[1] for block in blocks), covariance
-
-
-def _without(c: Capture, g: Gram, s: Repeatability, T_mount: Array, v: int) -> tuple[Array, Array]:
-    """The information of one capture less one view, at the repeatability of all."""
-    keep = (g.pairs != v).all(axis=1)
-    pairs = g.pairs[keep] - (g.pairs[keep] > v)
-    fewer = replace(
-        g, views=g.views - 1, pairs=pairs, matrix=g.matrix[keep], vector=g.vector[keep],
-        square=g.square[keep], weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
-    )  # fmt: skip
-    if not len(pairs):
-        return np.zeros((6, 6)), np.zeros(6)
-    rest = c.without(v)
-    return _information(pose_channel(fewer, rest.poses(T_mount), rest.T_reference_flange), s)
-
-
-def _view_squares(c: Capture, g: Gram, T_mount: Array, v: int, xi_v: Array, xi: Array) -> Array:
-    """Σ w e² of the pairs of view v: under the fit without it, and under the fit with it."""
-    touched = (g.pairs == v).any(axis=1)
-    J = jacobian(c.poses(T_mount), g.centre)
-    return np.array([pair_squares(g, (J @ x).reshape(-1, 6))[touched].sum() for x in (xi_v, xi)])
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:

@@ -16,6 +16,7 @@ from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.result import Run, StageResult
 from stitch.session import Session
+from stitch.solve import RMS_GATE
 from stitch.stages.coarse import Coarse, coarse, given
 from stitch.stages.correct import Correction, correct
 from stitch.stages.fuse import fuse, view_residuals
@@ -79,7 +80,7 @@ def _finish(
     _show(recorder, stages[0], own, own.poses(start.T_mount), before[0])
     _show(recorder, stages[1], own, poses_model, overlaps.gram.rms)
     clock.lap()
-    registration = register(own, poses_model, scatter, overlaps.gate, recorder)
+    registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
     final = registration.overlaps
     stages.append(StageResult("register", final.gram.rms, int(final.gram.count.sum()), len(registration.history), clock.lap()))
     fused = fuse(own, registration.poses)
@@ -120,7 +121,10 @@ def _show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array, rm
 
 def _fused_rms(residual: Array) -> float:
     seen = residual[np.isfinite(residual)]
-    return float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
+    if not len(seen):
+        return float("nan")
+    # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
+    return float(np.sqrt(np.mean(seen[seen < RMS_GATE * 1.4826 * np.median(seen)] ** 2)))
 
 
 def _correct_note(before: float, after: float) -> str:

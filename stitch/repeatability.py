@@ -1,7 +1,7 @@
 """How far the robot's poses scatter: restricted maximum likelihood on per-view pose estimates.
 
 The points of one view share that view's pose error, so evidence counts in views. The per-view
-twists δ̂ = −H⁺b are reduced to the directions the overlaps can see, z, with covariance
+twists δ̂ (`free_poses.py`) are reduced to the directions the overlaps can see, z, with covariance
 σ_r² T_r + σ_t² T_t + c σ² H⁺ (rotation and translation scatter of the flange, and a factor on the
 noise within overlaps, whose errors are correlated). Patterson & Thompson (1971), Harville (1977).
 """
@@ -14,10 +14,8 @@ from scipy.optimize import minimize
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.solve import Gram, assemble
-
-# Directions of H weaker than this share of the strongest (in displacements) carry no evidence.
-_NEAR_NULL = 1e-3
+from stitch.free_poses import visible_directions
+from stitch.solve import Gram
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,6 @@ class PoseChannel:
     rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
     translation: Array  # (n, n) the same for translation
     noise: Array  # (n, n) covariance of the sensor noise within overlaps
-    basis: Array  # (6V, n) visible directions
 
 
 @dataclass(frozen=True)
@@ -41,35 +38,23 @@ class Repeatability:
     noise_factor: float
 
 
-def pose_channel(g: Gram, poses: Array, T_reference_flange: Array) -> PoseChannel:
-    """Reduce the pairs to visible per-view twists.
+def pose_channel(g: Gram, twists: Array, model_poses: Array, T_reference_flange: Array) -> PoseChannel:
+    """Reduce per-view twists to the directions that the overlaps see.
 
     Args:
-        g: Gram matrices about the part's centre.
-        poses: T_reference_scanner (V, 4, 4).
-        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity for
-            eye_to_hand, T_base_flange for eye_in_hand.
+        g: normal equations about the part's centre, at the freed poses.
+        twists: (V, 6) about that centre, from the model's poses to the freed ones.
+        model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
+        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
+            for eye_to_hand, T_base_flange for eye_in_hand.
     """
+    values, vectors, scale = visible_directions(g)
+    left = vectors.T / scale[None, :]
     to_centre = frames.make(np.eye(3), -g.centre)
-    H, b = assemble(g)
-    size = _lever(g)
-    scale = np.tile([1 / size] * 3 + [1.0] * 3, g.views)
-    values, vectors = np.linalg.eigh(H * scale[:, None] * scale[None, :])
-    keep = values > _NEAR_NULL * values[-1]
-    basis = vectors[:, keep]
-    z = -(basis.T @ (b * scale)) / values[keep]
-    # Twists in scaled coordinates: rotations count as displacements at the part's size.
-    left = basis.T / scale[None, :]
-    response = left @ np.concatenate(list(frames.adjoint(to_centre @ poses)))
+    response = left @ np.concatenate(list(frames.adjoint(to_centre @ model_poses)))
     carried = frames.adjoint(to_centre @ T_reference_flange)
-    unit = [_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6))]
-    return PoseChannel(z, response, unit[0], unit[1], np.diag(g.variance / values[keep]), basis * scale[:, None])
-
-
-def _lever(g: Gram) -> float:
-    """Root mean square lever of the correspondences about the centre, from the traces."""
-    trace = np.trace(g.matrix.sum(axis=0)[:3, :3]) / np.trace(g.matrix.sum(axis=0)[3:, 3:])
-    return float(np.sqrt(max(trace, 1e-300)))
+    rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
+    return PoseChannel(left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
 
 
 def _scatter(left: Array, carried: Array) -> Array:

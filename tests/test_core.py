@@ -6,10 +6,10 @@ from conftest import disturbed, synthetic
 from scipy.spatial import cKDTree
 
 from stitch import frames
-from stitch.hand_eye import jacobian
+from stitch.free_poses import free_poses
+from stitch.hand_eye import jacobian, scatter_of
 from stitch.match import match, overlapping_pairs, sample
 from stitch.overlaps import collect
-from stitch.repeatability import estimate, pose_channel
 from stitch.scan import prepare_view
 from stitch.solve import assemble, gram, pair_squares
 
@@ -117,8 +117,7 @@ def test_repeatability_is_recovered():
             seed, views=12, repeatability_rotation=60e-6, repeatability_translation=0.04, pixels=80
         )
         poses = capture.poses(measured.T_mount)
-        g = collect(capture, poses, 1.5, [sample(s, 600) for s in capture.scans]).gram
-        scatter = estimate(pose_channel(g, poses, capture.T_reference_flange))
+        scatter = scatter_of(capture, free_poses(capture, poses, 1.5), poses)
         found.append((scatter.rotation, scatter.translation))
     rotation, translation = np.sqrt(np.mean(np.square(found), axis=0))
     assert rotation == pytest.approx(60e-6, rel=0.35)

@@ -13,6 +13,7 @@ import numpy as np
 from stitch import frames
 from stitch.capture import Capture
 from stitch.frames import Array
+from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, fit_hand_eye, jacobian
 from stitch.match import sample
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
@@ -28,10 +29,11 @@ _CONVERGED = 2e-3
 
 @dataclass(frozen=True)
 class Correction:
-    """The corrected hand-eye; `overlaps` and `poses` in the order of the captures."""
+    """The corrected hand-eye; `overlaps` and `freed` in the order of the captures."""
 
     hand_eye: HandEye
     overlaps: tuple[Overlaps, ...]
+    freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
     start_rms: tuple[tuple[float, int], ...]  # per capture: rms and correspondences under the start
 
@@ -99,11 +101,13 @@ def correct(
     start = [collect(c, c.poses(T_mount), gate, [sample(s, COARSE_SAMPLES) for s in c.scans]).gram for c in captures]
     T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
-    T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 6, recorder)
-    hand_eye = fit_hand_eye(captures, [o.gram for o in overlaps], T_mount)
+    T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 2, recorder)
+    freed = tuple(free_poses(c, c.poses(T_mount), o.gate) for c, o in zip(captures, overlaps, strict=True))
+    hand_eye = fit_hand_eye(captures, freed, T_mount)
     final = tuple(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)
     )
     start_rms = tuple((g.rms, int(g.count.sum())) for g in start)
-    return Correction(hand_eye, final, (*history, *fine, pooled_rms(final)), start_rms)
+    poses = tuple(f.poses for f in freed)
+    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)), start_rms)

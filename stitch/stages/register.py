@@ -73,7 +73,8 @@ def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> 
 
 
 def register(
-    capture: Capture, model_poses: Array, scatter: Repeatability, gate: float, recorder: Recorder | None = None
+    capture: Capture, model_poses: Array, scatter: Repeatability, gate: float, recorder: Recorder | None = None,
+    start: Array | None = None,
 ) -> Registration:
     """Move every view by its own twist until the overlaps agree.
 
@@ -81,6 +82,7 @@ def register(
         model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
         scatter: prior of the flange poses and the factor on the overlap noise.
         gate: first distance between partners, length_unit.
+        start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
 
     Raises:
         NoResultError: no two views overlap.
@@ -88,7 +90,7 @@ def register(
     recorder = recorder or Silent()
     views = len(capture.scans)
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses, history = np.array(model_poses), []
+    poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
     for index in range(_MAXIMUM_ITERATIONS):
         overlaps = collect(capture, poses, gate, picked)
         history.append(overlaps.gram.rms)
@@ -108,6 +110,12 @@ def register(
     final = collect(capture, poses, gate, picked)
     corrections = frames.log(poses @ frames.inverse(model_poses))
     return Registration(poses, corrections, final, (*history, final.gram.rms))
+
+
+def _held(start: Array, model_poses: Array) -> Array:
+    """`start` without its mean motion against the robot, which no overlap can show."""
+    common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
+    return np.asarray(frames.exp(-common) @ start)
 
 
 def _step(variance: float, equations: tuple[Array, Array], prior: Array, moved: Array) -> Array:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.capture import Capture
-from stitch.hand_eye import HandEye
+from stitch.free_poses import free_poses
+from stitch.hand_eye import HandEye, scatter_of
 from stitch.match import sample
 from stitch.model import Model
-from stitch.repeatability import estimate, pose_channel
 from stitch.stages.coarse import part_size
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.stages.correct import Correction
@@ -26,14 +26,12 @@ def reuse(captures: Sequence[Capture], model: Model) -> Correction:
     """
     size = part_size(captures)
     overlaps = tuple(_settle(c, model, _GATE_SHARE * size) for c in captures)
-    channels = [
-        pose_channel(o.gram, c.poses(model.T_mount), c.T_reference_flange)
-        for c, o in zip(captures, overlaps, strict=True)
-    ]
-    scatter = tuple(estimate(channel) for channel in channels)
+    poses = [c.poses(model.T_mount) for c in captures]
+    freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
+    scatter = tuple(scatter_of(c, f, T) for c, f, T in zip(captures, freed, poses, strict=True))
     hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
     rms = tuple((o.gram.rms, int(o.gram.count.sum())) for o in overlaps)
-    return Correction(hand_eye, overlaps, (pooled_rms(overlaps),), rms)
+    return Correction(hand_eye, overlaps, tuple(f.poses for f in freed), (pooled_rms(overlaps),), rms)
 
 
 def _settle(capture: Capture, model: Model, gate: float) -> Overlaps:
