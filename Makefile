@@ -8,7 +8,6 @@ UV := $(shell command -v uv 2>/dev/null)
 BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && { echo $$p; break; }; done)
 
-export OMP_NUM_THREADS ?= 2
 export RERUN_ANALYTICS ?= off
 
 .PHONY: install demo test check lock clean

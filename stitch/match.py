@@ -9,6 +9,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.scan import Scan
+from stitch.threads import parallel
 
 # Two patches whose normals differ by more than 45° are not the same surface.
 _NORMAL_COSINE = np.cos(np.radians(45.0))
@@ -42,17 +43,17 @@ def sample(scan: Scan, count: int) -> Array:
 def overlapping_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
     """Pairs (v < w) of which at least 4 % of the probed points meet; poses T_reference_scanner."""
     probes = [sample(scan, _PROBES) for scan in scans]
-    pairs = []
-    for v, w in combinations(range(len(scans)), 2):
+
+    def overlap(pair: tuple[int, int]) -> bool:
         share = 0.0
-        for a, b in ((v, w), (w, v)):
-            if not len(probes[a]):
-                continue
-            distance, _, agree = _search(scans[a], scans[b], probes[a], poses[a], poses[b], gate)
-            share = max(share, float(np.mean(np.isfinite(distance) & agree)))
-        if share >= _MINIMUM_OVERLAP:
-            pairs.append((v, w))
-    return pairs
+        for a, b in (pair, pair[::-1]):
+            if len(probes[a]):
+                distance, _, agree = search(scans[a], scans[b], probes[a], poses[a], poses[b], gate)
+                share = max(share, float(np.mean(np.isfinite(distance) & agree)))
+        return share >= _MINIMUM_OVERLAP
+
+    pairs = list(combinations(range(len(scans)), 2))
+    return [pair for pair, meets in zip(pairs, parallel(overlap, pairs), strict=True) if meets]
 
 
 def match(
@@ -69,16 +70,19 @@ def match(
         gate: largest distance between partners, length_unit.
         samples: per view the indices that search (see `sample`).
     """
-    for v, w in pairs:
+
+    def of_pair(pair: tuple[int, int]) -> Match | None:
+        v, w = pair
         from_v = _partners(scans, poses, samples[v], v, w, gate)
         from_w = _partners(scans, poses, samples[w], w, v, gate)
         index_v = np.concatenate([from_v[0], from_w[1]])
         index_w = np.concatenate([from_v[1], from_w[0]])
-        if len(index_v):
-            yield _measure(scans, poses, v, w, index_v, index_w)
+        return _measure(scans, poses, v, w, index_v, index_w) if len(index_v) else None
+
+    return (found for found in parallel(of_pair, pairs) if found is not None)
 
 
-def _search(
+def search(
     scan: Scan, other: Scan, index: Array, T_scan: Array, T_other: Array, gate: float
 ) -> tuple[Array, Array, Array]:
     """Distance (inf where none), index of the partner and whether it may be used."""
@@ -99,7 +103,7 @@ def _partners(
     """Indices (of view a, of view b) of the accepted correspondences."""
     if not len(index):
         return index, index
-    _, partner, accept = _search(scans[a], scans[b], index, poses[a], poses[b], gate)
+    _, partner, accept = search(scans[a], scans[b], index, poses[a], poses[b], gate)
     return index[accept], partner[accept]
 
 

@@ -22,6 +22,7 @@ from stitch.stages.correct import Correction, correct
 from stitch.stages.fuse import fuse, view_residuals
 from stitch.stages.register import register
 from stitch.stages.reuse import reuse
+from stitch.threads import library_threads_off
 from stitch.verdict import sentence
 
 
@@ -40,6 +41,11 @@ def run_rig(
 ) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye; one run per session."""
     _same_rig(sessions, model)
+    with library_threads_off():
+        return _run_rig(sessions, model, recorders)
+
+
+def _run_rig(sessions: Sequence[Session], model: Model | None, recorders: Sequence[Recorder] | None) -> list[Run]:
     recorders = recorders or [Silent() for _ in sessions]
     for session, recorder in zip(sessions, recorders, strict=True):
         recorder.start(session)

@@ -8,6 +8,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.frames import Array
 from stitch.session import Session
+from stitch.threads import parallel
 
 # Neighbours of the local plane: enough to average the noise, few enough to follow a fillet.
 _PLANE_NEIGHBOURS = 16
@@ -39,7 +40,8 @@ class Scan:
 
 def prepare(session: Session) -> tuple[Scan, ...]:
     """Scans of all views of a cloud session, in the order of views.csv."""
-    return tuple(prepare_view(view.name, view.cloud.points) for view in session.views if view.cloud)
+    clouds = [(view.name, view.cloud.points) for view in session.views if view.cloud]
+    return tuple(parallel(lambda item: prepare_view(*item), clouds))
 
 
 def prepare_view(name: str, points: Array) -> Scan:

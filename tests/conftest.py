@@ -12,6 +12,10 @@ from data_synth.shapes import blade
 from stitch import frames
 from stitch.capture import Capture, place
 from stitch.scan import prepare_view
+from stitch.threads import library_threads_off
+
+# As inside a run: the tests call the stages directly.
+library_threads_off()
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -9,6 +9,7 @@ between all views that ought to meet. Objects without features (sphere, cone, pl
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,9 +19,10 @@ from stitch import frames
 from stitch.capture import Capture
 from stitch.errors import NoResultError
 from stitch.frames import Array
-from stitch.match import sample
+from stitch.match import sample, search
 from stitch.relative_motion import motion_candidates
 from stitch.stages.correct import close_in
+from stitch.threads import parallel
 
 _STARTS = 24
 _SEARCH_SAMPLES = 120
@@ -171,22 +173,20 @@ def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> fl
 
     Views that fail to meet count with the limit, so falling apart cannot pay.
     """
-    squares = []
+    squares: list[float] = []
     for c in captures:
         poses = c.poses(T_mount)
         picked = [sample(scan, _SEARCH_SAMPLES) for scan in c.scans]
-        for v, scan in enumerate(c.scans):
-            for w, other in enumerate(c.scans):
-                if v == w or not len(picked[v]):
-                    continue
-                T_w_v = frames.inverse(poses[w]) @ poses[v]
-                query = np.ascontiguousarray(frames.transform(T_w_v, scan.points[picked[v]]))
-                distance, index = other.tree.query(query, k=1, distance_upper_bound=limit)
-                found = np.isfinite(distance)
-                index = np.where(found, index, 0).astype(np.int64)
-                normal = frames.rotate(T_w_v, scan.normals[picked[v]])
-                facing = np.einsum("ij,ij->i", normal, other.normals[index]) > 0
-                squares.append(np.mean(np.where(found & facing, distance, limit) ** 2))
+        pairs = [(v, w) for v, w in permutations(range(len(c.scans)), 2) if len(picked[v])]
+
+        def mean_square(
+            pair: tuple[int, int], c: Capture = c, poses: Array = poses, picked: list[Array] = picked
+        ) -> float:
+            v, w = pair
+            distance, _, facing = search(c.scans[v], c.scans[w], picked[v], poses[v], poses[w], limit)
+            return float(np.mean(np.where(facing, distance, limit) ** 2))
+
+        squares += parallel(mean_square, pairs)
     return float(np.sqrt(np.mean(squares)))
 
 

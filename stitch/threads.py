@@ -1,0 +1,32 @@
+"""One level of threads: ours, over views and view pairs.
+
+Queries of one pair are too small to share out, and two libraries that both spin for the same cores
+slow each other down twentyfold; so libraries run single-threaded inside a run.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(max_workers=cores, thread_name_prefix="stitch", initializer=library_threads_off)
+
+
+def parallel(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """`map` over the cores, results in order; `function` must not call `parallel` itself."""
+    return _pool().map(function, items)
+
+
+def library_threads_off() -> Any:
+    """Limit OpenMP and BLAS to one thread; also a context manager. OpenMP counts per calling thread."""
+    return threadpool_limits(1)

@@ -1,0 +1,95 @@
+"""Clouds written by other libraries are read to the same numbers."""
+
+import struct
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from stitch import lzf
+from stitch.clouds import read_cloud
+from stitch.errors import InputError
+from stitch.native import load_open3d
+
+POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
+
+
+@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
+def test_ply(tmp_path, text, order):
+    vertex = np.empty(500, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), ("intensity", "u2")])
+    for i, axis in enumerate("xyz"):
+        vertex[axis] = POINTS[:, i]
+        vertex["n" + axis] = i == 2
+    vertex["intensity"] = np.arange(500)
+    PlyData([PlyElement.describe(vertex, "vertex")], text=text, byte_order=order).write(str(tmp_path / "c.ply"))
+    cloud = read_cloud(tmp_path / "c.ply", 0.001)
+    assert np.allclose(cloud.points, POINTS / 1000, atol=1e-9)
+    assert np.allclose(cloud.normals, [0, 0, 1])
+    assert np.array_equal(cloud.scalars["intensity"], np.arange(500))
+
+
+@pytest.mark.parametrize(("ascii_", "compressed"), [(True, False), (False, False), (False, True)])
+def test_pcd_from_open3d(tmp_path, ascii_, compressed):
+    o3d = load_open3d()
+    # Repeated rows give the packer something to pack.
+    points = np.vstack([POINTS, np.repeat(POINTS[:5], 60, axis=0)])
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    o3d.io.write_point_cloud(str(tmp_path / "c.pcd"), cloud, write_ascii=ascii_, compressed=compressed)
+    assert np.allclose(read_cloud(tmp_path / "c.pcd").points, points, atol=1e-4)
+
+
+def test_pcd_with_padding_vectors_and_odd_names(tmp_path):
+    layout = np.dtype([("Coord._Z", "<f4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("_", "u1", 4), ("t", "<u4")])
+    table = np.zeros(500, layout)
+    for i, axis in enumerate("xyz"):
+        table[axis] = POINTS[:, i]
+    table["_"], table["t"] = 255, np.arange(500)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS Coord._Z x y z _ t\nSIZE 4 4 4 8 1 4\nTYPE F F F F U U\n"
+        "COUNT 1 1 1 1 4 1\nWIDTH 500\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 500\nDATA binary\n"
+    )
+    (tmp_path / "c.pcd").write_bytes(header.encode() + table.tobytes())
+    cloud = read_cloud(tmp_path / "c.pcd")
+    assert np.allclose(cloud.points, POINTS, atol=1e-4)
+    assert set(cloud.scalars) == {"Coord._Z", "t"}
+    (tmp_path / "c.pcd").write_bytes(header.encode() + table.tobytes()[:-40])
+    with pytest.raises(InputError, match="500 points announced"):
+        read_cloud(tmp_path / "c.pcd")
+
+
+def test_real_pcd_equals_open3d(reghec):
+    o3d = load_open3d()
+    for name in ("david", "sphere"):
+        path = reghec(name) / "clouds" / "view1.pcd"
+        assert np.array_equal(read_cloud(path).points, np.asarray(o3d.io.read_point_cloud(str(path)).points))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"),
+    [(".xyz", "1 2 3 9\n4 5 6 8\n"), (".csv", "x,y,z,intensity\n1,2,3,9\n4,5,6,8\n"), (".txt", "# c\n1;2;3;9\n4;5;6;8\n")],
+)
+def test_text(tmp_path, suffix, text):
+    path = tmp_path / f"c{suffix}"
+    path.write_text(text)
+    cloud = read_cloud(path)
+    assert np.array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    assert np.array_equal(next(iter(cloud.scalars.values())), [9, 8])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [("c.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n", "cannot be read"),
+     ("c.pcd", b"not a cloud", "no DATA line"), ("c.las", b"", "unknown cloud format"), ("c.csv", b"a,b\n1,2\n", "no column"),
+     ("c.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 9\nDATA binary_compressed\n" + struct.pack("<II", 50, 108), "cut short")],
+)  # fmt: skip
+def test_broken_files_say_so(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_cloud(tmp_path / name)
+
+
+def test_lzf_refuses_nonsense():
+    assert lzf.decompress(b"\xff\xff\xff\xff", 10) is None
+    assert lzf.decompress(b"\x02abc", 3) == b"abc"
+    # Three literals, then 6 bytes from 3 back: a pattern that reads what it writes.
+    assert lzf.decompress(b"\x02abc\x80\x02", 9) == b"abcabcabc"

@@ -1,0 +1,176 @@
+"""Sessions: what is read, and the one line that every bad input gets."""
+
+import csv
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+
+from data_synth.cell import Cell, measure
+from data_synth.scanner import AreaScanner
+from data_synth.write import write_session
+from conftest import blade_mesh
+from stitch.cli.main import main
+from stitch.errors import InputError
+from stitch.robot import forward, robot_from_dh
+from stitch.session import load_session
+
+
+@pytest.fixture
+def session(tmp_path):
+    """A small blade session on disk."""
+    cell = Cell(scanner=AreaScanner(40, 40))
+    measured = measure(blade_mesh(), cell, 3, 0)
+    write_session(tmp_path / "s", "s", cell, measured, measured.T_mount)
+    return tmp_path / "s"
+
+
+def edit(path, old, new, count=1):
+    text = path.read_text()
+    assert re.search(old, text), (old, text)
+    path.write_text(re.sub(old, new, text, count=count))
+
+
+def test_good_session(session):
+    loaded = load_session(session)
+    assert [view.name for view in loaded.views] == ["v000", "v001", "v002"]
+    assert loaded.mount == "eye_to_hand"
+    assert loaded.scanner.noise == 0.02
+    assert np.allclose(loaded.scanner.optical_axis, [0, 0, 1])
+
+
+def spoil_cell(row, column, value):
+    """An edit of one cell of views.csv."""
+
+    def edit_csv(folder):
+        rows = list(csv.reader(io.StringIO((folder / "views.csv").read_text())))
+        rows[row][rows[0].index(column)] = value
+        (folder / "views.csv").write_text("\n".join(",".join(r) for r in rows) + "\n")
+
+    return edit_csv
+
+
+def remove(name):
+    return lambda folder: (folder / name).unlink()
+
+
+def write_cloud(text):
+    def spoil(folder):
+        (folder / "clouds/v001.xyz").write_text(text)
+        spoil_cell(2, "cloud", "clouds/v001.xyz")(folder)
+
+    return spoil
+
+
+def toml(old, new):
+    return lambda folder: edit(folder / "session.toml", old, new)
+
+
+BAD = {
+    "no session.toml": (remove("session.toml"), ["session.toml", "not found"]),
+    "no views.csv": (remove("views.csv"), ["views.csv", "not found"]),
+    "missing cloud": (remove("clouds/v001.ply"), ["v001", "line 3", "no such cloud"]),
+    "view without pose": (
+        lambda f: [spoil_cell(2, c, "")(f) for c in ("x", "y", "z", "qx", "qy", "qz", "qw")], ["line 3", "v001", "no pose"]),
+    "pose half given": (spoil_cell(2, "qz", ""), ["line 3", "qz"]),
+    "not a number": (spoil_cell(3, "x", "12,5".replace(",", ";")), ["line 4", "x is '12;5'"]),
+    "quaternion": (spoil_cell(1, "qw", "3.0"), ["line 2", "v000", "unit quaternion"]),
+    "twice the same view": (spoil_cell(2, "view", "v000"), ["line 3", "line 2"]),
+    "NaN in a cloud": (write_cloud("1 2 400\nnan 2 400\n"), ["v001", "1 of 2 points"]),
+    "no points": (write_cloud("# x y z\n"), ["v001", "no points"]),
+    "words in a cloud": (write_cloud("1 2 400\n1 two 400\n"), ["v001", "cannot be read"]),
+    "not a rotation": (toml(r"pose = \[\[[^,]*,", "pose = [[2.0,"), ["scanner.pose", "not a rigid motion"]),
+    "metres read as millimetres": (toml('length_unit = "mm"', 'length_unit = "mm"\ncloud_unit = "m"'), ["cloud_unit", "1000", "v000"]),
+    "poses in metres": (toml('length_unit = "mm"', 'length_unit = "m"\ncloud_unit = "mm"'), ["length_unit", "1000"]),
+    "unknown key": (toml("standoff", "standof"), ["scanner.standof", "standoff"]),
+    "wrong mount": (toml("eye_to_hand", "eye_on_hand"), ["mount", "eye_in_hand"]),
+    "wrong unit": (toml('"mm"', '"cm"'), ["length_unit", "'cm'"]),
+    "format": (toml("stitch-session/1", "stitch-session/9"), ["format", "stitch-session/1"]),
+    "broken TOML": (toml("mount = ", "mount "), ["not valid TOML"]),
+    "axis": (toml(r"\+z", "up"), ["optical_axis"]),
+    "noise": (toml("noise = 0.02", "noise = -1"), ["scanner.noise"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_exit_2_and_leaves_nothing(session, tmp_path, capsys, name):
+    spoil, expected = BAD[name]
+    spoil(session)
+    with pytest.raises(InputError) as error:
+        load_session(session)
+    assert "\n" not in str(error.value)
+    for piece in expected:
+        assert piece in str(error.value), str(error.value)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(tmp_path / "out" / "run")])
+    assert ended.value.code == 2
+    assert not (tmp_path / "out").exists()
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.strip() == f"stitch: {error.value}"
+
+
+def test_check_reads_all_and_reports_each(session, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["check", str(session), str(session / "nowhere"), "--json"])
+    assert ended.value.code == 2
+    document = json.loads(capsys.readouterr().out)
+    assert document["sessions"][0]["views"] == 3
+    assert "nowhere" in document["errors"][0]
+
+
+def test_usage_is_exit_2():
+    for arguments in (["run"], ["run", "x", "--no-such-option"], ["fly"]):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 2
+
+
+def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
+    keep = tmp_path / "mine"
+    keep.mkdir()
+    (keep / "thesis.txt").write_text("all of it")
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(keep)])
+    assert ended.value.code == 2
+    assert [path.name for path in keep.iterdir()] == ["thesis.txt"]
+
+
+JOINTS = [{"a": 100, "alpha_deg": 90, "d": 400}, {"a": 500, "d": 0, "alpha_deg": 0}, {"a": 300, "d": 50, "alpha_deg": 20}]
+
+
+def joints_session(folder, rows, header="view,cloud,j1_deg,j2_deg,j3_deg,humidity,note"):
+    rows_text = ", ".join(f"{{ a = {j['a']}, alpha_deg = {j['alpha_deg']}, d = {j['d']} }}" for j in JOINTS)
+    edit(folder / "session.toml", r"\[scanner\]", f'[robot]\ndh = "standard"\njoints = [{rows_text}]\n[scanner]')
+    (folder / "views.csv").write_text("\n".join([header, *rows]) + "\n")
+
+
+def test_joints_give_the_pose_the_approach_and_covariates(session):
+    joints_session(session, ["a,clouds/v000.ply,10,20,30,41,first", "b,clouds/v001.ply,5,20,40,42,", "c,clouds/v002.ply,5,30,20,,x"])
+    views = load_session(session).views
+    robot = robot_from_dh("r", "standard", JOINTS, None, np.zeros(3), "mm")
+    assert np.allclose(views[1].T_base_flange, forward(robot, np.radians([5, 20, 40])))
+    assert views[0].approach.tolist() == [0, 0, 0]
+    assert views[1].approach.tolist() == [-1, 0, 1]
+    assert [view.covariates for view in views] == [{"humidity": 41.0}, {"humidity": 42.0}, {}]
+
+
+def test_joints_and_pose_that_contradict_are_refused(session):
+    rows = (session / "views.csv").read_text().splitlines()
+    header = rows[0] + ",j1_deg,j2_deg,j3_deg"
+    joints_session(session, [row + ",10,20,30" for row in rows[1:]], header)
+    with pytest.raises(InputError, match="line 2.*differ by.*check robot.dh"):
+        load_session(session)
+
+
+def test_robot_with_another_number_of_joints(session):
+    joints_session(session, ["a,clouds/v000.ply,10,20"], "view,cloud,j1_deg,j2_deg")
+    with pytest.raises(InputError, match="2 joint columns, but the robot has 3"):
+        load_session(session)
+
+
+def test_real_sessions_are_read(shared_data):
+    for name, views in (("reghec/david", 9), ("fanuc-line-sphere", 15), ("irb120-tracker", 600), ("ur10-tmac", 1495)):
+        assert len(load_session(shared_data / name).views) == views
