@@ -1,6 +1,6 @@
 """A cell: a scanner that stands still and a part on the flange (or the reverse), and its views."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import trimesh
@@ -18,7 +18,7 @@ class Cell:
     """Lengths in mm, angles in rad. The repeatability is a twist of the flange, new for every view."""
 
     mount: str = "eye_to_hand"
-    scanner: AreaScanner = AreaScanner()
+    scanner: AreaScanner = field(default_factory=AreaScanner)
     repeatability_rotation: float = 20e-6
     repeatability_translation: float = 0.02
     tilt_deg: float = 30.0  # largest tilt of the turning axis between views
@@ -71,5 +71,7 @@ def _part_in_front(mesh: trimesh.Trimesh, cell: Cell, views: int, rng: np.random
 
 def _hand_eye(cell: Cell, rng: np.random.Generator) -> Array:
     if cell.mount == "eye_to_hand":
-        return frames.make(Rotation.from_euler("zyx", [40, 100, 15], degrees=True).as_matrix(), np.array([650.0, -150, 900]))
+        return frames.make(
+            Rotation.from_euler("zyx", [40, 100, 15], degrees=True).as_matrix(), np.array([650.0, -150, 900])
+        )
     return frames.make(Rotation.from_euler("zyx", [25, -4, 3], degrees=True).as_matrix(), np.array([45.0, -20, 95]))

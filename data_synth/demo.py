@@ -45,7 +45,7 @@ def _score(run: Path, T_true: np.ndarray, part: np.ndarray) -> None:
 
     model = read_model(run)
     errors = [
-        np.linalg.norm((frames.transform(T, part[None]) - frames.transform(T_true, part[None])))
+        np.linalg.norm(frames.transform(T, part[None]) - frames.transform(T_true, part[None]))
         for T in (model.T_mount_coarse, model.T_mount)
     ]
     print(

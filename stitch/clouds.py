@@ -60,7 +60,7 @@ def _read_ply(path: Path) -> dict[str, Array]:
 
     data: NDArray[np.void] = PlyData.read(path)["vertex"].data
     # List properties have no column of numbers.
-    return {name: data[name] for name in data.dtype.names or () if data.dtype[name] != object}
+    return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
 
 
 def _read_text(path: Path) -> dict[str, Array]:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+# Positions in other arrays.
+Indices = NDArray[np.int64]
 
 # Below this angle (rad) the closed forms lose digits; their Taylor series to θ⁴ are exact there.
 _SMALL_ANGLE = 1e-3
@@ -94,7 +96,7 @@ def transform(T: Array, points: Array) -> Array:
 
 def rotate(T: Array, vectors: Array) -> Array:
     """Turn directions (..., N, 3) by the rotation of T (..., 4, 4)."""
-    return np.asarray(vectors) @ np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2)
+    return np.asarray(np.asarray(vectors) @ np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2))
 
 
 def from_quaternion(position: Array, quaternion: Array) -> Array:
@@ -108,7 +110,7 @@ def to_quaternion(T: Array) -> Array:
     """Quaternions (..., 4) in the order x, y, z, w, with w ≥ 0."""
     R = np.asarray(T, float)[..., :3, :3]
     quaternion = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
-    return quaternion.reshape(*R.shape[:-2], 4)
+    return np.asarray(quaternion.reshape(*R.shape[:-2], 4))
 
 
 def nearest_rotation(matrix: Array) -> Array:

@@ -114,9 +114,8 @@ def _information(channel: PoseChannel, scatter: Repeatability) -> tuple[Array, A
 
 
 def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
-    information = prior + sum(block[0] for block in blocks)
-    covariance = np.linalg.inv(information)
-    return covariance @ sum(block[1] for block in blocks), covariance
+    covariance: Array = np.linalg.inv(prior + np.sum([block[0] for block in blocks], axis=0))
+    return covariance @ np.sum([block[1] for block in blocks], axis=0), covariance
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stitch import frames
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.scan import Scan
 from stitch.threads import parallel
 
@@ -28,16 +29,17 @@ class Match:
     normal: Array  # (M, 3) unit, mean of the two normals
     residual: Array  # (M,) signed distance (p_v − p_w)·normal
     weight: Array  # (M,) confidence × surface per point, mean 1 over the scan
-    index_v: Array  # (M,) int: point of view v
-    index_w: Array  # (M,) int: point of view w
+    index_v: Indices  # (M,) point of view v
+    index_w: Indices  # (M,) point of view w
 
 
-def sample(scan: Scan, count: int) -> Array:
+def sample(scan: Scan, count: int) -> Indices:
     """Indices of at most `count` usable points, evenly over the scan order; the same every time."""
-    usable = np.flatnonzero(scan.usable)
+    usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
     if len(usable) <= count:
         return usable
-    return usable[np.linspace(0, len(usable) - 1, count).astype(int)]
+    picked: Indices = usable[np.linspace(0, len(usable) - 1, count).astype(int)]
+    return picked
 
 
 def overlapping_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
@@ -61,7 +63,7 @@ def match(
     poses: Array,
     pairs: Sequence[tuple[int, int]],
     gate: float,
-    samples: Sequence[Array],
+    samples: Sequence[Indices],
 ) -> Iterator[Match]:
     """Stream the correspondences of `pairs`: each sampled point with its nearest point of the other.
 
@@ -83,8 +85,8 @@ def match(
 
 
 def search(
-    scan: Scan, other: Scan, index: Array, T_scan: Array, T_other: Array, gate: float
-) -> tuple[Array, Array, Array]:
+    scan: Scan, other: Scan, index: Indices, T_scan: Array, T_other: Array, gate: float
+) -> tuple[Array, Indices, NDArray[np.bool_]]:
     """Distance (inf where none), index of the partner and whether it may be used."""
     # The trees stay in their scanner's frame; the queries travel.
     T_other_scan = frames.inverse(T_other) @ T_scan
@@ -98,8 +100,8 @@ def search(
 
 
 def _partners(
-    scans: Sequence[Scan], poses: Array, index: Array, a: int, b: int, gate: float
-) -> tuple[Array, Array]:
+    scans: Sequence[Scan], poses: Array, index: Indices, a: int, b: int, gate: float
+) -> tuple[Indices, Indices]:
     """Indices (of view a, of view b) of the accepted correspondences."""
     if not len(index):
         return index, index
@@ -107,9 +109,7 @@ def _partners(
     return index[accept], partner[accept]
 
 
-def _measure(
-    scans: Sequence[Scan], poses: Array, v: int, w: int, index_v: Array, index_w: Array
-) -> Match:
+def _measure(scans: Sequence[Scan], poses: Array, v: int, w: int, index_v: Indices, index_w: Indices) -> Match:
     p = frames.transform(poses[v], scans[v].points[index_v])
     q = frames.transform(poses[w], scans[w].points[index_w])
     normal = frames.rotate(poses[v], scans[v].normals[index_v])

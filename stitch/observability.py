@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch import frames, robot as kinematics
+from stitch import frames
+from stitch import robot as kinematics
 from stitch.capture import Capture
 from stitch.frames import Array
 from stitch.robot import Robot
@@ -85,7 +86,7 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
         moving = np.ptp(joints, axis=0) > np.radians(0.5)
         axes = {name: axis for i, (name, axis) in enumerate(axes.items()) if moving[int(name.split()[-1]) - 1]}
     motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
-    U, s, Vt = np.linalg.svd(motions)
+    _U, s, Vt = np.linalg.svd(motions)
     if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):
         axes["the axis about which all views were turned"] = Vt[0]
     return axes

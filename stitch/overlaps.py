@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.capture import Capture
 from stitch.errors import NoResultError
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.match import Match, match, overlapping_pairs
 from stitch.solve import Gram, gram, robust_scale
 
@@ -28,7 +28,7 @@ class Overlaps:
     gate: float
 
 
-def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Array]) -> Overlaps:
+def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> Overlaps:
     """Match all overlapping pairs within `gate` and accumulate their normal equations.
 
     Raises:
@@ -54,5 +54,3 @@ def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
     """Root mean square over the correspondences of all captures, inside the robust gate."""
     square = sum(o.gram.raw_square.sum() for o in overlaps)
     return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))
-
-

@@ -7,7 +7,6 @@ import io
 import struct
 from pathlib import Path
 
-
 import numpy as np
 
 from stitch import lzf
@@ -32,7 +31,9 @@ def read_pcd(path: Path) -> dict[str, Array]:
     if encoding == "binary":
         need = layout.itemsize * count
         if len(body) < need:
-            raise InputError(f"{path}: {count} points announced, data for {len(body) // layout.itemsize}; export it again")
+            raise InputError(
+                f"{path}: {count} points announced, data for {len(body) // layout.itemsize}; export it again"
+            )
         table = np.frombuffer(body, layout, count)
         return {name: table[str(i)] for name, i in _wanted(header).items()}
     if encoding == "binary_compressed":
@@ -64,7 +65,9 @@ def _layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[np.void]
         return np.dtype([(f"{i}", "<" + k, (c,)) if c > 1 else (f"{i}", "<" + k)
                          for i, (k, c) in enumerate(zip(kinds, counts, strict=True))]), count  # fmt: skip
     except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: PCD header is incomplete ({error}); it needs FIELDS, SIZE, TYPE and POINTS") from None
+        raise InputError(
+            f"{path}: PCD header is incomplete ({error}); it needs FIELDS, SIZE, TYPE and POINTS"
+        ) from None
 
 
 def _counts(header: dict[str, list[str]]) -> list[int]:
@@ -94,6 +97,4 @@ def _compressed(
         raise InputError(f"{path}: compressed data are cut short; export it again")
     sizes = [layout[name].itemsize for name in layout.names or ()]
     first = np.concatenate([[0], np.cumsum(sizes)]) * count
-    return {
-        name: np.frombuffer(data, layout[i], count, int(first[i])) for name, i in _wanted(header).items()
-    }
+    return {name: np.frombuffer(data, layout[i], count, int(first[i])) for name, i in _wanted(header).items()}

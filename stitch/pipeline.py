@@ -10,8 +10,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.model import Model, in_unit
 from stitch.noise import noise_floor
-from stitch.overlaps import Overlaps
 from stitch.observability import unobservable
+from stitch.overlaps import Overlaps
 from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.result import Run, StageResult
@@ -80,15 +80,23 @@ def _finish(
     before = correction.start_rms[index]
     stages = [
         StageResult("coarse", before[0], before[1], len(start.candidates), seconds[0], _coarse_note(start)),
-        StageResult("correct", overlaps.gram.rms, int(overlaps.gram.count.sum()), len(correction.history), seconds[1],
-                    _correct_note(before[0], overlaps.gram.rms)),
+        StageResult(
+            "correct",
+            overlaps.gram.rms,
+            int(overlaps.gram.count.sum()),
+            len(correction.history),
+            seconds[1],
+            _correct_note(before[0], overlaps.gram.rms),
+        ),
     ]
     _show(recorder, stages[0], own, own.poses(start.T_mount), before[0])
     _show(recorder, stages[1], own, poses_model, overlaps.gram.rms)
     clock.lap()
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
     final = registration.overlaps
-    stages.append(StageResult("register", final.gram.rms, int(final.gram.count.sum()), len(registration.history), clock.lap()))
+    stages.append(
+        StageResult("register", final.gram.rms, int(final.gram.count.sum()), len(registration.history), clock.lap())
+    )
     fused = fuse(own, registration.poses)
     stages.append(StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap()))
     _show(recorder, stages[2], own, registration.poses, final.gram.rms)
@@ -175,7 +183,9 @@ def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:
                 f"in {first.length_unit}; only sessions of one rig share a hand-eye"
             )
     if model and model.mount != first.mount:
-        raise InputError(f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig")
+        raise InputError(
+            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
+        )
     for session in sessions:
         if any(view.cloud is None for view in session.views):
             raise InputError(f"{session.path}: views without clouds; `stitch run` stitches cloud sessions")

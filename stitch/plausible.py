@@ -28,7 +28,9 @@ def check_scale(session: "Session", cloud_unit: str) -> None:
     for view in session.views:
         if view.cloud is not None:
             distance = float(np.median(np.linalg.norm(view.cloud.points, axis=1)))
-            _refuse(distance * metres, _RANGE_M, f"{toml}: the points of view {view.name} lie", "cloud_unit", cloud_unit)
+            _refuse(
+                distance * metres, _RANGE_M, f"{toml}: the points of view {view.name} lie", "cloud_unit", cloud_unit
+            )
     reach = float(np.max([np.linalg.norm(view.T_base_flange[:3, 3]) for view in session.views]))
     _refuse(reach * metres, _REACH_M, f"{toml}: the flange stands at most", "length_unit", session.length_unit)
     _compare(session, cloud_unit)
@@ -39,7 +41,7 @@ def _refuse(size_m: float, limits: tuple[float, float], what: str, key: str, uni
         return
     shown = f"{size_m * 1e3:.3g} mm" if size_m < 1 else f"{size_m:.3g} m"
     hint = f'the scale looks off by 1000: set {key} = "{_OTHER[unit]}"'
-    raise InputError(f"{what} {shown} away with {key} = \"{unit}\"; {hint}")
+    raise InputError(f'{what} {shown} away with {key} = "{unit}"; {hint}')
 
 
 def _compare(session: "Session", cloud_unit: str) -> None:
@@ -51,6 +53,6 @@ def _compare(session: "Session", cloud_unit: str) -> None:
     ratio = distance / session.scanner.standoff
     if not 0.03 < ratio < 30:
         raise InputError(
-            f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away, but scanner.standoff is "
-            f"{session.scanner.standoff:.3g}; the scale looks off by 1000: check cloud_unit (is \"{cloud_unit}\")"
+            f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away, but "
+            f'scanner.standoff is {session.scanner.standoff:.3g}; the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'
         )

@@ -7,6 +7,7 @@ which holds for any hand-eye.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -89,7 +90,7 @@ def _even_size(points: Array) -> float:
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
 
 
-def _feature_motion(o3d, target, source, size):  # type: ignore[no-untyped-def]
+def _feature_motion(o3d: Any, target: Any, source: Any, size: float) -> Any:
     registration = o3d.pipelines.registration
     result = registration.registration_ransac_based_on_feature_matching(
         source[0], target[0], source[1], target[1], True, 1.5 * size,
@@ -106,8 +107,8 @@ def _feature_motion(o3d, target, source, size):  # type: ignore[no-untyped-def]
 
 def sequence_motions(capture: Capture) -> tuple[Array, Array]:
     """Motions between consecutive views by KISS-ICP, which expects a sequence in small steps."""
-    from kiss_icp.mapping import get_voxel_hash_map
     from kiss_icp.config import KISSConfig
+    from kiss_icp.mapping import get_voxel_hash_map
     from kiss_icp.registration import get_registration
 
     pairs = [(v, v + 1) for v in range(len(capture.scans) - 1)]

@@ -48,7 +48,7 @@ class Robot:
         return bool(self.mass.any() or self.payload_mass)
 
 
-def elementary(axis: str, angle: Array = 0.0, shift: Array = 0.0) -> Array:
+def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
     """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
     angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
     unit = np.eye(3)["xyz".index(axis)]
@@ -129,4 +129,5 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
     beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]
     moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
     moment -= (beyond @ mass)[:, None] * point
-    return np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity)) * robot.metres_per_unit
+    torque = np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity))
+    return np.asarray(torque * robot.metres_per_unit)

@@ -179,5 +179,7 @@ def write_residuals(run: Run, path: Path) -> None:
         if run.session.views[m.v].time_s is not None:
             add("time_s", np.full(size, run.session.views[m.v].time_s))
     columns = {key: np.concatenate(parts) for key, parts in table.items()}
-    arrays = {key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()}
+    arrays = {
+        key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()
+    }
     pq.write_table(pa.table(arrays), path, compression="zstd")

@@ -30,7 +30,9 @@ def robot_from_urdf(
     chain = _chain(path, root, base_link, flange_link)
     links = {link.get("name"): link for link in root.iter("link")}
     scale = 1 / METRES[length_unit]
-    before, after, mass, com = [], [], [], []
+    before: list[Array] = []
+    after: list[Array] = []
+    mass, com = [], []
     pending = np.eye(4)
     for joint in chain:
         pending = pending @ _origin(joint.find("origin"), scale)
@@ -62,11 +64,15 @@ def robot_from_urdf(
 def _chain(path: Path, root: Any, base_link: str | None, flange_link: str | None) -> list[Any]:
     if not base_link or not flange_link:
         raise InputError(f"{path}: robot.urdf needs base_link and flange_link in session.toml")
-    parent_of = {joint.find("child").get("link"): joint for joint in root.iter("joint") if joint.find("child") is not None}
+    parent_of = {
+        joint.find("child").get("link"): joint for joint in root.iter("joint") if joint.find("child") is not None
+    }
     chain, link = [], flange_link
     while link != base_link:
         if link not in parent_of:
-            raise InputError(f"{path}: no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
+            raise InputError(
+                f"{path}: no chain from {base_link} to {flange_link} (stops at {link}); check the link names"
+            )
         chain.append(parent_of[link])
         link = parent_of[link].find("parent").get("link")
     return chain[::-1]
@@ -102,7 +108,11 @@ def to_urdf(robot: Robot) -> str:
     ElementTree.SubElement(root, "link", name="base_link")
     parent, carried = "base_link", np.eye(4)
     for i in range(robot.n_joints):
-        origin = carried @ robot.before[i] @ frames.make(Rotation.from_rotvec([0, 0, robot.theta[i]]).as_matrix(), np.zeros(3))
+        origin = (
+            carried
+            @ robot.before[i]
+            @ frames.make(Rotation.from_rotvec([0, 0, robot.theta[i]]).as_matrix(), np.zeros(3))
+        )
         _add_joint(root, f"joint_{i + 1}", "continuous", parent, f"link_{i + 1}", origin, robot.metres_per_unit)
         parent, carried = f"link_{i + 1}", robot.after[i]
     _add_joint(root, "flange_joint", "fixed", parent, "flange", carried, robot.metres_per_unit)
@@ -118,7 +128,9 @@ def _add_joint(root: Any, name: str, kind: str, parent: str, child: str, T: Arra
         warnings.simplefilter("ignore", UserWarning)
         rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
     xyz = T[:3, 3] * metres
-    ElementTree.SubElement(joint, "origin", xyz=" ".join(repr(float(x)) for x in xyz), rpy=" ".join(repr(float(x)) for x in rpy))
+    ElementTree.SubElement(
+        joint, "origin", xyz=" ".join(repr(float(x)) for x in xyz), rpy=" ".join(repr(float(x)) for x in rpy)
+    )
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
     if kind != "fixed":

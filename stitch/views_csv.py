@@ -59,7 +59,8 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     cells = [(line, _row_cells(file, line, header, row)) for line, row in lines]
     covariates = _covariate_names(header, cells)
     joints = [_joints(file, line, row, header) for line, row in cells]
-    rows, seen = [], {}
+    rows: list[Row] = []
+    seen: dict[str, int] = {}
     for i, (line, row) in enumerate(cells):
         name = row.get("view", "")
         if not name or name in seen:
@@ -86,7 +87,9 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
         missing = ", ".join(name for name in _POSE if name not in header)
         raise InputError(f"{file} line 1: a pose needs {', '.join(_POSE)}; missing {missing}")
     if not pose and not numbers:
-        raise InputError(f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(_POSE)}); one of them is needed")
+        raise InputError(
+            f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(_POSE)}); one of them is needed"
+        )
     if numbers and numbers != list(range(1, len(numbers) + 1)):
         raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
     if numbers and robot and len(numbers) != robot.n_joints:
@@ -128,9 +131,7 @@ def _joints(file: Path, line: int, row: dict[str, str], header: Sequence[str]) -
     return np.radians([_number(file, line, name, row[name]) for name in names])
 
 
-def _approach(
-    file: Path, line: int, row: dict[str, str], joints: Sequence[Array | None], i: int
-) -> Array | None:
+def _approach(file: Path, line: int, row: dict[str, str], joints: Sequence[Array | None], i: int) -> Array | None:
     q = joints[i]
     if q is None:
         return None
@@ -145,19 +146,22 @@ def _approach(
     return out
 
 
-def _flange(
-    file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None
-) -> Array:
+def _flange(file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None) -> Array:
     from_joints = forward(robot, joints) if robot and joints is not None else None
     given = [row.get(column, "") for column in _POSE]
     if not any(given):
         if from_joints is None:
-            raise InputError(f"{file} line {line}: view {name} has no pose; fill {','.join(_POSE)} or the joints, or remove the row")
+            raise InputError(
+                f"{file} line {line}: view {name} has no pose; fill {','.join(_POSE)} or the joints, or remove the row"
+            )
         return from_joints
     values = np.array([_number(file, line, c, cell) for c, cell in zip(_POSE, given, strict=True)])
     norm = float(np.linalg.norm(values[3:]))
     if abs(norm - 1) > _UNIT_TOLERANCE:
-        raise InputError(f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; write a unit quaternion, w last")
+        raise InputError(
+            f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
+            "write a unit quaternion, w last"
+        )
     reported = frames.from_quaternion(values[:3], values[3:] / norm)
     if from_joints is not None:
         _agree(file, line, name, reported, from_joints)

@@ -38,7 +38,9 @@ def blade_mesh():
     return blade.build()
 
 
-def synthetic(seed: int, views: int = 12, mount: str = "eye_to_hand", pixels: int = 110, **cell) -> tuple[Measured, Capture]:
+def synthetic(
+    seed: int, views: int = 12, mount: str = "eye_to_hand", pixels: int = 110, **cell
+) -> tuple[Measured, Capture]:
     """A blade scanned in a cell of known truth."""
     measured = measure(blade_mesh(), Cell(mount=mount, scanner=AreaScanner(pixels, pixels), **cell), views, seed)
     scans = [prepare_view(f"v{i}", cloud) for i, cloud in enumerate(measured.clouds)]

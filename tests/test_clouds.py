@@ -16,7 +16,9 @@ POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
 
 @pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
 def test_ply(tmp_path, text, order):
-    vertex = np.empty(500, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), ("intensity", "u2")])
+    vertex = np.empty(
+        500, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), ("intensity", "u2")]
+    )
     for i, axis in enumerate("xyz"):
         vertex[axis] = POINTS[:, i]
         vertex["n" + axis] = i == 2
@@ -66,7 +68,11 @@ def test_real_pcd_equals_open3d(reghec):
 
 @pytest.mark.parametrize(
     ("suffix", "text"),
-    [(".xyz", "1 2 3 9\n4 5 6 8\n"), (".csv", "x,y,z,intensity\n1,2,3,9\n4,5,6,8\n"), (".txt", "# c\n1;2;3;9\n4;5;6;8\n")],
+    [
+        (".xyz", "1 2 3 9\n4 5 6 8\n"),
+        (".csv", "x,y,z,intensity\n1,2,3,9\n4,5,6,8\n"),
+        (".txt", "# c\n1;2;3;9\n4;5;6;8\n"),
+    ],
 )
 def test_text(tmp_path, suffix, text):
     path = tmp_path / f"c{suffix}"

@@ -73,7 +73,15 @@ def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "runs" / "reghec-rubik"
     assert result == json.loads((folder / "result.json").read_text())
     names = {path.name for path in folder.iterdir()}
-    assert names == {"model.toml", "result.json", "ledger.json", "stitched.ply", "recording.rrd", "report.html", "residuals.parquet"}
+    assert names == {
+        "model.toml",
+        "result.json",
+        "ledger.json",
+        "stitched.ply",
+        "recording.rrd",
+        "report.html",
+        "residuals.parquet",
+    }
     assert (result["format"], result["reference_frame"], result["length_unit"]) == ("stitch-run/1", "base", "mm")
     assert [s["name"] for s in result["stages"]] == ["coarse", "correct", "register", "fuse"]
     with pytest.raises(SystemExit) as ended:

@@ -39,7 +39,12 @@ def test_forward_is_the_product_of_elementary_matrices(convention, order):
     q = np.random.default_rng(0).uniform(-3, 3, 6)
     T = np.eye(4)
     for row, angle in zip(ROWS, q, strict=True):
-        values = {"Rz": angle + np.radians(row["theta_deg"]), "Tz": row["d"], "Tx": row["a"], "Rx": np.radians(row["alpha_deg"])}
+        values = {
+            "Rz": angle + np.radians(row["theta_deg"]),
+            "Tz": row["d"],
+            "Tx": row["a"],
+            "Rx": np.radians(row["alpha_deg"]),
+        }
         for kind in order.split():
             T = T @ np.array(elementary(kind, values[kind]))
     assert np.allclose(forward(robot(convention), q), T, atol=1e-9)

@@ -7,11 +7,11 @@ import re
 
 import numpy as np
 import pytest
+from conftest import blade_mesh
 
 from data_synth.cell import Cell, measure
 from data_synth.scanner import AreaScanner
 from data_synth.write import write_session
-from conftest import blade_mesh
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.robot import forward, robot_from_dh
@@ -138,7 +138,11 @@ def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
     assert [path.name for path in keep.iterdir()] == ["thesis.txt"]
 
 
-JOINTS = [{"a": 100, "alpha_deg": 90, "d": 400}, {"a": 500, "d": 0, "alpha_deg": 0}, {"a": 300, "d": 50, "alpha_deg": 20}]
+JOINTS = [
+    {"a": 100, "alpha_deg": 90, "d": 400},
+    {"a": 500, "d": 0, "alpha_deg": 0},
+    {"a": 300, "d": 50, "alpha_deg": 20},
+]
 
 
 def joints_session(folder, rows, header="view,cloud,j1_deg,j2_deg,j3_deg,humidity,note"):
@@ -148,7 +152,10 @@ def joints_session(folder, rows, header="view,cloud,j1_deg,j2_deg,j3_deg,humidit
 
 
 def test_joints_give_the_pose_the_approach_and_covariates(session):
-    joints_session(session, ["a,clouds/v000.ply,10,20,30,41,first", "b,clouds/v001.ply,5,20,40,42,", "c,clouds/v002.ply,5,30,20,,x"])
+    joints_session(
+        session,
+        ["a,clouds/v000.ply,10,20,30,41,first", "b,clouds/v001.ply,5,20,40,42,", "c,clouds/v002.ply,5,30,20,,x"],
+    )
     views = load_session(session).views
     robot = robot_from_dh("r", "standard", JOINTS, None, np.zeros(3), "mm")
     assert np.allclose(views[1].T_base_flange, forward(robot, np.radians([5, 20, 40])))

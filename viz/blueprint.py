@@ -3,7 +3,7 @@
 import os
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
-import rerun.blueprint as rrb  # noqa: E402
+import rerun.blueprint as rrb
 
 
 def blueprint() -> rrb.Blueprint:

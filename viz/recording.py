@@ -14,7 +14,7 @@ from viz.units import to_micrometres
 from viz.words import run_markdown
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
-import rerun as rr  # noqa: E402  (the switch above must be set before the import)
+import rerun as rr
 
 # What a screen can show; the run folder keeps everything.
 _POINTS_PER_VIEW = 12_000

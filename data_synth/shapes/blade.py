@@ -26,7 +26,7 @@ class Blade:
     around: int = 120
 
 
-def build(blade: Blade = Blade()) -> trimesh.Trimesh:  # noqa: B008  (frozen, hence safe as a default)
+def build(blade: Blade = Blade()) -> trimesh.Trimesh:
     """The closed surfaces of aerofoil, platform and root, as one mesh; they penetrate each other.
 
     A ray from outside meets the outermost surface first, so a scan sees the union.
@@ -57,7 +57,9 @@ def _aerofoil(blade: Blade, bottom: float) -> trimesh.Trimesh:
     shares = np.linspace(0, 1, blade.sections)
     rings = np.array([section(blade, s) for s in shares])
     heights = bottom + blade.span * shares
-    points = np.concatenate([np.column_stack([ring, np.full(len(ring), z)]) for ring, z in zip(rings, heights, strict=True)])
+    points = np.concatenate(
+        [np.column_stack([ring, np.full(len(ring), z)]) for ring, z in zip(rings, heights, strict=True)]
+    )
     n = blade.around
     i = np.arange(n)
     faces = []

@@ -36,7 +36,7 @@ def require_motion(A: Array) -> None:
     if spread[0] == 0:
         raise NoResultError("the motions only translate: the hand-eye's translation cannot be found; turn the flange")
     if spread[1] < _PARALLEL:
-        U, s, Vt = np.linalg.svd(frames.log(np.asarray(A))[:, :3])
+        _U, _s, Vt = np.linalg.svd(frames.log(np.asarray(A))[:, :3])
         axis = ", ".join(f"{x:+.2f}" for x in Vt[0])
         raise NoResultError(
             f"all motions turn about one axis ({axis}): translation along it and rotation about it cannot "
@@ -66,7 +66,7 @@ def tsai_lenz(A: Array, B: Array) -> Array:
     def rodrigues(T: Array) -> Array:
         rotation = frames.log(T)[:, :3]
         angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-        return 2 * np.sin(angle / 2) * rotation / np.maximum(angle, 1e-12)
+        return np.asarray(2 * np.sin(angle / 2) * rotation / np.maximum(angle, 1e-12))
 
     # Their P is that of X⁻¹-free form: P_A = R P_B, so (P_A + P_B) x P' = P_B − P_A gives X's own.
     pa, pb = rodrigues(A), rodrigues(B)

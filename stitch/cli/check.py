@@ -29,8 +29,8 @@ def check(
         print(json.dumps({"sessions": facts, "errors": errors}, indent=1))
     else:
         _print(facts)
-    for error in errors:
-        print(f"stitch: {error}", file=sys.stderr)
+    for line in errors:
+        print(f"stitch: {line}", file=sys.stderr)
     if errors:
         raise typer.Exit(2)
 

@@ -30,7 +30,9 @@ class Progress:
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Show where the iteration stands."""
         if self.status:
-            self.status.update(f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms, partners within {gate * self.to_um:.4g} µm")
+            self.status.update(
+                f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms, partners within {gate * self.to_um:.4g} µm"
+            )
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
         """A stage has ended."""

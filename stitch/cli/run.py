@@ -22,8 +22,12 @@ from stitch.session import Session, load_session
 
 def run(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders of one rig.")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")] = None,
-    hand_eye: Annotated[Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")
+    ] = None,
+    hand_eye: Annotated[
+        Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
+    ] = None,
     effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
@@ -35,7 +39,9 @@ def run(
     loaded = [load_session(path) for path in sessions]
     names = [session.name for session in loaded]
     if len(set(names)) < len(names):
-        raise InputError(f"two sessions are named {max(names, key=names.count)!r}; give each its own name in session.toml")
+        raise InputError(
+            f"two sessions are named {max(names, key=names.count)!r}; give each its own name in session.toml"
+        )
     target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
     model = read_model(hand_eye) if hand_eye else None
     with run_folder.new_folder(target) as scratch:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.capture import Capture
 from stitch.errors import NoResultError
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.match import sample, search
 from stitch.relative_motion import motion_candidates
 from stitch.stages.correct import close_in
@@ -120,7 +120,7 @@ def _starts(captures: Sequence[Capture], tolerance: float) -> list[tuple[str, Ar
 
 def scanner_centre(captures: Sequence[Capture]) -> Array:
     """Mean centroid of the scans in the scanner frame (3,)."""
-    return np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0)
+    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
 
 
 def _turn_about(rotation: Array, centre: Array) -> Array:
@@ -180,7 +180,7 @@ def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> fl
         pairs = [(v, w) for v, w in permutations(range(len(c.scans)), 2) if len(picked[v])]
 
         def mean_square(
-            pair: tuple[int, int], c: Capture = c, poses: Array = poses, picked: list[Array] = picked
+            pair: tuple[int, int], c: Capture = c, poses: Array = poses, picked: list[Indices] = picked
         ) -> float:
             v, w = pair
             distance, _, facing = search(c.scans[v], c.scans[w], picked[v], poses[v], poses[w], limit)
@@ -200,9 +200,7 @@ def _distinct(captures: Sequence[Capture], tried: Sequence[Candidate], tolerance
                 break
         else:
             groups.append([candidate])
-    best = [
-        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=len(group)) for group in groups
-    ]
+    best = [replace(min(group, key=lambda c: c.score), source=group[0].source, reached=len(group)) for group in groups]
     return sorted(best, key=lambda c: c.score)
 
 

@@ -69,9 +69,7 @@ def close_in(
     picked = [[sample(scan, samples) for scan in capture.scans] for capture in captures]
     gates, history = list(gates), []
     for index in range(maximum):
-        overlaps = [
-            collect(c, c.poses(T_mount), gate, s) for c, gate, s in zip(captures, gates, picked, strict=True)
-        ]
+        overlaps = [collect(c, c.poses(T_mount), gate, s) for c, gate, s in zip(captures, gates, picked, strict=True)]
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount)
@@ -85,9 +83,7 @@ def close_in(
     return T_mount, overlaps, history
 
 
-def correct(
-    captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None
-) -> Correction:
+def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None) -> Correction:
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
     Args:

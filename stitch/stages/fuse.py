@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.result import FusedCloud
 from stitch.scan import Scan
 
@@ -22,7 +22,7 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
         its normal (NaN where one view only), and the number of views per point.
     """
     cells = _Cells(capture.scans, poses, cell or capture.spacing)
-    points, normals, weight = cells.mean()
+    points, normals, _weight = cells.mean()
     view_cell, offset, view_weight = cells.view_means(points, normals)
     count = np.bincount(view_cell, minlength=len(points))
     square = np.bincount(view_cell, view_weight * offset**2, len(points))
@@ -70,20 +70,22 @@ class _Cells:
         points = self._sum(self.cell, self.points, self.cells) / weight[:, None]
         normals = self._sum(self.cell, self.normals, self.cells)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return points, normals / np.maximum(length, 1e-12), weight
+        return points, normals / np.maximum(length, 1e-12), np.asarray(weight, float)
 
     def own(self) -> tuple[Array, Array]:
         """Per point: weighted sum of points (N, 3) and weight (N,) of its own view in its cell."""
         _, group = np.unique(self.cell * self.views + self.view, return_inverse=True)
         size = int(group.max()) + 1
-        return self._sum(group, self.points, size)[group], np.bincount(group, self.weight, size)[group]
+        weight: Array = np.asarray(np.bincount(group, self.weight, size), float)
+        return self._sum(group, self.points, size)[group], weight[group]
 
-    def view_means(self, points: Array, normals: Array) -> tuple[Array, Array, Array]:
+    def view_means(self, points: Array, normals: Array) -> tuple[Indices, Array, Array]:
         """Per (cell, view): its cell, the mean offset along the cell's normal, and its weight."""
         offset = np.einsum("ij,ij->i", self.points - points[self.cell], normals[self.cell])
         key, group = np.unique(self.cell * self.views + self.view, return_inverse=True)
-        weight = np.bincount(group, self.weight, len(key))
-        return key // self.views, np.bincount(group, self.weight * offset, len(key)) / weight, weight
+        weight: Array = np.asarray(np.bincount(group, self.weight, len(key)), float)
+        mean: Array = np.bincount(group, self.weight * offset, len(key)) / weight
+        return np.asarray(key // self.views, np.int64), mean, weight
 
-    def _sum(self, group: Array, values: Array, size: int) -> Array:
+    def _sum(self, group: Indices, values: Array, size: int) -> Array:
         return np.stack([np.bincount(group, self.weight * values[:, i], size) for i in range(3)], axis=1)

@@ -21,11 +21,11 @@ from stitch import frames
 from stitch.capture import Capture
 from stitch.frames import Array
 from stitch.match import Match, sample
+from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
 from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.scan import Scan
 from stitch.solve import assemble, gram
-from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
@@ -73,7 +73,11 @@ def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> 
 
 
 def register(
-    capture: Capture, model_poses: Array, scatter: Repeatability, gate: float, recorder: Recorder | None = None,
+    capture: Capture,
+    model_poses: Array,
+    scatter: Repeatability,
+    gate: float,
+    recorder: Recorder | None = None,
     start: Array | None = None,
 ) -> Registration:
     """Move every view by its own twist until the overlaps agree.

@@ -9,8 +9,8 @@ from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, scatter_of
 from stitch.match import sample
 from stitch.model import Model
-from stitch.stages.coarse import part_size
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.stages.coarse import part_size
 from stitch.stages.correct import Correction
 
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
