@@ -54,5 +54,6 @@ def _compare(session: "Session", cloud_unit: str) -> None:
     if not 0.03 < ratio < 30:
         raise InputError(
             f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away, but "
-            f'scanner.standoff is {session.scanner.standoff:.3g}; the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'
+            f"scanner.standoff is {session.scanner.standoff:.3g}; "
+            f'the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'
         )
