@@ -66,7 +66,8 @@ def together(folder: Path, runs) -> None:
     sigma = np.sqrt(np.diag(joint[0].mount_covariance))
     best = min(np.sqrt(np.trace(runs[n].mount_covariance[3:, 3:])) for n in IN_HAND)
     print(
-        f"\nTogether: one hand-eye, translation sigma {np.linalg.norm(sigma[3:]):.2f} mm (best single object {best:.2f} mm); "
+        f"\nTogether: one hand-eye, translation sigma {np.linalg.norm(sigma[3:]):.2f} mm "
+        f"(best single object {best:.2f} mm); "
         "after register "
         + ", ".join(f"{n} {r.stages[2].rms * 1e3:.0f} µm" for n, r in zip(IN_HAND, joint, strict=True))
         + "."
