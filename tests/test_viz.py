@@ -45,14 +45,14 @@ def test_recording_is_whole_and_shows_every_stage(recorded):
     assert rerun("rrd", "verify", str(path)).returncode == 0
     printed = rerun("rrd", "print", str(path)).stdout
     for entity in (
-        "/scans/v000/by_view",
-        "/scans/v004/by_residual",
+        "/scans/by_view/v000",
+        "/scans/by_residual/v004",
         "/fused",
         "/verdict",
         "/before",
         "/after",
-        "/convergence/correct/rms_um",
-        "/convergence/register/rms_um",
+        "/convergence/rms_um/correct",
+        "/convergence/rms_um/register",
         "/views/correction_um",
         "/robot/flange_path",
     ):

@@ -25,12 +25,12 @@ def blueprint() -> rrb.Blueprint:
     )
     steps = rrb.Horizontal(
         rrb.Vertical(
-            rrb.Spatial3DView(origin="scans", contents=["scans/**", "- scans/*/by_residual"], name="Scans by view"),
-            rrb.Spatial3DView(origin="scans", contents=["scans/**", "- scans/*/by_view"], name="Scans by residual"),
+            rrb.Spatial3DView(origin="scans/by_view", name="Scans by view"),
+            rrb.Spatial3DView(origin="scans/by_residual", name="Scans by distance from the other views (from the end of each stage)"),
         ),
         rrb.Vertical(
-            rrb.TimeSeriesView(origin="convergence", contents=["convergence/*/rms_um"], name="Rms (µm)"),
-            rrb.TimeSeriesView(origin="convergence", contents=["convergence/*/gate_um"], name="Gate (µm)"),
+            rrb.TimeSeriesView(origin="convergence/rms_um", name="Rms (µm)"),
+            rrb.TimeSeriesView(origin="convergence/gate_um", name="Gate: partners within (µm)"),
             rrb.Spatial3DView(origin="robot", name="Robot: flange poses in the base frame"),
             rrb.TextLogView(origin="log", name="Stages"),
         ),

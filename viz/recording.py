@@ -48,7 +48,7 @@ class RerunRecorder:
             pick = np.linspace(0, len(points) - 1, min(len(points), _POINTS_PER_VIEW)).astype(int)
             self.picked.append(pick)
             self.clouds.append(points[pick].astype(np.float32))
-            rec.log(f"scans/{view.name}/by_view", rr.Points3D(self.clouds[-1], colors=[colour]), static=True)
+            rec.log(f"scans/by_view/{view.name}", rr.Points3D(self.clouds[-1], colors=[colour]), static=True)
         flange = np.array([view.T_base_flange for view in session.views])
         rec.log("robot/flange_path", rr.LineStrips3D([flange[:, :3, 3]], colors=[(90, 90, 90)]), static=True)
         size = 0.05 * float(np.ptp(flange[:, :3, 3], axis=0).max() + 1e-9)
@@ -60,8 +60,8 @@ class RerunRecorder:
         """Move the scans, add a point to the curves."""
         self._at_next_step()
         self._move(poses)
-        self.recording.log(f"convergence/{stage}/rms_um", rr.Scalars(rms * self.to_um))
-        self.recording.log(f"convergence/{stage}/gate_um", rr.Scalars(gate * self.to_um))
+        self.recording.log(f"convergence/rms_um/{stage}", rr.Scalars(rms * self.to_um))
+        self.recording.log(f"convergence/gate_um/{stage}", rr.Scalars(gate * self.to_um))
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
         """Colour the scans by their distance from the other views, at the end of a stage."""
@@ -71,7 +71,7 @@ class RerunRecorder:
         limit = robust_limit(np.concatenate(residuals))
         for name, cloud, pick, residual in zip(self.names, self.clouds, self.picked, residuals, strict=True):
             colours = signed_colours(residual[pick], limit)
-            rec.log(f"scans/{name}/by_residual", rr.Points3D(cloud, colors=colours))
+            rec.log(f"scans/by_residual/{name}", rr.Points3D(cloud, colors=colours))
         self._snapshot(result.name, poses, residuals, limit)
         text = f"{result.name}: {result.rms * self.to_um:.1f} µm rms, full colour at ±{limit * self.to_um:.0f} µm"
         rec.log("log", rr.TextLog(text))
@@ -105,7 +105,9 @@ class RerunRecorder:
 
     def _move(self, poses: Array) -> None:
         for name, T in zip(self.names, poses, strict=True):
-            self.recording.log(f"scans/{name}", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+            placed = rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+            for colouring in ("by_view", "by_residual"):
+                self.recording.log(f"scans/{colouring}/{name}", placed)
 
     def _at_next_step(self) -> None:
         self.step += 1
