@@ -120,7 +120,7 @@ def speed() -> None:
     """Seconds of every stage with a coarse hand-eye given."""
     import time
 
-    m = measure(blade.build(), Cell(scanner=AreaScanner(280, 280)), 18, 0)
+    m = measure(blade.build(), Cell(scanner=AreaScanner(320, 320)), 18, 0)
     marks = [time.perf_counter()]
     c = place("blade", [prepare_view(str(i), p) for i, p in enumerate(m.clouds)], m.T_base_flange, "eye_to_hand")
     marks.append(time.perf_counter())

@@ -8,22 +8,23 @@ import numpy as np
 from stitch.capture import Capture, capture
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.match import sample
 from stitch.model import Model, in_unit
 from stitch.noise import noise_floor
 from stitch.observability import unobservable
-from stitch.overlaps import Overlaps
+from stitch.overlaps import Overlaps, collect
 from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.result import Run, StageResult
 from stitch.session import Session
 from stitch.solve import RMS_GATE
 from stitch.stages.coarse import Coarse, coarse, given
-from stitch.stages.correct import Correction, correct
+from stitch.stages.correct import COARSE_SAMPLES, Correction, correct
 from stitch.stages.fuse import fuse, view_residuals
 from stitch.stages.register import register
 from stitch.stages.reuse import reuse
 from stitch.threads import library_threads_off
-from stitch.verdict import sentence
+from stitch.verdict import coarse_note, correct_note, sentence, warnings
 
 
 def run(session: Session, model: Model | None = None, recorder: Recorder | None = None) -> Run:
@@ -54,43 +55,45 @@ def _run_rig(sessions: Sequence[Session], model: Model | None, recorders: Sequen
     if model:
         model = in_unit(model, sessions[0].length_unit)
         start = given(captures, model.T_mount)
-        correction = reuse(captures, model)
     else:
         known = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
         start = coarse(captures) if known is None else given(captures, known)
-    coarse_seconds = clock.lap()
-    if not model:
+    seconds = clock.lap()
+    before = [_begin(c, start, seconds, r) for c, r in zip(captures, recorders, strict=True)]
+    clock.lap()
+    if model:
+        correction = reuse(captures, model)
+    else:
         correction = correct(captures, start.T_mount, start.gate, recorders[0])
-    seconds = (coarse_seconds, clock.lap())
+    seconds = clock.lap()
     return [
-        _finish(session, captures[i], i, start, correction, captures, recorders[i], seconds)
+        _finish(session, captures[i], i, start, before[i], correction, captures, recorders[i], seconds)
         for i, session in enumerate(sessions)
     ]
 
 
+def _begin(own: Capture, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+    """How well the views of one session meet under the coarse hand-eye."""
+    poses = own.poses(start.T_mount)
+    g = collect(own, poses, start.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
+    stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
+    _show(recorder, stage, own, poses, g.rms)
+    return stage
+
+
 def _finish(
-    session: Session, own: Capture, index: int, start: Coarse, correction: Correction,
-    captures: Sequence[Capture], recorder: Recorder, seconds: tuple[float, float],
+    session: Session, own: Capture, index: int, start: Coarse, before: StageResult, correction: Correction,
+    captures: Sequence[Capture], recorder: Recorder, seconds: float,
 ) -> Run:  # fmt: skip
     """Register and fuse one session under the common hand-eye, and tell the recorder."""
     clock = _Clock()
     hand_eye, overlaps = correction.hand_eye, correction.overlaps[index]
     scatter: Repeatability = hand_eye.repeatability[index]
     poses_model = own.poses(hand_eye.T_mount)
-    before = correction.start_rms[index]
-    stages = [
-        StageResult("coarse", before[0], before[1], len(start.candidates), seconds[0], _coarse_note(start)),
-        StageResult(
-            "correct",
-            overlaps.gram.rms,
-            int(overlaps.gram.count.sum()),
-            len(correction.history),
-            seconds[1],
-            _correct_note(before[0], overlaps.gram.rms),
-        ),
-    ]
-    _show(recorder, stages[0], own, own.poses(start.T_mount), before[0])
-    _show(recorder, stages[1], own, poses_model, overlaps.gram.rms)
+    g, iterations = overlaps.gram, len(correction.history)
+    note = correct_note(before.rms, g.rms)
+    stages = [before, StageResult("correct", g.rms, int(g.count.sum()), iterations, seconds, note)]
+    _show(recorder, stages[1], own, poses_model, g.rms)
     clock.lap()
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
     final = registration.overlaps
@@ -112,7 +115,7 @@ def _finish(
         noise_floor=floor, fused=fused, repeatability=scatter, overlaps=overlaps,
         verdict=sentence(overlaps.gram.rms, final.gram.rms, floor, scatter, session.length_unit),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
-        notes=_notes(start, hand_eye.inflation),
+        notes=warnings(start, hand_eye.inflation),
     )  # fmt: skip
     recorder.finish(result)
     return result
@@ -139,39 +142,6 @@ def _fused_rms(residual: Array) -> float:
         return float("nan")
     # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
     return float(np.sqrt(np.mean(seen[seen < RMS_GATE * 1.4826 * np.median(seen)] ** 2)))
-
-
-def _correct_note(before: float, after: float) -> str:
-    if after > before:
-        return "views weighed by the robot's scatter: the hand-eye is more certain, single overlaps fit less tightly"
-    return ""
-
-
-def _coarse_note(start: Coarse) -> str:
-    """Where the hand-eye came from, and how far the second answer was."""
-    if not start.candidates:
-        return start.source
-    best = start.candidates[0]
-    tried = sum(c.reached for c in start.candidates)
-    found = f"found from {best.source}; {best.reached} of {tried} starts ended there"
-    if len(start.candidates) == 1:
-        return f"{found}, no other answer"
-    return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
-
-
-def _notes(start: Coarse, inflation: float) -> tuple[str, ...]:
-    notes = []
-    if start.candidates and start.runner_up_ratio < 1.1:
-        notes.append(
-            f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}): "
-            "give scanner.pose, or add views with other orientations."
-        )
-    if inflation > 2:
-        notes.append(
-            f"Leaving views out moves the hand-eye {np.sqrt(inflation):.1f} times more than independent pose "
-            "errors would; its sigma was widened by that factor."
-        )
-    return tuple(notes)
 
 
 def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:

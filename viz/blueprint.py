@@ -26,7 +26,7 @@ def blueprint() -> rrb.Blueprint:
     steps = rrb.Horizontal(
         rrb.Vertical(
             rrb.Spatial3DView(origin="scans/by_view", name="Scans by view"),
-            rrb.Spatial3DView(origin="scans/by_residual", name="Scans by distance from the other views (from the end of each stage)"),
+            rrb.Spatial3DView(origin="scans/by_residual", name="Scans by distance from the others"),
         ),
         rrb.Vertical(
             rrb.TimeSeriesView(origin="convergence/rms_um", name="Rms (µm)"),
@@ -36,4 +36,6 @@ def blueprint() -> rrb.Blueprint:
         ),
         column_shares=[3, 2], name="Every iteration",
     )  # fmt: skip
-    return rrb.Blueprint(rrb.Tabs(result, compare, steps, active_tab=0), collapse_panels=True)
+    # Opens at the end of the timeline: the result is there, the way back is the slider.
+    time = rrb.TimePanel(state="collapsed", timeline="step", play_state="following")
+    return rrb.Blueprint(rrb.Tabs(result, compare, steps, active_tab=0), time, collapse_panels=True)

@@ -35,7 +35,6 @@ class Correction:
     overlaps: tuple[Overlaps, ...]
     freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
-    start_rms: tuple[tuple[float, int], ...]  # per capture: rms and correspondences under the start
 
 
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
@@ -94,7 +93,6 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
     Raises:
         NoResultError: no two views of a capture overlap.
     """
-    start = [collect(c, c.poses(T_mount), gate, [sample(s, COARSE_SAMPLES) for s in c.scans]).gram for c in captures]
     T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
     T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 2, recorder)
@@ -104,6 +102,5 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)
     )
-    start_rms = tuple((g.rms, int(g.count.sum())) for g in start)
     poses = tuple(f.poses for f in freed)
-    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)), start_rms)
+    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)))

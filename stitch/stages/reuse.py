@@ -30,8 +30,7 @@ def reuse(captures: Sequence[Capture], model: Model) -> Correction:
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(scatter_of(c, f, T) for c, f, T in zip(captures, freed, poses, strict=True))
     hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
-    rms = tuple((o.gram.rms, int(o.gram.count.sum())) for o in overlaps)
-    return Correction(hand_eye, overlaps, tuple(f.poses for f in freed), (pooled_rms(overlaps),), rms)
+    return Correction(hand_eye, overlaps, tuple(f.poses for f in freed), (pooled_rms(overlaps),))
 
 
 def _settle(capture: Capture, model: Model, gate: float) -> Overlaps:
