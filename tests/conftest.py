@@ -39,7 +39,7 @@ def blade_mesh():
 
 
 def synthetic(
-    seed: int, views: int = 12, mount: str = "eye_to_hand", pixels: int = 110, **cell
+    seed: int, views: int = 12, mount: str = "eye_to_hand", pixels: int = 150, **cell
 ) -> tuple[Measured, Capture]:
     """A blade scanned in a cell of known truth."""
     measured = measure(blade_mesh(), Cell(mount=mount, scanner=AreaScanner(pixels, pixels), **cell), views, seed)

@@ -28,7 +28,7 @@ def test_hand_eye_error_is_what_the_covariance_predicts(mount):
     """From 5° and 30 mm, 20 seeds: rms error at the part below 1.2 of the prediction, sigmas honest."""
     errors, predicted, z = [], [], []
     for seed in range(20):
-        measured, capture = synthetic(seed, mount=mount, pixels=80)
+        measured, capture = synthetic(seed, mount=mount)
         start = disturbed(measured.T_mount, seed)
         found = correct([capture], start, 0.35 * part_size([capture])).hand_eye
         xi = frames.log(frames.inverse(measured.T_mount) @ found.T_mount)
@@ -75,7 +75,7 @@ def test_perfect_poses_leave_the_noise_that_was_put_in():
 
 def test_several_captures_share_one_hand_eye():
     """Two sessions of one rig know the hand-eye better than either."""
-    cells = [synthetic(seed, views=8, pixels=80) for seed in (3, 4)]
+    cells = [synthetic(seed, views=8) for seed in (3, 4)]
     captures = [capture for _, capture in cells]
     start = disturbed(cells[0][0].T_mount, 1, 2.0, 10.0)
     both = correct(captures, start, 15.0).hand_eye
