@@ -4,9 +4,11 @@ PYTHON := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
 # uv if it is on the path, else venv and pip.
 UV := $(shell command -v uv 2>/dev/null)
-# The first Python that all wheels serve.
-BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do \
-	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && { echo $$p; break; }; done)
+RANGE := >=3.11,<3.14
+# True for a Python that all wheels serve.
+SERVES := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
+BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do $$p $(SERVES) && { echo $$p; break; }; done)
+PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
 
 export RERUN_ANALYTICS ?= off
 
@@ -14,16 +16,19 @@ export RERUN_ANALYTICS ?= off
 
 install: $(STAMP)
 
+# A .venv that an interrupted or failed attempt left behind is made anew.
 $(STAMP): pyproject.toml constraints.txt
-	@test -n "$(BASE)$(UV)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path" >&2; exit 2; }
 ifdef UV
-	@test -x $(PYTHON) || uv venv --quiet --python ">=3.11,<3.14" $(VENV)
+	@$(PYTHON) $(SERVES) || uv venv --quiet --clear --python "$(or $(BASE),$(RANGE))" $(VENV) || \
+		{ echo "stitch needs Python 3.11, 3.12 or 3.13: none was found" >&2; exit 2; }
 	uv pip install --quiet --python $(PYTHON) --require-hashes -r constraints.txt
 	uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
 else
-	@test -x $(PYTHON) || $(BASE) -m venv $(VENV) || { echo "python3 has no venv module: on Debian it is in python3-venv" >&2; exit 2; }
-	$(PYTHON) -m pip install --quiet --disable-pip-version-check --require-hashes -r constraints.txt
-	$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path" >&2; exit 2; }
+	@{ $(PYTHON) $(SERVES) && $(PIP) --version >/dev/null 2>&1; } || $(BASE) -m venv --clear $(VENV) || \
+		{ echo "$(BASE) has no venv module: on Debian it is in python3-venv" >&2; exit 2; }
+	$(PIP) install --require-hashes -r constraints.txt
+	$(PIP) install --no-deps --no-build-isolation -e .
 endif
 	@touch $@
 
@@ -39,10 +44,12 @@ check: install
 	$(VENV)/bin/mypy
 	$(PYTHON) -m pytest --cov
 
-# Pins every package with hashes; no addresses are written.
+# Pins every package with hashes. What other indexes or settings of this machine might write into it is refused.
 lock:
+	@command -v uv >/dev/null || { echo "make lock needs uv" >&2; exit 2; }
 	uv pip compile pyproject.toml constraints.in --extra dev --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints.txt
+	@! grep -nE '://| @ |^-' constraints.txt || { echo "constraints.txt names an address" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage build *.egg-info

@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.robot_table import gravity_of, known_keys, numbers, payload_of, point_mass
 
 METRES = {"mm": 1e-3, "m": 1.0}
+_DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")
 
 
 @dataclass(frozen=True)
@@ -63,10 +65,16 @@ def robot_from_dh(
     """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
 
     Raises:
-        InputError: unknown convention.
+        InputError: unknown convention or key, no row, or a value that is not a finite number.
     """
+    if not joints:
+        raise InputError("robot.joints is empty; write one DH row a joint")
+    rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
+    for where, row in rows:
+        known_keys(where, row, _DH_KEYS)
     a, alpha, d, theta = (
-        np.array([float(j.get(key, 0.0)) for j in joints]) for key in ("a", "alpha_deg", "d", "theta_deg")
+        np.array([float(numbers(where, row, key, ())) for where, row in rows])
+        for key in ("a", "alpha_deg", "d", "theta_deg")
     )
     alpha, theta = np.radians(alpha), np.radians(theta)
     still = np.broadcast_to(np.eye(4), (len(a), 4, 4))
@@ -76,12 +84,10 @@ def robot_from_dh(
         before, after = elementary("x", alpha, a), elementary("z", 0, d)
     else:
         raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
-    mass = np.array([float(j.get("mass", 0.0)) for j in joints])
-    com = np.array([j.get("com", (0.0, 0.0, 0.0)) for j in joints], float)
-    payload = payload or {}
+    masses = [point_mass(where, row) for where, row in rows]
     return Robot(
-        name, convention, before, after, theta, mass, com, float(payload.get("mass", 0.0)),
-        np.array(payload.get("com", (0.0, 0.0, 0.0)), float), np.asarray(gravity, float),
+        name, convention, before, after, theta, np.array([m for m, _ in masses]),
+        np.array([c for _, c in masses]), *payload_of(payload), gravity_of(gravity),
         METRES[length_unit], a, alpha, d,
     )  # fmt: skip
 
@@ -108,7 +114,10 @@ def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
 
 
 def jacobian(robot: Robot, joints: Array) -> Array:
-    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first."""
+    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
+
+    The columns are the joint screws seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    """
     point, axis = joint_axes(robot, joints)
     T = forward(robot, joints)
     lever = T[..., None, :3, 3] - point
@@ -118,7 +127,10 @@ def jacobian(robot: Robot, joints: Array) -> Array:
 
 
 def gravity_torques(robot: Robot, joints: Array) -> Array:
-    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond."""
+    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
+
+    Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
+    """
     link = link_frames(robot, joints)
     point, axis = joint_axes(robot, joints)
     centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]

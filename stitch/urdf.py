@@ -1,7 +1,7 @@
-"""Robots from URDF, and to URDF. URDF counts in metres and radians."""
+"""Robots from URDF. URDF counts in metres and radians (http://wiki.ros.org/urdf/XML)."""
 
-import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,126 +12,151 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot import METRES, Robot
+from stitch.robot_table import gravity_of, payload_of
+from stitch.urdf_write import to_urdf
+
+__all__ = ["robot_from_urdf", "to_urdf"]
+Element = ElementTree.Element
 
 
 def robot_from_urdf(
-    path: Path, base_link: str | None, flange_link: str | None, length_unit: str, gravity: Array,
+    path: Path | str, base_link: str | None, flange_link: str | None, length_unit: str, gravity: Array,
     payload: dict[str, Any] | None = None,
 ) -> Robot:  # fmt: skip
-    """The serial chain base_link → flange_link; masses of links fixed to a moving one are not counted.
+    """The serial chain base_link → flange_link, in length_unit.
+
+    Fixed joints are merged. A link's mass includes all links fixed to it, a tool beyond the flange too:
+    `payload` comes on top. Links on moving side branches (fingers) are not counted.
 
     Raises:
-        InputError: no such link, no chain between them, or a joint that does not turn.
+        InputError: unreadable, no such link, no chain between them, or a joint that does not turn freely.
     """
+    path = Path(path)
     try:
-        root = ElementTree.parse(path).getroot()
+        robot = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}") from None
-    chain = _chain(path, root, base_link, flange_link)
-    links = {link.get("name"): link for link in root.iter("link")}
-    scale = 1 / METRES[length_unit]
+    try:
+        return _robot(path, robot, base_link, flange_link, 1 / METRES[length_unit], gravity, payload)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _robot(
+    path: Path, root: Element, base_link: str | None, flange_link: str | None, scale: float, gravity: Array,
+    payload: dict[str, Any] | None,
+) -> Robot:  # fmt: skip
     before: list[Array] = []
     after: list[Array] = []
     mass, com = [], []
     pending = np.eye(4)
-    for joint in chain:
-        pending = pending @ _origin(joint.find("origin"), scale)
-        kind = joint.get("type")
-        if kind == "fixed":
-            if after:
-                after[-1], pending = after[-1] @ pending, np.eye(4)
+    for joint in _chain(root, base_link, flange_link):
+        pending = pending @ _origin(joint, scale)
+        if joint.get("type") == "fixed":
             continue
-        if kind not in ("revolute", "continuous") or joint.find("mimic") is not None:
-            raise InputError(f"{path}: joint {joint.get('name')} is {kind}; only independent revolute joints are known")
-        turn = _turn_to_z(joint.find("axis"))
+        _require_turning(joint)
+        turn = _turn_to_z(joint)
         before.append(pending @ turn)
         after.append(frames.inverse(turn))
-        child = joint.find("child")
-        m, c = _inertia(links.get(child.get("link") if child is not None else None), scale)
-        mass.append(m)
-        com.append(c)
+        body = list(_rigid_body(root, _end(joint, "child"), scale))
+        mass.append(sum(m for m, _ in body))
+        com.append(sum((m * c for m, c in body), np.zeros(3)) / (mass[-1] or 1.0))
         pending = np.eye(4)
     if not before:
-        raise InputError(f"{path}: no revolute joint between {base_link} and {flange_link}")
-    payload = payload or {}
+        raise InputError(f"no revolute joint between {base_link} and {flange_link}")
+    # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
+    after[-1] = after[-1] @ pending
+    com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
     return Robot(
         str(root.get("name", path.stem)), "urdf", np.array(before), np.array(after), np.zeros(len(before)),
-        np.array(mass), np.array(com), float(payload.get("mass", 0.0)),
-        np.array(payload.get("com", (0.0, 0.0, 0.0)), float), np.asarray(gravity, float), METRES[length_unit],
+        np.array(mass), np.array(com), *payload_of(payload), gravity_of(gravity), 1 / scale,
     )  # fmt: skip
 
 
-def _chain(path: Path, root: Any, base_link: str | None, flange_link: str | None) -> list[Any]:
+def _chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
+    """Joints from base to flange; walked backwards, because a link has one parent."""
+    parent_of: dict[str, Element] = {}
+    for joint in root.findall("joint"):
+        child = _end(joint, "child")
+        if child in parent_of:
+            raise InputError(f"link {child} hangs on two joints; a URDF is a tree")
+        parent_of[child] = joint
     if not base_link or not flange_link:
-        raise InputError(f"{path}: robot.urdf needs base_link and flange_link in session.toml")
-    parent_of = {
-        joint.find("child").get("link"): joint for joint in root.iter("joint") if joint.find("child") is not None
-    }
-    chain, link = [], flange_link
+        parents = {_end(joint, "parent") for joint in parent_of.values()}
+        roots, ends = (", ".join(sorted(names)) for names in (parents - set(parent_of), set(parent_of) - parents))
+        raise InputError(
+            "robot.urdf needs base_link and flange_link in session.toml; the tree starts at "
+            f"{roots or '?'} and ends at {ends}"
+        )
+    chain: list[Element] = []
+    link = flange_link
     while link != base_link:
-        if link not in parent_of:
-            raise InputError(
-                f"{path}: no chain from {base_link} to {flange_link} (stops at {link}); check the link names"
-            )
+        if link not in parent_of or parent_of[link] in chain:
+            raise InputError(f"no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
         chain.append(parent_of[link])
-        link = parent_of[link].find("parent").get("link")
+        link = _end(chain[-1], "parent")
     return chain[::-1]
 
 
-def _origin(element: Any, scale: float) -> Array:
-    if element is None:
-        return np.eye(4)
-    xyz, rpy = (np.array((element.get(key) or "0 0 0").split(), float) for key in ("xyz", "rpy"))
+def _end(joint: Element, kind: str) -> str:
+    element = joint.find(kind)
+    if element is None or not element.get("link"):
+        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>")
+    return str(element.get("link"))
+
+
+def _require_turning(joint: Element) -> None:
+    name, kind = joint.get("name"), joint.get("type")
+    if kind not in ("revolute", "continuous"):
+        raise InputError(f"joint {name} is {kind}; only revolute and continuous joints are known")
+    if joint.find("mimic") is not None:
+        raise InputError(f"joint {name} copies another joint (mimic); only independent revolute joints are known")
+
+
+def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
+    """Mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
+    waiting = [(link, np.eye(4))]
+    while waiting:
+        name, T = waiting.pop()
+        element = next((e for e in root.findall("link") if e.get("name") == name), None)
+        inertial = None if element is None else element.find("inertial")
+        if inertial is not None and inertial.find("mass") is not None:
+            mass = _values(inertial.find("mass"), "value", "0", f"link {name}")
+            if len(mass) != 1 or mass[0] < 0:
+                raise InputError(f"link {name}: mass is not a positive number")
+            yield float(mass[0]), (T @ _origin(inertial, scale, f"link {name}"))[:3, 3]
+        for joint in root.findall("joint"):
+            if joint.get("type") == "fixed" and _end(joint, "parent") == name:
+                waiting.append((_end(joint, "child"), T @ _origin(joint, scale)))
+
+
+def _origin(owner: Element, scale: float, where: str = "") -> Array:
+    where = where or f"joint {owner.get('name')}"
+    element = owner.find("origin")
+    xyz, rpy = (_values(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
     return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
 
 
-def _turn_to_z(axis: Any) -> Array:
+def _values(element: Element | None, key: str, default: str, where: str) -> Array:
+    """The numbers of an attribute, as many as its default has."""
+    text = default if element is None else element.get(key) or default
+    try:
+        values = np.array(text.split(), float)
+    except ValueError:
+        values = np.array([np.nan])
+    if len(values) != len(default.split()) or not np.isfinite(values).all():
+        raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
+    return values
+
+
+def _turn_to_z(joint: Element) -> Array:
     """A rotation whose z axis is the joint's axis; URDF's default axis is x."""
-    direction = np.array((axis.get("xyz") if axis is not None else "1 0 0").split(), float)
-    direction /= np.linalg.norm(direction)
+    direction = _values(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
+    length = np.linalg.norm(direction)
+    if length < 1e-9:
+        raise InputError(f"axis of joint {joint.get('name')} has no direction")
+    direction /= length
     helper = np.eye(3)[np.abs(direction).argmin()]
     x = np.cross(helper, direction)
     x /= np.linalg.norm(x)
     return frames.make(np.column_stack([x, np.cross(direction, x), direction]), np.zeros(3))
-
-
-def _inertia(link: Any, scale: float) -> tuple[float, Array]:
-    inertial = None if link is None else link.find("inertial")
-    if inertial is None or inertial.find("mass") is None:
-        return 0.0, np.zeros(3)
-    return float(inertial.find("mass").get("value")), _origin(inertial.find("origin"), scale)[:3, 3]
-
-
-def to_urdf(robot: Robot) -> str:
-    """The same chain as URDF, so that every joint angle gives the same flange pose."""
-    root = ElementTree.Element("robot", name=robot.name or "robot")
-    ElementTree.SubElement(root, "link", name="base_link")
-    parent, carried = "base_link", np.eye(4)
-    for i in range(robot.n_joints):
-        origin = (
-            carried
-            @ robot.before[i]
-            @ frames.make(Rotation.from_rotvec([0, 0, robot.theta[i]]).as_matrix(), np.zeros(3))
-        )
-        _add_joint(root, f"joint_{i + 1}", "continuous", parent, f"link_{i + 1}", origin, robot.metres_per_unit)
-        parent, carried = f"link_{i + 1}", robot.after[i]
-    _add_joint(root, "flange_joint", "fixed", parent, "flange", carried, robot.metres_per_unit)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
-
-
-def _add_joint(root: Any, name: str, kind: str, parent: str, child: str, T: Array, metres: float) -> None:
-    ElementTree.SubElement(root, "link", name=child)
-    joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
-    with warnings.catch_warnings():
-        # At a pitch of 90° roll and yaw are one angle: any split of it is the same rotation.
-        warnings.simplefilter("ignore", UserWarning)
-        rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
-    xyz = T[:3, 3] * metres
-    ElementTree.SubElement(
-        joint, "origin", xyz=" ".join(repr(float(x)) for x in xyz), rpy=" ".join(repr(float(x)) for x in rpy)
-    )
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=child)
-    if kind != "fixed":
-        ElementTree.SubElement(joint, "axis", xyz="0 0 1")
