@@ -14,9 +14,12 @@ import numpy as np
 from stitch import frames
 from stitch.capture import Capture
 from stitch.frames import Array
-from stitch.free_poses import FreePoses
+from stitch.free_poses import FreePoses, visible_directions
 from stitch.repeatability import PoseChannel, Repeatability, covariance_of, estimate, pose_channel
 from stitch.solve import Gram, pair_squares
+
+_DRAWS = 200
+_NOTHING = (np.zeros((6, 6)), np.zeros((6, 1 + _DRAWS)))
 
 
 @dataclass(frozen=True)
@@ -45,18 +48,21 @@ def fit_hand_eye(captures: Sequence[Capture], freed: Sequence[FreePoses], T_moun
     evidence = [_Evidence(c, f.overlaps.gram, f.twists, c.poses(T_mount)) for c, f in zip(captures, freed, strict=True)]
     scatter = [estimate(e.channel()) for e in evidence]
     prior = _weak_prior(captures, freed, T_mount)
-    blocks = [_information(e.channel(), s) for e, s in zip(evidence, scatter, strict=True)]
+    # Column 0 is what was measured; the others are draws of what this scatter alone would give.
+    twists = [_measured_and_drawn(e, s) for e, s in zip(evidence, scatter, strict=True)]
+    blocks = [_information(e.channel(), s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
     xi, covariance = _combine(blocks, prior)
     left_out = []
     outside = np.zeros(2)
-    for k, (e, s) in enumerate(zip(evidence, scatter, strict=True)):
+    for k, (e, s, t) in enumerate(zip(evidence, scatter, twists, strict=True)):
         for v in range(e.gram.views):
             fewer = e.without(v)
-            block = _information(fewer.channel(), s) if len(fewer.gram.pairs) else (np.zeros((6, 6)), np.zeros(6))
+            block = _information(fewer.channel(), s, _drop(t, v)) if len(fewer.gram.pairs) else _NOTHING
             xi_v, _ = _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)
             left_out.append(xi_v)
-            outside += e.squares(v, (xi_v, xi))
+            outside += e.squares(v, (xi_v[:, 0], xi[:, 0]))
     inflation = _jackknife_inflation(np.array(left_out), covariance)
+    xi = xi[:, 0]
     ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
     return HandEye(T_mount @ frames.exp(xi), covariance * inflation, inflation, tuple(scatter), ratio)
 
@@ -106,11 +112,28 @@ def _weak_prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount
     return np.diag([1.0] * 3 + [distance**-2.0] * 3)
 
 
-def _information(channel: PoseChannel, scatter: Repeatability) -> tuple[Array, Array]:
-    """Information matrix and vector of ξ from one pose channel."""
-    sigma = covariance_of(channel, scatter)
-    whitened = np.linalg.solve(sigma, np.column_stack([channel.hand_eye, channel.z]))
-    return channel.hand_eye.T @ whitened[:, :6], channel.hand_eye.T @ whitened[:, 6]
+def _measured_and_drawn(evidence: _Evidence, scatter: Repeatability) -> Array:
+    """(6V, 1 + _DRAWS) twists: the measured ones, then draws under the scatter and the noise alone."""
+    rng = np.random.default_rng(0)
+    g = evidence.gram
+    to_centre = frames.make(np.eye(3), -g.centre)
+    carried = frames.adjoint(to_centre @ evidence.capture.T_reference_flange)
+    sigma = np.array([scatter.rotation] * 3 + [scatter.translation] * 3)
+    robot = np.einsum("vij,vjd->vid", carried, sigma[:, None] * rng.standard_normal((g.views, 6, _DRAWS)))
+    values, vectors, scale = visible_directions(g)
+    noise = np.sqrt(scatter.noise_factor * g.variance / values)[:, None] * rng.standard_normal((len(values), _DRAWS))
+    drawn = robot.reshape(6 * g.views, _DRAWS) + scale[:, None] * (vectors @ noise)
+    return np.column_stack([evidence.twists.reshape(-1), drawn])
+
+
+def _drop(twists: Array, v: int) -> Array:
+    return np.delete(twists, range(6 * v, 6 * v + 6), axis=0)
+
+
+def _information(channel: PoseChannel, scatter: Repeatability, twists: Array) -> tuple[Array, Array]:
+    """Information matrix (6, 6) and vectors (6, D) of ξ from one pose channel and twists (6V, D)."""
+    weighted = np.linalg.solve(covariance_of(channel, scatter), channel.hand_eye).T
+    return weighted @ channel.hand_eye, weighted @ channel.left @ twists
 
 
 def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
@@ -119,10 +142,19 @@ def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:
-    """Mean ratio of the jackknife's covariance to the model's over the six directions, at least 1."""
+    """How much more the left-out views move the hand-eye than chance explains, at least 1.
+
+    The mean ratio of the jackknife's covariance to the model's over the six directions, over its
+    95 % point under the model: a handful of views makes the jackknife itself uncertain, and taking
+    every value above 1 at its word would widen sigmas that are right.
+
+    Args:
+        left_out: (L, 6, 1 + draws) estimates with one view left out; column 0 from the measurement.
+    """
     count = len(left_out)
     if count < 4:
         return 1.0
     centred = left_out - left_out.mean(axis=0)
-    jackknife = (count - 1) / count * centred.T @ centred
-    return float(max(1.0, np.trace(np.linalg.solve(covariance, jackknife)) / 6))
+    squares = np.einsum("lid,ij,ljd->d", centred, np.linalg.inv(covariance), centred)
+    ratio = (count - 1) / count * squares / 6
+    return float(max(1.0, ratio[0] / np.quantile(ratio[1:], 0.95)))

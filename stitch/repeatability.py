@@ -22,7 +22,8 @@ from stitch.solve import Gram
 class PoseChannel:
     """What the overlaps say about the poses of the views, reduced to n visible directions."""
 
-    z: Array  # (n,) observed twists
+    left: Array  # (n, 6V) from twists of the views to visible directions
+    z: Array  # (n,) observed twists, left @ twists
     hand_eye: Array  # (n, 6) response to the hand-eye's ξ
     rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
     translation: Array  # (n, n) the same for translation
@@ -54,7 +55,7 @@ def pose_channel(g: Gram, twists: Array, model_poses: Array, T_reference_flange:
     response = left @ np.concatenate(list(frames.adjoint(to_centre @ model_poses)))
     carried = frames.adjoint(to_centre @ T_reference_flange)
     rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
-    return PoseChannel(left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
+    return PoseChannel(left, left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
 
 
 def _scatter(left: Array, carried: Array) -> Array:

@@ -44,7 +44,7 @@ def test_hand_eye_error_is_what_the_covariance_predicts(mount):
 
 
 def test_register_reaches_the_noise_and_finds_the_pose_errors():
-    measured, capture = synthetic(1, pixels=110, repeatability_rotation=3e-4, repeatability_translation=0.1)
+    measured, capture = synthetic(1, repeatability_rotation=3e-4, repeatability_translation=0.1)
     found = correct([capture], measured.T_mount, 5.0)
     registration = register(
         capture, capture.poses(found.hand_eye.T_mount), found.hand_eye.repeatability[0], found.overlaps[0].gate
