@@ -4,13 +4,13 @@ Usage: python bench/real_scans.py PATH_OF_REGHEC_SESSIONS > docs/results.md
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from data_synth.cell import Cell, measure
-from data_synth.scanner import AreaScanner
-from data_synth.shapes import blade
+from data_synth.scene import load_scene
+from data_synth.simulate import Measured, simulate
 from stitch import frames
 from stitch.capture import capture, place
 from stitch.match import sample
@@ -93,18 +93,18 @@ def synthetic(seeds: int = 20) -> None:
     print(f"\n## Synthetic blade, 12 views, {seeds} seeds, start off by 5° and 30 mm\n")
     print("Repeatability put in: 20 µm and 20 µrad. z: error over sigma, all six components.\n")
     print("| mount | rms error at the part (µm) | predicted (µm) | ratio | rms z |\n|---|---:|---:|---:|---:|")
-    mesh = blade.build()
     for mount in ("eye_to_hand", "eye_in_hand"):
-        rows = [_trial(mesh, mount, seed) for seed in range(seeds)]
+        rows = [_trial(mount, seed) for seed in range(seeds)]
         error, predicted = (np.sqrt(np.mean([row[i] for row in rows])) * 1e3 for i in (0, 1))
         z = np.sqrt(np.mean([row[2] for row in rows]))
         print(f"| {mount} | {error:.1f} | {predicted:.1f} | {error / predicted:.2f} | {z:.2f} |")
 
 
-def _trial(mesh, mount: str, seed: int) -> tuple[float, float, float]:
+def _trial(mount: str, seed: int) -> tuple[float, float, float]:
     """Squared error and predicted variance at the part, mean squared z."""
-    m = measure(mesh, Cell(mount=mount, scanner=AreaScanner(110, 110)), 12, seed)
-    c = place("blade", [prepare_view(str(i), p) for i, p in enumerate(m.clouds)], m.T_base_flange, mount)
+    scene = load_scene({"eye_to_hand": "blade", "eye_in_hand": "blade-table"}[mount])
+    m = simulate(replace(scene, small=0.0), {}, seed, 12)
+    c = _capture(m)
     direction = np.random.default_rng(1000 + seed).normal(size=(2, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     start = m.T_mount @ frames.exp(np.r_[direction[0] * np.radians(5), direction[1] * 30])
@@ -116,13 +116,19 @@ def _trial(mesh, mount: str, seed: int) -> tuple[float, float, float]:
     return float(np.sum((J @ xi) ** 2)), float(np.trace(J @ found.covariance @ J.T)), float(np.mean(z**2))
 
 
+def _capture(m: Measured):
+    scans = [prepare_view(str(i), cloud.points) for i, cloud in enumerate(m.clouds)]
+    return place("blade", scans, m.T_base_flange, m.scene.mount)
+
+
 def speed() -> None:
     """Seconds of every stage with a coarse hand-eye given."""
     import time
 
-    m = measure(blade.build(), Cell(scanner=AreaScanner(320, 320)), 18, 0)
+    scene = load_scene("blade")
+    m = simulate(replace(scene, scanner=replace(scene.scanner, columns=330, rows=330)), {}, 0)
     marks = [time.perf_counter()]
-    c = place("blade", [prepare_view(str(i), p) for i, p in enumerate(m.clouds)], m.T_base_flange, "eye_to_hand")
+    c = _capture(m)
     marks.append(time.perf_counter())
     found = correct([c], m.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5])), 0.35 * part_size([c]))
     marks.append(time.perf_counter())

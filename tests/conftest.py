@@ -1,14 +1,14 @@
 """Fixtures: the measured data beside the project, and small synthetic cells."""
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from data_synth.cell import Cell, Measured, measure
-from data_synth.scanner import AreaScanner
-from data_synth.shapes import blade
+from data_synth.scene import load_scene
+from data_synth.simulate import Measured, part_mesh, simulate
 from stitch import frames
 from stitch.capture import Capture, place
 from stitch.scan import prepare_view
@@ -33,18 +33,36 @@ def reghec(shared_data):
     return lambda name: shared_data / "reghec" / name
 
 
+SCENE_OF_MOUNT = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
+
+
 @lru_cache(maxsize=1)
 def blade_mesh():
-    return blade.build()
+    return part_mesh(load_scene("blade"))
 
 
-def synthetic(
-    seed: int, views: int = 12, mount: str = "eye_to_hand", pixels: int = 150, **cell
-) -> tuple[Measured, Capture]:
-    """A blade scanned in a cell of known truth."""
-    measured = measure(blade_mesh(), Cell(mount=mount, scanner=AreaScanner(pixels, pixels), **cell), views, seed)
-    scans = [prepare_view(f"v{i}", cloud) for i, cloud in enumerate(measured.clouds)]
-    return measured, place("blade", scans, measured.T_base_flange, mount)
+def measured_blade(
+    seed: int, views: int = 12, mount: str = "eye_to_hand", repeatability: tuple[float, float] = (20e-6, 0.02),
+    small: float = 0.0, pixels: int = 190, hidden: dict[str, float] | None = None,
+    spread: tuple[float, float] = (0.003, 1.0), **plan,
+) -> Measured:  # fmt: skip
+    """A blade scanned in a cell of known truth, with a scanner that has noise and nothing else."""
+    scene = load_scene(SCENE_OF_MOUNT[mount])
+    scanner = replace(
+        scene.scanner, columns=pixels, rows=pixels, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0
+    )
+    scene = replace(
+        scene, repeatability=repeatability, small=small, mount_spread=spread, scanner=scanner,
+        plan=replace(scene.plan, **plan),
+    )  # fmt: skip
+    return simulate(scene, hidden or {}, seed, views)
+
+
+def synthetic(seed: int, **cell) -> tuple[Measured, Capture]:
+    """`measured_blade` made ready for the stages."""
+    measured = measured_blade(seed, **cell)
+    scans = [prepare_view(f"v{i}", cloud.points) for i, cloud in enumerate(measured.clouds)]
+    return measured, place("blade", scans, measured.T_base_flange, measured.scene.mount)
 
 
 def disturbed(T: np.ndarray, seed: int, degrees: float = 5.0, shift: float = 30.0) -> np.ndarray:

@@ -4,13 +4,12 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import blade_mesh
+from conftest import measured_blade
 
-from data_synth.cell import Cell, measure
-from data_synth.scanner import AreaScanner
 from data_synth.write import write_session
 from stitch.cli.main import main
 from stitch.errors import InputError
@@ -21,9 +20,12 @@ from stitch.session import load_session
 @pytest.fixture
 def session(tmp_path):
     """A small blade session on disk."""
-    cell = Cell(scanner=AreaScanner(40, 40))
-    measured = measure(blade_mesh(), cell, 3, 0)
-    write_session(tmp_path / "s", "s", cell, measured, measured.T_mount)
+    measured = measured_blade(0, views=3, pixels=50)
+    # A rail leaves joints and robot out: each test adds what it is about.
+    write_session(tmp_path / "s", replace(measured, scene=replace(measured.scene, rail=1.0), covariates={}), "s")
+    file = tmp_path / "s" / "views.csv"
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_text("\n".join(",".join(row[:2] + row[3:-1]) for row in rows) + "\n")
     return tmp_path / "s"
 
 
@@ -81,7 +83,7 @@ BAD = {
     "NaN in a cloud": (write_cloud("1 2 400\nnan 2 400\n"), ["v001", "1 of 2 points"]),
     "no points": (write_cloud("# x y z\n"), ["v001", "no points"]),
     "words in a cloud": (write_cloud("1 2 400\n1 two 400\n"), ["v001", "cannot be read"]),
-    "not a rotation": (toml(r"pose = \[\[[^,]*,", "pose = [[2.0,"), ["scanner.pose", "not a rigid motion"]),
+    "not a rotation": (toml(r"pose = \[\s*\[[^,]*,", "pose = [[2.0,"), ["scanner.pose", "not a rigid motion"]),
     "metres read as millimetres": (toml('length_unit = "mm"', 'length_unit = "mm"\ncloud_unit = "m"'), ["cloud_unit", "1000", "v000"]),
     "poses in metres": (toml('length_unit = "mm"', 'length_unit = "m"\ncloud_unit = "mm"'), ["length_unit", "1000"]),
     "unknown key": (toml("standoff", "standof"), ["scanner.standof", "standoff"]),

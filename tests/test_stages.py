@@ -44,7 +44,7 @@ def test_hand_eye_error_is_what_the_covariance_predicts(mount):
 
 
 def test_register_reaches_the_noise_and_finds_the_pose_errors():
-    measured, capture = synthetic(1, repeatability_rotation=3e-4, repeatability_translation=0.1)
+    measured, capture = synthetic(1, repeatability=(3e-4, 0.1))
     found = correct([capture], measured.T_mount, 5.0)
     registration = register(
         capture, capture.poses(found.hand_eye.T_mount), found.hand_eye.repeatability[0], found.overlaps[0].gate
@@ -65,7 +65,7 @@ def test_register_reaches_the_noise_and_finds_the_pose_errors():
 
 
 def test_perfect_poses_leave_the_noise_that_was_put_in():
-    measured, capture = synthetic(2, repeatability_rotation=0.0, repeatability_translation=0.0)
+    measured, capture = synthetic(2, repeatability=(0.0, 0.0))
     found = correct([capture], disturbed(measured.T_mount, 2, 0.5, 3.0), 10.0)
     truth = collect(
         capture, capture.poses(measured.T_mount), found.overlaps[0].gate, [sample(s, 3000) for s in capture.scans]
@@ -75,7 +75,7 @@ def test_perfect_poses_leave_the_noise_that_was_put_in():
 
 def test_several_captures_share_one_hand_eye():
     """Two sessions of one rig know the hand-eye better than either."""
-    cells = [synthetic(seed, views=8) for seed in (3, 4)]
+    cells = [synthetic(seed, views=8, spread=(0.0, 0.0)) for seed in (3, 4)]
     captures = [capture for _, capture in cells]
     start = disturbed(cells[0][0].T_mount, 1, 2.0, 10.0)
     both = correct(captures, start, 15.0).hand_eye
@@ -97,7 +97,7 @@ def test_a_hand_eye_is_found_from_nothing(mount):
 
 
 def test_turning_the_last_joint_alone_hides_two_directions():
-    measured, capture = synthetic(6, views=10, tilt_deg=0.0)
+    measured, capture = synthetic(6, views=10, tilt=0.0)
     # Views that turn about exactly one axis of the flange.
     phrases = unobservable([turning_only(capture, measured.T_mount)], measured.T_mount)
     assert len(phrases) == 2
@@ -120,9 +120,9 @@ def test_all_directions_are_seen_by_a_tilting_set():
 
 
 def test_fused_cloud_lies_on_the_part():
-    measured, capture = synthetic(8, pixels=150, repeatability_rotation=0.0, repeatability_translation=0.0)
+    measured, capture = synthetic(8, repeatability=(0.0, 0.0))
     fused = fuse(capture, measured.T_reference_scanner)
-    in_part = fused.points - [0, 0, 60.0]
+    in_part = fused.points
     inner = fused.count >= 3
     o3d = load_open3d()
     surface = o3d.t.geometry.RaycastingScene()
@@ -136,7 +136,7 @@ def test_fused_cloud_lies_on_the_part():
 
 
 def test_view_residuals_show_a_shifted_view():
-    measured, capture = synthetic(9, repeatability_rotation=0.0, repeatability_translation=0.0)
+    measured, capture = synthetic(9, repeatability=(0.0, 0.0))
     poses = measured.T_reference_scanner.copy()
     poses[3] = poses[3] @ frames.exp(np.array([0, 0, 0, 0, 0, 0.3]))
     residuals = view_residuals(capture, poses, 4.0)

@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from conftest import blade_mesh
+from conftest import measured_blade
 
-from data_synth.cell import Cell, measure
-from data_synth.scanner import AreaScanner
 from data_synth.write import write_session
 from stitch.pipeline import run
 from stitch.session import load_session
@@ -25,8 +23,7 @@ from viz.report import write_report
 def recorded(tmp_path_factory):
     """A run of five views with its recording, in Rerun's strict mode."""
     folder = tmp_path_factory.mktemp("viz")
-    measured = measure(blade_mesh(), Cell(scanner=AreaScanner(60, 60)), 5, 0)
-    write_session(folder / "s", "blade <1>", Cell(), measured, measured.T_mount)
+    write_session(folder / "s", measured_blade(0, views=5, pixels=70), "blade <1>")
     rr.set_strict_mode(True)
     try:
         result = run(load_session(folder / "s"), recorder=RerunRecorder(folder / "r.rrd"))

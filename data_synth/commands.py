@@ -1,0 +1,153 @@
+"""`stitch synth` writes a session with a hidden effect; `stitch reveal` judges who was asked to find it."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from data_synth.nature import LAWS
+from data_synth.scene import load_scene
+from data_synth.simulate import Measured, simulate
+from data_synth.write import write_session, write_truth
+from stitch import frames
+from stitch.errors import InputError
+
+
+def synth(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="A scene's name, or a TOML file.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Session folder to write.")],
+    hide: Annotated[
+        list[str] | None, typer.Option("--hide", metavar="EFFECT[=AMPLITUDE]", help="May be given again.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same files.")] = 0,
+    views: Annotated[int | None, typer.Option(help="Number of views; default is the scene's.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="PATH", help="Where the truth goes.")] = None,
+) -> None:
+    """Write a session made by a cell that behaves like a real one, and its truth beside it."""
+    if out.exists():
+        raise InputError(f"{out}: exists already; name another folder")
+    if views is not None and views < 2:
+        raise InputError(f"--views {views}: stitching needs at least 2")
+    measured = make(scene, hidden_of(hide or []), seed, views)
+    scratch = out.with_name(f".{out.name}.writing")
+    shutil.rmtree(scratch, ignore_errors=True)
+    write_session(scratch, measured, out.name)
+    scratch.rename(out)
+    target = truth or truth_path(out)
+    write_truth(target, measured, seed)
+    Console(stderr=True).print(
+        f"{len(measured.clouds)} views, {sum(len(c.points) for c in measured.clouds):,} points → {out}\n"
+        f"truth → {target}", soft_wrap=True, highlight=False,
+    )  # fmt: skip
+
+
+def make(scene: str | Path, hidden: dict[str, float], seed: int, views: int | None = None) -> Measured:
+    """Simulate a scene by its name.
+
+    Raises:
+        InputError: no such scene or law, a wrong value in it; NoResultError: views that the arm cannot reach.
+    """
+    try:
+        return simulate(load_scene(scene), hidden, seed, views)
+    except ValueError as error:
+        raise InputError(f"scene {scene}: {error}") from None
+
+
+def hidden_of(options: list[str]) -> dict[str, float]:
+    """EFFECT or EFFECT=AMPLITUDE → amplitudes; 1 is a size that a real cell could have."""
+    hidden = {}
+    for option in options:
+        name, _, size = option.partition("=")
+        if name not in LAWS:
+            raise InputError(f"--hide {option}: nature knows {', '.join(LAWS)}")
+        try:
+            hidden[name] = float(size) if size else 1.0
+        except ValueError:
+            raise InputError(f"--hide {option}: {size!r} is not a number") from None
+    return hidden
+
+
+def truth_path(session: Path) -> Path:
+    """Where the truth of a session lies unless told otherwise."""
+    return session.with_name(session.name + ".truth.json")
+
+
+def reveal(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, after diagnose or add.")],
+    truth: Annotated[Path, typer.Argument(metavar="PATH", help="truth.json of its session.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")] = False,
+) -> None:
+    """Compare a run and its diagnosis with the truth."""
+    judged = judge(run, truth)
+    if as_json:
+        print(json.dumps(judged, indent=1))
+        return
+    table = Table("", "", show_header=False, box=None)
+    for key, value in judged.items():
+        table.add_row(key.replace("_", " "), value if isinstance(value, str) else json.dumps(value))
+    Console(stderr=True).print(table)
+
+
+def judge(run: Path, truth: Path) -> dict[str, Any]:
+    """Hidden, named and fitted effects, and the hand-eye's true error (mm at 400 mm before the scanner).
+
+    Raises:
+        InputError: a file is missing or not JSON.
+    """
+    told, result = _read(truth), _read(run / "result.json")
+    diagnosis = _read(run / "diagnosis.json") if (run / "diagnosis.json").is_file() else {}
+    hidden, fitted = told["hidden"], result.get("effects", {})
+    place = np.array([[0.0, 0.0, 400.0]])
+    scale = {"mm": 1.0, "m": 1000.0}[result["length_unit"]]
+
+    def off(T: Any) -> float:
+        T = np.array(T)
+        T[:3, 3] *= scale
+        difference = frames.transform(T, place) - frames.transform(np.array(told["hand_eye"]), place)
+        return round(float(np.linalg.norm(difference)), 4)
+
+    named = set(diagnosis.get("effects", []))
+    judged: dict[str, Any] = {
+        "hidden": hidden,
+        "verdict": diagnosis.get("verdict", "not diagnosed"),
+        "named": sorted(named),
+        "judgement": _judgement(set(hidden), diagnosis.get("verdict"), named, set(fitted)),
+        "hand_eye_error_coarse_mm": off(result["hand_eye_coarse"]),
+        "hand_eye_error_mm": off(result["hand_eye"]),
+    }
+    for effect, parameters in hidden.items():
+        for name, value in parameters.items():
+            got = fitted.get(effect, {}).get(name)
+            if got:
+                judged[f"{effect}.{name}"] = f"{got['value']:.3g} ± {got['sigma']:.1g}, true {value:.3g}"
+    return judged
+
+
+def _judgement(hidden: set[str], verdict: str | None, named: set[str], fitted: set[str]) -> str:
+    left = hidden - fitted
+    if fitted - hidden:
+        return f"wrong: {', '.join(sorted(fitted - hidden))} was added and is not there"
+    if verdict is None:
+        return "complete" if not left else f"not found yet: {', '.join(sorted(left))}"
+    if verdict == "adequate":
+        return "right" if not left else f"missed: {', '.join(sorted(left))}"
+    if verdict == "unknown_effect":
+        return "right: something is there" if left else "wrong: nothing is left"
+    if named & left:
+        return "right" if verdict == "missing_effect" else "right: among those that cannot be told apart"
+    return "wrong name"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: not found") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise InputError(f"{path}: not a JSON file: {error}") from None
+    return document

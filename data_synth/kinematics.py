@@ -1,0 +1,86 @@
+"""Where an arm's flange is, what gravity does to its joints, and joint angles for a wanted pose."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from data_synth.arms import Arm
+
+Array = NDArray[np.float64]
+
+GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s², base frame
+_ANGLE_STEP = 1e-5  # rad, for the slope of potential energy
+_LEVER = 300.0  # mm: a radian of orientation error counts as much as this in position
+
+
+def links(arm: Arm, q: Array) -> Array:
+    """(..., n + 1, 4, 4): base and the DH frames of all links, for joint angles q (..., n)."""
+    q = np.asarray(q, float)
+    angle = q + arm.theta
+    c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(arm.alpha), np.sin(arm.alpha)
+    step = np.zeros((*q.shape, 4, 4))
+    step[..., 0, :] = np.stack([c, -s * ca, s * sa, arm.a * c], axis=-1)
+    step[..., 1, :] = np.stack([s, c * ca, -c * sa, arm.a * s], axis=-1)
+    step[..., 2, 1], step[..., 2, 2], step[..., 2, 3] = sa, ca, arm.d
+    step[..., 3, 3] = 1.0
+    frames = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
+    for i in range(arm.joints):
+        frames.append(frames[-1] @ step[..., i, :, :])
+    return np.stack(frames, axis=-3)
+
+
+def flange(arm: Arm, q: Array) -> Array:
+    """T_base_flange (..., 4, 4)."""
+    return np.asarray(links(arm, q)[..., -1, :, :])
+
+
+def potential_energy(arm: Arm, q: Array) -> Array:
+    """Joule (...): −Σ m g·c over links and payload."""
+    frames = links(arm, q)
+    centres = np.einsum("...nij,nj->...ni", frames[..., 1:, :3, :3], arm.com) + frames[..., 1:, :3, 3]
+    load = frames[..., -1, :3, :3] @ np.array(arm.payload_com) + frames[..., -1, :3, 3]
+    moment = np.einsum("n,...ni->...i", arm.mass, centres) + arm.payload_mass * load
+    return np.asarray(-(moment @ GRAVITY) / 1000.0)
+
+
+def gravity_torques(arm: Arm, q: Array) -> Array:
+    """N·m (..., n) about +z of every joint: minus the slope of potential energy."""
+    q = np.asarray(q, float)
+    steps = np.eye(arm.joints) * _ANGLE_STEP
+    rise = potential_energy(arm, q[..., None, :] + steps) - potential_energy(arm, q[..., None, :] - steps)
+    return np.asarray(-rise / (2 * _ANGLE_STEP))
+
+
+def inverse(arm: Arm, T_base_flange: Array, near: Array) -> Array | None:
+    """Joint angles (n,) within limits that put the flange at the pose; None if there is no way from `near` or home.
+
+    The solution found from `near` is taken first: arms keep their configuration and move as little as they can.
+    """
+    margin = np.radians(2.0)
+    lower, upper = arm.lower + margin, arm.upper - margin
+    towards = arm.home.copy()
+    towards[0] = np.arctan2(T_base_flange[1, 3], T_base_flange[0, 3])
+    for start in (near, arm.home, towards):
+        found = least_squares(
+            _off, np.clip(start, lower, upper), args=(arm, T_base_flange), bounds=(lower, upper), max_nfev=40
+        )
+        if np.abs(found.fun).max() < 1e-6:
+            return np.asarray(found.x)
+    return None
+
+
+def velocity(arm: Arm, q: Array, v: Array) -> Array:
+    """Smallest joint velocities (n,) rad/s at q that move the flange by v (3,) mm/s in its own frame, unturned."""
+    here = flange(arm, q)
+    step = 1e-6
+    columns = [_off(q + e, arm, here) / step for e in np.eye(arm.joints) * step]
+    return np.asarray(
+        np.linalg.lstsq(np.column_stack(columns), np.append(np.zeros(3), here[:3, :3] @ v), rcond=None)[0]
+    )
+
+
+def _off(q: Array, arm: Arm, wanted: Array) -> Array:
+    T = flange(arm, q)
+    turn = Rotation.from_matrix(wanted[:3, :3].T @ T[:3, :3]).as_rotvec()
+    return np.concatenate([turn * _LEVER, T[:3, 3] - wanted[:3, 3]])
