@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.scan import Scan, prepare
 from stitch.session import Session
 
 
 @dataclass(frozen=True)
 class Capture:
-    """The V views of one session. `T_reference_scanner = T_reference_mount @ T_mount_scanner`.
+    """The V views of one session. `T_reference_scanner = T_reference_mount @ T_mount_scanner @ T_behind_mount`.
 
     The reference frame is the flange (eye_to_hand) or the base (eye_in_hand); the mount frame, on
     which the hand-eye sits, is the other one.
@@ -23,6 +23,7 @@ class Capture:
     scans: tuple[Scan, ...]
     T_reference_mount: Array  # (V, 4, 4) from the robot
     T_reference_flange: Array  # (V, 4, 4) carries a twist of the flange into the reference frame
+    T_behind_mount: Array | None = None  # (V, 4, 4) what moves the scanner on its mount; None: nothing does
 
     @property
     def spacing(self) -> float:
@@ -31,16 +32,22 @@ class Capture:
 
     def poses(self, T_mount_scanner: Array) -> Array:
         """T_reference_scanner (V, 4, 4) under a hand-eye."""
+        poses = self.carriers(T_mount_scanner)
+        return poses if self.T_behind_mount is None else np.asarray(poses @ self.T_behind_mount)
+
+    def carriers(self, T_mount_scanner: Array) -> Array:
+        """(V, 4, 4) whose adjoint carries a right perturbation of the hand-eye into the reference frame."""
         return np.asarray(self.T_reference_mount @ T_mount_scanner)
 
-    def without(self, left_out: int) -> "Capture":
-        """The capture less one view."""
-        keep = [v for v in range(len(self.scans)) if v != left_out]
+    def without(self, left_out: Indices) -> "Capture":
+        """The capture less some views."""
+        keep = [v for v in range(len(self.scans)) if v not in left_out]
         return replace(
             self,
             scans=tuple(self.scans[v] for v in keep),
             T_reference_mount=self.T_reference_mount[keep],
             T_reference_flange=self.T_reference_flange[keep],
+            T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],
         )
 
 

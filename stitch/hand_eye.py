@@ -1,25 +1,34 @@
-"""The hand-eye from per-view evidence: generalised least squares, covariance, held-out error.
+"""The hand-eye and the effects in use from per-view evidence: generalised least squares, covariance, held-out error.
 
 The poses of the views scatter by the robot's repeatability, which no number of points averages
-out: views are the samples. Estimates with one view left out at a time give the held-out error and
-show whether the covariance is too small for these data (jackknife; Efron & Stein 1981): a robot
-whose pose errors are not independent from view to view has a larger one, never a smaller.
+out: views are the samples. Estimates with views left out give the held-out error and show whether the
+covariance is too small for these data (jackknife; Efron & Stein 1981): a robot whose pose errors are
+not independent from view to view has a larger one, never a smaller.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
-from stitch.frames import Array
+from stitch.folds import grouped_folds
+from stitch.frames import Array, Indices
 from stitch.free_poses import FreePoses, visible_directions
 from stitch.repeatability import PoseChannel, Repeatability, covariance_of, estimate, pose_channel
 from stitch.solve import Gram, pair_squares
 
 _DRAWS = 200
-_NOTHING = (np.zeros((6, 6)), np.zeros((6, 1 + _DRAWS)))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """P parameters of effects that are fitted together with the hand-eye."""
+
+    twists: tuple[Array, ...]  # per capture (6V, P): left twists about the centre of its Gram matrices
+    values: Array  # (P,) at which they were computed
+    prior: Array  # (P,) standard deviation of a weak prior about zero
 
 
 @dataclass(frozen=True)
@@ -31,45 +40,56 @@ class HandEye:
     inflation: float  # factor on the covariance that the left-out views asked for, ≥ 1
     repeatability: tuple[Repeatability, ...]  # per capture
     heldout_ratio: float  # rms of left-out views over rms of the fit, same correspondences
+    values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
+    values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
 
-def jacobian(poses: Array, centre: Array) -> Array:
+def jacobian(carriers: Array, centre: Array) -> Array:
     """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
-    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ poses)))
+    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ carriers)))
 
 
-def fit_hand_eye(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array) -> HandEye:
+def fit_hand_eye(
+    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns | None = None
+) -> HandEye:
     """Generalised least squares over the pose channels of all captures.
 
     Args:
         freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
         T_mount: (4, 4) hand-eye at which that began.
+        columns: effects to fit with it.
     """
-    evidence = [_Evidence(c, f.overlaps.gram, f.twists, c.poses(T_mount)) for c, f in zip(captures, freed, strict=True)]
-    scatter = [estimate(e.channel()) for e in evidence]
-    prior = _weak_prior(captures, freed, T_mount)
+    columns = columns or Columns(tuple(np.zeros((6 * len(c.scans), 0)) for c in captures), np.zeros(0), np.zeros(0))
+    evidence = [
+        _Evidence(c, f.overlaps.gram, f.twists, c.carriers(T_mount), extra)
+        for c, f, extra in zip(captures, freed, columns.twists, strict=True)
+    ]
+    scatter = [estimate(e.channel(), e.further()) for e in evidence]
+    prior = _prior(captures, freed, T_mount, columns)
     # Column 0 is what was measured; the others are draws of what this scatter alone would give.
     twists = [_measured_and_drawn(e, s) for e, s in zip(evidence, scatter, strict=True)]
-    blocks = [_information(e.channel(), s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
-    xi, covariance = _combine(blocks, prior)
-    left_out = []
-    outside = np.zeros(2)
+    blocks = [_information(e, s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
+    blocks.append(_pull(columns))
+    x, covariance = _combine(blocks, prior)
+    left_out, outside = [], np.zeros(2)
     for k, (e, s, t) in enumerate(zip(evidence, scatter, twists, strict=True)):
         for v in range(e.gram.views):
-            fewer = e.without(v)
-            block = _information(fewer.channel(), s, _drop(t, v)) if len(fewer.gram.pairs) else _NOTHING
-            xi_v, _ = _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)
-            left_out.append(xi_v)
-            outside += e.squares(v, (xi_v[:, 0], xi[:, 0]))
+            left_out.append(_without(blocks, k, e, s, t, np.array([v]), prior))
+        for fold in e.folds():
+            fewer = _without(blocks, k, e, s, t, fold, prior)
+            outside += e.squares(fold, (fewer[:, 0], x[:, 0]))
     inflation = _jackknife_inflation(np.array(left_out), covariance)
-    xi = xi[:, 0]
     ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
-    return HandEye(T_mount @ frames.exp(xi), covariance * inflation, inflation, tuple(scatter), ratio)
+    return HandEye(
+        T_mount @ frames.exp(x[:6, 0]), covariance[:6, :6] * inflation, inflation, tuple(scatter), ratio,
+        columns.values + x[6:, 0], covariance[6:, 6:] * inflation,
+    )  # fmt: skip
 
 
-def scatter_of(capture: Capture, freed: FreePoses, model_poses: Array) -> Repeatability:
+def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
     """The repeatability of one capture's poses, whatever its hand-eye."""
-    return estimate(_Evidence(capture, freed.overlaps.gram, freed.twists, model_poses).channel())
+    nothing = np.zeros((6 * len(capture.scans), 0))
+    return estimate(_Evidence(capture, freed.overlaps.gram, freed.twists, capture.carriers(T_mount), nothing).channel())
 
 
 @dataclass(frozen=True)
@@ -79,37 +99,70 @@ class _Evidence:
     capture: Capture
     gram: Gram
     twists: Array  # (V, 6)
-    poses: Array  # (V, 4, 4) of the model
+    carriers: Array  # (V, 4, 4) of the hand-eye
+    extra: Array  # (6V, P)
 
     def channel(self) -> PoseChannel:
-        return pose_channel(self.gram, self.twists, self.poses, self.capture.T_reference_flange)
+        return pose_channel(self.gram, self.twists, self.carriers, self.capture.T_reference_flange)
 
-    def without(self, v: int) -> "_Evidence":
+    def further(self) -> Array | None:
+        """(n, P) the effects' columns in the channel."""
+        return self.channel().left @ self.extra if self.extra.shape[1] else None
+
+    def folds(self) -> list[Indices]:
+        total = self.gram.matrix.sum(axis=0)
+        lever = float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
+        return grouped_folds(self.capture.T_reference_mount, max(lever, 1e-9))
+
+    def without(self, views: Indices) -> "_Evidence":
         g = self.gram
-        keep = (g.pairs != v).all(axis=1)
-        pairs = g.pairs[keep] - (g.pairs[keep] > v)
+        keep = ~np.isin(g.pairs, views).any(axis=1)
+        number = np.cumsum(~np.isin(np.arange(g.views), views)) - 1
         fewer = replace(
-            g, views=g.views - 1, pairs=pairs, matrix=g.matrix[keep], vector=g.vector[keep], square=g.square[keep],
-            weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
+            g, views=g.views - len(views), pairs=number[g.pairs[keep]], matrix=g.matrix[keep], vector=g.vector[keep],
+            square=g.square[keep], weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
         )  # fmt: skip
-        return _Evidence(self.capture.without(v), fewer, np.delete(self.twists, v, 0), np.delete(self.poses, v, 0))
+        return _Evidence(
+            self.capture.without(views), fewer, np.delete(self.twists, views, 0), np.delete(self.carriers, views, 0),
+            _drop(self.extra, views),
+        )  # fmt: skip
 
-    def squares(self, v: int, corrections: Sequence[Array]) -> Array:
-        """Σ w e² of the pairs of view v with the robot's poses and each of the hand-eye corrections ξ."""
-        touched = (self.gram.pairs == v).any(axis=1)
-        J = jacobian(self.poses, self.gram.centre)
-        moved = [(J @ xi).reshape(-1, 6) - self.twists for xi in corrections]
+    def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
+        """Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""
+        touched = np.isin(self.gram.pairs, views).any(axis=1)
+        J = np.column_stack([jacobian(self.carriers, self.gram.centre), self.extra])
+        moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
         return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
 
 
-def _weak_prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array) -> Array:
+def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns) -> Array:
     """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else."""
     ranges = [
         np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
         for c, f in zip(captures, freed, strict=True)
     ]
     distance = float(np.median(np.concatenate(ranges)))
-    return np.diag([1.0] * 3 + [distance**-2.0] * 3)
+    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, columns.prior**-2.0]))
+
+
+def _pull(columns: Columns) -> tuple[Array, Array]:
+    """The effects' prior is about zero, not about their present values."""
+    size = 6 + len(columns.values)
+    pull = np.zeros((size, 1 + _DRAWS))
+    pull[6:, 0] = -columns.values * columns.prior**-2.0
+    return np.zeros((size, size)), pull
+
+
+def _without(
+    blocks: Sequence[tuple[Array, Array]], k: int, evidence: _Evidence, scatter: Repeatability, twists: Array,
+    views: Indices, prior: Array,
+) -> Array:  # fmt: skip
+    """(6 + P, 1 + draws) estimates without some views of capture k."""
+    fewer = evidence.without(views)
+    size = len(prior)
+    nothing = (np.zeros((size, size)), np.zeros((size, twists.shape[1])))
+    block = _information(fewer, scatter, _drop(twists, views)) if len(fewer.gram.pairs) else nothing
+    return _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)[0]
 
 
 def _measured_and_drawn(evidence: _Evidence, scatter: Repeatability) -> Array:
@@ -126,35 +179,42 @@ def _measured_and_drawn(evidence: _Evidence, scatter: Repeatability) -> Array:
     return np.column_stack([evidence.twists.reshape(-1), drawn])
 
 
-def _drop(twists: Array, v: int) -> Array:
-    return np.delete(twists, range(6 * v, 6 * v + 6), axis=0)
+def _drop(rows: Array, views: Indices) -> Array:
+    return np.delete(rows, (6 * views[:, None] + np.arange(6)).ravel(), axis=0)
 
 
-def _information(channel: PoseChannel, scatter: Repeatability, twists: Array) -> tuple[Array, Array]:
-    """Information matrix (6, 6) and vectors (6, D) of ξ from one pose channel and twists (6V, D)."""
-    weighted = np.linalg.solve(covariance_of(channel, scatter), channel.hand_eye).T
-    return weighted @ channel.hand_eye, weighted @ channel.left @ twists
+def _information(evidence: _Evidence, scatter: Repeatability, twists: Array) -> tuple[Array, Array]:
+    """Information matrix (6 + P, 6 + P) and vectors (6 + P, D) from one pose channel and twists (6V, D)."""
+    channel = evidence.channel()
+    X = np.column_stack([channel.hand_eye, channel.left @ evidence.extra])
+    weighted = np.linalg.solve(covariance_of(channel, scatter), X).T
+    return weighted @ X, weighted @ channel.left @ twists
 
 
 def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
-    covariance: Array = np.linalg.inv(prior + np.sum([block[0] for block in blocks], axis=0))
-    return covariance @ np.sum([block[1] for block in blocks], axis=0), covariance
+    """Estimates and covariance; parameters count in rad and mm, so the matrix is equilibrated first."""
+    matrix = prior + np.sum([block[0] for block in blocks], axis=0)
+    scale = 1 / np.sqrt(np.diag(matrix))
+    covariance: Array = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
+    return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0)), covariance
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:
-    """How much more the left-out views move the hand-eye than chance explains, at least 1.
+    """How much more the left-out views move the estimates than chance explains, at least 1.
 
-    The mean ratio of the jackknife's covariance to the model's over the six directions, over its
+    The mean ratio of the jackknife's covariance to the model's over all directions, over its
     95 % point under the model: a handful of views makes the jackknife itself uncertain, and taking
     every value above 1 at its word would widen sigmas that are right.
 
     Args:
-        left_out: (L, 6, 1 + draws) estimates with one view left out; column 0 from the measurement.
+        left_out: (L, 6 + P, 1 + draws) estimates with one view left out; column 0 from the measurement.
     """
     count = len(left_out)
     if count < 4:
         return 1.0
     centred = left_out - left_out.mean(axis=0)
-    squares = np.einsum("lid,ij,ljd->d", centred, np.linalg.inv(covariance), centred)
-    ratio = (count - 1) / count * squares / 6
+    scale = np.sqrt(np.diag(covariance))
+    precision = np.linalg.inv(covariance / scale[:, None] / scale) / scale[:, None] / scale
+    squares = np.einsum("lid,ij,ljd->d", centred, precision, centred, optimize=True)
+    ratio = (count - 1) / count * squares / len(covariance)
     return float(max(1.0, ratio[0] / np.quantile(ratio[1:], 0.95)))

@@ -9,13 +9,12 @@ noise within overlaps, whose errors are correlated). Patterson & Thompson (1971)
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from stitch import frames
 from stitch.frames import Array
 from stitch.free_poses import visible_directions
 from stitch.solve import Gram
+from stitch.variance import Evidence, fit_variances
 
 
 @dataclass(frozen=True)
@@ -39,20 +38,20 @@ class Repeatability:
     noise_factor: float
 
 
-def pose_channel(g: Gram, twists: Array, model_poses: Array, T_reference_flange: Array) -> PoseChannel:
+def pose_channel(g: Gram, twists: Array, carriers: Array, T_reference_flange: Array) -> PoseChannel:
     """Reduce per-view twists to the directions that the overlaps see.
 
     Args:
         g: normal equations about the part's centre, at the freed poses.
         twists: (V, 6) about that centre, from the model's poses to the freed ones.
-        model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
+        carriers: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
         T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
             for eye_to_hand, T_base_flange for eye_in_hand.
     """
     values, vectors, scale = visible_directions(g)
     left = vectors.T / scale[None, :]
     to_centre = frames.make(np.eye(3), -g.centre)
-    response = left @ np.concatenate(list(frames.adjoint(to_centre @ model_poses)))
+    response = left @ np.concatenate(list(frames.adjoint(to_centre @ carriers)))
     carried = frames.adjoint(to_centre @ T_reference_flange)
     rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
     return PoseChannel(left, left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
@@ -64,24 +63,21 @@ def _scatter(left: Array, carried: Array) -> Array:
     return np.asarray(np.einsum("vni,vmi->nm", blocks, blocks))
 
 
-def estimate(channel: PoseChannel, design: Array | None = None) -> Repeatability:
-    """REML of (σ_r, σ_t, c); the hand-eye (or `design`, (n, K)) is the unknown mean."""
-    mean = channel.hand_eye if design is None else design
-    mean = _column_space(mean)
-    spread = float(np.std(channel.z)) or 1e-12
-    lever = np.sqrt(np.trace(channel.rotation) / max(np.trace(channel.translation), 1e-300))
-    start = np.log([spread / lever, spread, 1.0])
-    options = {"xatol": 1e-3, "fatol": 1e-4, "maxiter": 600}
-    # Two starts: a scatter that explains everything, and noise that explains everything.
-    starts = [start, start + np.log([1e-2, 1e-2, 1.0])]
-    bounds = [(s - 16, s + 6) for s in start[:2]] + [(np.log(0.3), np.log(1e4))]
-    fits = [
-        minimize(_deviance, s, args=(channel, mean), method="Nelder-Mead", bounds=bounds, options=options)
-        for s in starts
-    ]
-    best = min(fits, key=lambda fit: float(fit.fun))
-    rotation, translation, factor = np.exp(best.x)
-    return Repeatability(float(rotation), float(translation), float(factor))
+def evidence_of(channel: PoseChannel, further: Array | None = None) -> Evidence:
+    """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
+    mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
+    components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
+    return Evidence(channel.z[None], _column_space(mean)[None], components)
+
+
+def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:
+    """REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
+    return scatter_from(fit_variances(evidence_of(channel, further), both_starts=True).variances)
+
+
+def scatter_from(variances: Array) -> Repeatability:
+    """Standard deviations and noise factor from the three variances."""
+    return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
 
 
 def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
@@ -91,26 +87,6 @@ def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
         + scatter.translation**2 * channel.translation
         + scatter.noise_factor * channel.noise
     )
-
-
-def _deviance(log_parameters: Array, channel: PoseChannel, mean: Array) -> float:
-    """−2 × restricted log likelihood, without constants, with the boundary-avoiding penalty.
-
-    With few views the maximum often lies at a scatter of exactly zero, and every sigma after it would
-    be too small; a gamma(2, 0) penalty, + log σ_r + log σ_t in the log likelihood, keeps it off the
-    boundary by about one standard error (Chung et al. 2013, Psychometrika 78:685).
-    """
-    try:
-        factor = cho_factor(covariance_of(channel, Repeatability(*np.exp(log_parameters))), lower=True)
-    except np.linalg.LinAlgError:
-        return float("inf")
-    whitened = cho_solve(factor, np.column_stack([mean, channel.z]))
-    information = mean.T @ whitened[:, :-1]
-    score = mean.T @ whitened[:, -1]
-    sign, logdet = np.linalg.slogdet(information)
-    rest = channel.z @ whitened[:, -1] - score @ np.linalg.solve(information, score)
-    penalty = 2 * (log_parameters[0] + log_parameters[1])
-    return float(2 * np.log(np.diag(factor[0])).sum() + logdet + rest - penalty) if sign > 0 else float("inf")
 
 
 def _column_space(design: Array) -> Array:

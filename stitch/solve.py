@@ -55,6 +55,11 @@ def robust_scale(matches: Iterable[Match]) -> float:
     return _MAD_TO_SIGMA * float(np.median(np.concatenate(residuals))) if residuals else float("nan")
 
 
+def tukey(e: Array, scale: float) -> Array:
+    """Biweight of residuals at a robust sigma."""
+    return np.asarray(np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2)
+
+
 def gram(
     matches: Sequence[Match], views: int, centre: Array, scale: float, weights: Sequence[Array] | None = None
 ) -> Gram:
@@ -68,7 +73,7 @@ def gram(
 def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> tuple[Array | float, ...]:
     e = m.residual
     if weight is None:
-        weight = m.weight * np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2
+        weight = m.weight * tukey(e, scale)
     B = np.concatenate([np.cross(m.middle - centre, m.normal), m.normal], axis=1)
     weighted = B * weight[:, None]
     inside = np.abs(e) < RMS_GATE * scale

@@ -115,7 +115,7 @@ def test_repeatability_is_recovered():
     for seed in range(6):
         measured, capture = synthetic(seed, views=12, repeatability=(60e-6, 0.04))
         poses = capture.poses(measured.T_mount)
-        scatter = scatter_of(capture, free_poses(capture, poses, 1.5), poses)
+        scatter = scatter_of(capture, free_poses(capture, poses, 1.5), measured.T_mount)
         found.append((scatter.rotation, scatter.translation))
     rotation, translation = np.sqrt(np.mean(np.square(found), axis=0))
     assert rotation == pytest.approx(60e-6, rel=0.35)

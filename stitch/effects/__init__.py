@@ -1,0 +1,12 @@
+"""Physical effects along the chain of frames: what nature does, in the form a user would write one.
+
+Importing the package registers the library; `user_file.load` adds a user's own.
+"""
+
+from stitch.effects import empirical, mount, part, robot, sensor
+from stitch.effects.contract import EFFECTS, Effect, Parameter, effect, number, per_joint, per_torque, twist
+
+__all__ = [
+    "EFFECTS", "Effect", "Parameter", "effect", "empirical", "mount", "number", "part", "per_joint", "per_torque",
+    "robot", "sensor", "twist",
+]  # fmt: skip

@@ -40,7 +40,7 @@ class Correction:
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
     """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
     D, b, moved = np.zeros((6, 6)), np.zeros(6), []
-    jacobians = [jacobian(c.poses(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
+    jacobians = [jacobian(c.carriers(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
     for J, o in zip(jacobians, overlaps, strict=True):
         # Sessions of different noise count by their own variance.
         H, vector = assemble(o.gram)

@@ -28,7 +28,7 @@ def reuse(captures: Sequence[Capture], model: Model) -> Correction:
     overlaps = tuple(_settle(c, model, _GATE_SHARE * size) for c in captures)
     poses = [c.poses(model.T_mount) for c in captures]
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
-    scatter = tuple(scatter_of(c, f, T) for c, f, T in zip(captures, freed, poses, strict=True))
+    scatter = tuple(scatter_of(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
     hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
     return Correction(hand_eye, overlaps, tuple(f.poses for f in freed), (pooled_rms(overlaps),))
 

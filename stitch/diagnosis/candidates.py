@@ -1,0 +1,102 @@
+"""All effects that could be missing, each with the forms in which it may appear."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.effects.chain import Term
+from stitch.effects.columns import PointGram
+from stitch.effects.contract import EFFECTS, Effect, Parameter
+from stitch.effects.empirical import empirical_effects
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class Form:
+    """One form of an effect: all its parameters, or those of one joint; one value of each gridded parameter."""
+
+    term: Term  # at zero, gridded parameters at their value
+    keep: Array  # (P,) bool: parameters that are free in this form
+    columns: Array  # (n, p) of the free ones in the channel
+    sizes: Array  # (p,) plausible sizes
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect with its forms; the first one has all parameters free."""
+
+    effect: Effect
+    parameters: tuple[Parameter, ...]
+    forms: tuple[Form, ...]
+    twists: Array  # (6V, P) of the first form
+    points: slice | None  # of the first form's columns in the PointGram
+
+    @property
+    def name(self) -> str:
+        return self.effect.name
+
+
+def candidates_of(evidence: PoseEvidence) -> tuple[list[Candidate], PointGram | None, dict[str, tuple[str, ...]]]:
+    """Physical, user and empirical effects that are not in the model, and what each unavailable one lacks."""
+    chain = evidence.chain
+    used = {term.effect.name for term in evidence.terms}
+    library = [e for e in EFFECTS.values() if e.name not in used]
+    missing = {e.name: chain.offers(e) for e in library if chain.offers(e)}
+    effects = [e for e in library if e.name not in missing] + empirical_effects(chain.views)
+    terms, owner = [], []
+    for k, effect in enumerate(effects):
+        for term in _grid_terms(effect, chain.parameters(effect)):
+            terms.append(term)
+            owner.append(k)
+    columns, sums, where = evidence.columns(terms)
+    out = []
+    for k, effect in enumerate(effects):
+        own = [i for i, o in enumerate(owner) if o == k]
+        parameters = chain.parameters(effect)
+        forms = [f for i in own for f in _forms(evidence, terms[i], parameters, columns[i])]
+        if forms:
+            out.append(Candidate(effect, parameters, tuple(forms), columns[own[0]], where[own[0]]))
+    return out, sums, missing
+
+
+def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
+    """The effect at zero, once for every combination of its gridded parameters."""
+    grids = [p.grid or (0.0,) for p in parameters]
+    return [Term(effect, np.array(values)) for values in product(*grids)]
+
+
+def _forms(evidence: PoseEvidence, term: Term, parameters: Sequence[Parameter], twists: Array) -> list[Form]:
+    """All parameters together, then joint by joint where there are several."""
+    free = np.array([not p.grid for p in parameters])
+    sizes = np.array([p.typical for p in parameters])
+    channel = evidence.channel.left @ twists
+    keeps = [free]
+    groups = _groups(term.effect, parameters)
+    if len(groups) > 1:
+        keeps += [free & np.isin(np.arange(len(parameters)), g) for g in groups]
+    return [Form(term, keep, channel[:, keep], sizes[keep]) for keep in keeps]
+
+
+def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Indices of the parameters of one joint; links in single numbers too: one row seldom is wrong altogether."""
+    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
+        return []
+    letters = sorted(effect.specs, key=len, reverse=True)
+    joints: dict[str, list[int]] = {}
+    for i, parameter in enumerate(parameters):
+        letter = next(name for name in letters if parameter.name.startswith(name))
+        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
+    groups = list(joints.values())
+    if effect.place == "links" and len(effect.specs) > 1:
+        groups += [[i] for i in range(len(parameters))]
+    return groups
+
+
+def with_values(form: Form, values: Array) -> Term:
+    """The term of a form with fitted values of its free parameters."""
+    filled = form.term.values.copy()
+    filled[form.keep] = values
+    return replace(form.term, values=filled)

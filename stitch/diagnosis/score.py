@@ -1,0 +1,129 @@
+"""How well each candidate explains the views: evidence, p-value, amplitude, smallest detectable size.
+
+Every form of a candidate is fitted with the variances estimated anew (`variance.py`). The p-value is that of
+the Wald F test under the form's own REML; forms are counted (Bonferroni). The evidence is the likelihood
+integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import f as f_distribution
+from scipy.stats import norm
+
+from stitch.diagnosis.candidates import Candidate, Form
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.frames import Array
+from stitch.variance import VarianceFit, fit_variances
+
+ALPHA = 0.05
+_POWER = 0.8
+# A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
+_SEEN = 0.5
+# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
+_FREE = 30.0
+# Forms that do not gain under the null's variances do not gain under their own either.
+_HOPELESS = -4.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """One candidate against the null."""
+
+    candidate: Candidate
+    observable: bool
+    form: Form  # the best one
+    p_value: float  # of the candidate, its forms counted; not yet counted over candidates
+    gain: float  # log evidence over the null's
+    values: Array  # (p,) of the best form, free fit
+    sigmas: Array  # (p,)
+    covariance: Array  # (p, p)
+    fit: VarianceFit
+    minimum_detectable: dict[str, float]  # per parameter, alone
+
+    @property
+    def name(self) -> str:
+        return self.candidate.name
+
+
+def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
+    """Try all forms of a candidate.
+
+    Args:
+        tests: number of candidates, for the smallest detectable size.
+    """
+    full = candidate.forms[0]
+    white = evidence.whiten(candidate.twists)[:, full.keep]
+    seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
+    detectable = _detectable(candidate, white, tests)
+    tried = [_try(evidence, form) for form in candidate.forms]
+    singles = len(candidate.forms)
+    best = max(range(singles), key=lambda i: tried[i][0])
+    # The full forms share one half of the prior, the single joints the other.
+    gains = np.array([gain for gain, *_ in tried])
+    whole = np.array([form.keep.sum() == full.keep.sum() for form in candidate.forms])
+    weights = np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1))
+    gain = float(logsumexp(gains + np.log(weights)))
+    p_values = np.array([p for _, p, _ in tried])
+    p = float(min(1.0, np.min(p_values / weights)))
+    return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain, detectable)
+
+
+def _try(evidence: PoseEvidence, form: Form) -> tuple[float, float, VarianceFit]:
+    """Log evidence over the null, p-value and free fit of one form."""
+    e = evidence.evidence
+    G = form.columns[None]
+    quick = _null_gain(evidence, form)
+    if quick < _HOPELESS:
+        return quick, 1.0, evidence.null
+    integrated = fit_variances(e, G, form.sizes, start=evidence.null.variances)
+    gain = 0.5 * (evidence.null.deviance - integrated.deviance)
+    free = fit_variances(e, G, _FREE * form.sizes, start=integrated.variances)
+    a = e.A.shape[2]
+    theta, covariance = free.mean[a:], free.covariance[a:, a:]
+    rank, square = _wald(theta, covariance, form.sizes)
+    rest = max(e.size - a - rank, 1)
+    return gain, float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest)), free
+
+
+def _null_gain(evidence: PoseEvidence, form: Form) -> float:
+    """Log evidence gained at the null's variances: cheap, and an upper hand for what cannot help."""
+    white = evidence.whiten_channel(form.columns) * form.sizes
+    information = np.eye(white.shape[1]) + white.T @ white
+    b = white.T @ evidence.white_z
+    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
+
+
+def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
+    """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
+    values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
+    keep = values < 0.5 * _FREE**2
+    projected = vectors[:, keep].T @ (theta / sizes)
+    return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
+
+
+def _detectable(candidate: Candidate, white: Array, tests: int) -> dict[str, float]:
+    """|θ| = (z_{1−α/2K} + z_{power})/√I for every parameter alone, K tests."""
+    factor = float(norm.isf(ALPHA / (2 * max(tests, 1))) + norm.ppf(_POWER))
+    names = [p.name for p, keep in zip(candidate.parameters, candidate.forms[0].keep, strict=True) if keep]
+    root = np.linalg.norm(white, axis=0)
+    return {name: factor / r if r > 0 else float("inf") for name, r in zip(names, root, strict=True)}
+
+
+def _fill(
+    evidence: PoseEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
+    p: float, gain: float, detectable: dict[str, float],
+) -> Score:  # fmt: skip
+    a, size = evidence.evidence.A.shape[2], form.columns.shape[1]
+    fit = tried[2]
+    if len(fit.mean) < a + size:
+        nothing = np.zeros(size)
+        return Score(
+            candidate, seen, form, 1.0, gain, nothing, np.full(size, np.nan), np.zeros((size, size)), fit, detectable
+        )
+    covariance = fit.covariance[a:, a:]
+    return Score(
+        candidate, seen, form, p if seen else 1.0, gain if seen else 0.0, fit.mean[a:],
+        np.sqrt(np.maximum(np.diag(covariance), 0)), covariance, fit, detectable,
+    )  # fmt: skip

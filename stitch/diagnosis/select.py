@@ -1,0 +1,132 @@
+"""From scores to an answer: which effects are named, which cannot be told apart, whether something unknown is there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.score import ALPHA, Score, score
+from stitch.frames import Array
+from stitch.variance import fit_variances
+
+# Prior shares: nothing is missing, one effect of the library, something without a name.
+_NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
+# The family-wise error is shared between names and the alarm without one.
+ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
+# A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name.
+_ODDS = float(np.log(20.0))
+# No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
+IMPLAUSIBLE = (2.5e-4, 0.12)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A score with its place among all."""
+
+    score: Score
+    adjusted: float  # family-wise p
+    log_posterior: float  # not yet normalised
+    posterior: float
+
+    @property
+    def name(self) -> str:
+        return self.score.name
+
+    @property
+    def physical(self) -> bool:
+        return self.score.candidate.effect.tier != "empirical"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The answer before it is put into words."""
+
+    verdict: str  # adequate | missing_effect | cannot_tell | unknown_effect
+    named: tuple[Ranked, ...]  # the effect, or the group
+    ranked: tuple[Ranked, ...]  # physical, best first, unobservable last
+    empirical: tuple[Ranked, ...]  # best first
+    second: Ranked | None = None  # a further effect that the views show beside the first
+
+
+def score_all(evidence: PoseEvidence, candidates: Sequence[Candidate]) -> list[Score]:
+    """Scores in the order of the candidates."""
+    tests = sum(c.effect.tier != "empirical" for c in candidates)
+    return [score(evidence, c, tests) for c in candidates]
+
+
+def select(evidence: PoseEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
+    """Name what is missing, or abstain."""
+    ranked, empirical = rank(score_all(evidence, candidates))
+    best = next((r for r in ranked if _nameable(r)), None)
+    stray = empirical[0] if empirical and empirical[0].adjusted < ALPHA_UNKNOWN else None
+    if best is None and stray is None:
+        verdict = "unknown_effect" if implausible(evidence, length_unit) else "adequate"
+        return Selection(verdict, (), ranked, empirical)
+    if best is None:
+        return Selection("unknown_effect", (), ranked, empirical)
+    second = None
+    if stray is not None and stray.log_posterior > best.log_posterior + _ODDS:
+        # Two known effects at once may look like none of them: try the best with a second one.
+        best, second = _pair(evidence, candidates, best)
+        together = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(_PHYSICAL / len(ranked)))
+        if stray.log_posterior > together + _ODDS:
+            return Selection("unknown_effect", (), ranked, empirical)
+    group = tuple(r for r in ranked if _nameable(r) and r.log_posterior > best.log_posterior - _ODDS)
+    group = (best, *(r for r in group if r.name != best.name))
+    return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second)
+
+
+def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
+    """Physical and empirical candidates, best first; posterior shares among all and nothing."""
+    known = [s for s in scores if s.candidate.effect.tier != "empirical"]
+    other = [s for s in scores if s.candidate.effect.tier == "empirical" and s.observable]
+    seen = max(sum(s.observable for s in known), 1)
+    weights = [(s, _PHYSICAL / seen, seen) for s in known] + [(s, _UNKNOWN / len(other), len(other)) for s in other]
+    logs = [s.gain + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
+    total = float(logsumexp([*logs, np.log(_NOTHING)]))
+    out = [
+        Ranked(s, min(1.0, s.p_value * tests), log, float(np.exp(log - total)))
+        for (s, _, tests), log in zip(weights, logs, strict=True)
+    ]
+    # Sorted by evidence; where there is none to tell them, by name, so that the order of a list decides nothing.
+    out.sort(key=lambda r: (not r.score.observable, -round(r.log_posterior, 6) if r.score.observable else 0.0, r.name))
+    return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
+
+
+def implausible(evidence: PoseEvidence, length_unit: str) -> bool:
+    """True if the poses scatter as no arm does."""
+    rotation, translation = np.sqrt(evidence.null.variances[:2])
+    return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
+
+
+def _nameable(r: Ranked) -> bool:
+    """Significant, seen, and of a size that somebody would believe."""
+    kept = [p for p, k in zip(r.score.candidate.parameters, r.score.form.keep, strict=True) if k]
+    believable = all(abs(v) < p.limit for v, p in zip(r.score.values, kept, strict=True))
+    return r.physical and r.score.observable and r.adjusted < ALPHA_NAME and believable
+
+
+def _pair(evidence: PoseEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
+    """The best effect and the one that explains most beside it; of the two the stronger comes first."""
+    others = [c for c in candidates if c.name != best.name and c.effect.tier != "empirical"]
+    ranked, _ = rank(score_all(with_columns(evidence, best.score.form.columns), others))
+    second = next((r for r in ranked if _nameable(r)), None)
+    if second is None:
+        return best, None
+    return best, second
+
+
+def with_columns(evidence: PoseEvidence, columns: Array) -> PoseEvidence:
+    """The evidence with further free columns (n, p) of the channel in its model."""
+    e = evidence.evidence
+    A = np.concatenate([e.A, columns[None]], axis=2)
+    more = replace(e, A=A)
+    # Twists of the model are read through `left`: the pseudo-inverse carries channel columns back to twists.
+    back = np.linalg.pinv(evidence.channel.left) @ columns
+    return replace(
+        evidence, model=np.hstack([evidence.model, back]), evidence=more,
+        null=fit_variances(more, start=evidence.null.variances),
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+"""The empirical tier: shapes without a cause. They only say on what the missing effect depends.
+
+Fourier terms of a joint, polynomials of time or a covariate, an event, a low-order field map. They compete
+with the physical effects: where one of them explains the views far better than anything known, something
+unknown is at work.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from stitch.effects.contract import Effect, Spec, number, twist
+from stitch.effects.views import ScanView, Views
+from stitch.frames import Array
+
+_HARMONICS = (1, 2, 3, 4)
+
+
+def empirical_effects(views: Views) -> list[Effect]:
+    """Every empirical effect that these views can carry."""
+    out = []
+    for joint in range(views.joints.shape[1]):
+        # A joint that hardly turns shows no period.
+        if np.ptp(views.joints[:, joint]) > np.radians(15.0):
+            out += [_harmonic(joint, order) for order in _HARMONICS]
+    courses = {"time_s": views.time} if views.has("time") else {}
+    for name, course in (courses | views.covariates).items():
+        if np.ptp(course) > 0 and len(np.unique(course)) > 2:
+            out += [_bias(name, course, 1), _bias(name, course, 2), _mount(name, course, 1), _mount(name, course, 2)]
+    out.append(_effect("an event", "knock_of_mount", "mount", _step,
+                       xi=twist("", 6e-4, 0.2), v=number("view", 1.0, 1e9, grid=(-1.0,))))  # fmt: skip
+    return out
+
+
+def _effect(group: str, name: str, place: str, function: Callable[..., Array], **specs: Spec) -> Effect:
+    return Effect(name, place, specs, function, (), (), "empirical", group)
+
+
+def _harmonic(joint: int, order: int) -> Effect:
+    def fourier(joints: Array, views: Views, A: float, B: float) -> Array:
+        out = joints.copy()
+        out[:, joint] += A * np.sin(order * views.joints[:, joint]) + B * np.cos(order * views.joints[:, joint])
+        return out
+
+    fourier.__doc__ = f"joint {joint + 1}: A sin {order}q + B cos {order}q"
+    return _effect(f"j{joint + 1}_deg", f"fourier_{order}_of_j{joint + 1}", "robot", fourier,
+                   A=number("rad", 4e-4, 0.01), B=number("rad", 4e-4, 0.01))  # fmt: skip
+
+
+def _standard(course: Array, order: int) -> Array:
+    """(V,) polynomial of the course over ±1."""
+    x = 2 * (course - course.min()) / np.ptp(course) - 1
+    return np.asarray(x if order == 1 else 1.5 * x**2 - 0.5)
+
+
+def _bias(name: str, course: Array, order: int) -> Effect:
+    shape = _standard(course, order)
+
+    def bias(points: Array, view: ScanView, k: float) -> Array:
+        return np.asarray(points + view.along(points) * (k * shape[view.index]))
+
+    bias.__doc__ = f"along the ray by k·P{order}({name})"
+    return _effect(name, f"bias_{order}_of_{name}", "sensor", bias, k=number("mm", 0.1, 5.0))
+
+
+def _mount(name: str, course: Array, order: int) -> Effect:
+    shape = _standard(course, order)
+
+    def follow(views: Views, xi: Array) -> Array:
+        return np.outer(shape, xi)
+
+    follow.__doc__ = f"M·exp(ξ·P{order}({name}))"
+    return _effect(name, f"mount_{order}_of_{name}", "mount", follow, xi=twist("", 4e-4, 0.15))
+
+
+def _step(views: Views, xi: Array, v: float) -> Array:
+    """M·exp(ξ) from view v on"""
+    return np.outer(np.arange(views.count) >= v, xi)

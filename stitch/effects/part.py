@@ -1,0 +1,32 @@
+"""Effects of the part: it creeps, slips, grows or sags in the reference frame."""
+
+import numpy as np
+
+from stitch.effects.contract import effect, number, twist
+from stitch.effects.robot import warmer
+from stitch.effects.views import ScanView, Views
+from stitch.frames import Array
+
+
+@effect("part", needs=("time",), xi=twist("/h", 1e-3, 0.4))
+def fixture_drift(views: Views, xi: Array) -> Array:
+    """exp(ξ (t−t₀)/3600 s) in the reference frame"""
+    return np.outer(views.hours, xi)
+
+
+@effect("part", xi=twist("", 6e-4, 0.2), v=number("view", typical=1.0, limit=1e9, grid=(-1.0,)))
+def part_slip(views: Views, xi: Array, v: float) -> Array:
+    """from view v on (counted from 0), the part sits displaced by ξ"""
+    return np.outer(np.arange(views.count) >= v, xi)
+
+
+@effect("shape", prefers=("part_temperature_c",), g=number("1/°C", typical=3e-5, limit=5e-4))
+def part_growth(points: Array, view: ScanView, g: float) -> Array:
+    """part scaled about its frame's origin, 1+g·ΔT, ΔT from part_temperature_c; without it g per hour"""
+    return points * (1 + g * float(warmer(view.views, "part_temperature_c")[view.index]))
+
+
+@effect("shape", kappa=number("1/mm", typical=5e-6, limit=1e-3))
+def part_sag(points: Array, view: ScanView, kappa: float) -> Array:
+    """point at distance h from the clamp plane (part z=0) moves κ·h² along gravity"""
+    return points + kappa * points[:, 2:] ** 2 * view.gravity

@@ -1,0 +1,55 @@
+"""Which parameters the views can know: absolute first, then beside the hand-eye and each other."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.capture import Capture
+from stitch.frames import Array
+from stitch.free_poses import FreePoses
+from stitch.repeatability import covariance_of, estimate, pose_channel
+
+
+def whitened(
+    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Columns of the hand-eye (N, 6) and of effects (N, P) in units of the pose scatter, all captures stacked."""
+    own, further = [], []
+    for capture, f, extra in zip(captures, freed, columns, strict=True):
+        channel = pose_channel(f.overlaps.gram, f.twists, capture.carriers(T_mount), capture.T_reference_flange)
+        half = np.linalg.cholesky(covariance_of(channel, estimate(channel)))
+        own.append(np.linalg.solve(half, channel.hand_eye))
+        further.append(np.linalg.solve(half, channel.left @ extra))
+    return np.concatenate(own), np.concatenate(further)
+
+
+def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Array:
+    """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
+
+    The clearest is chosen first (QR with pivoting), so that of two that say the same the better known stays.
+
+    Args:
+        base: (N, a) whitened columns that come first, whatever they say.
+        further: (N, P) whitened columns per unit of their parameters.
+        sizes: (P,) plausible sizes of the parameters.
+    """
+    rest = project_out(base, further * sizes)
+    chosen = np.zeros(further.shape[1], bool)
+    while True:
+        strength = np.where(chosen, 0.0, np.linalg.norm(rest, axis=0))
+        if not len(strength) or strength.max() < threshold:
+            return chosen
+        best = int(strength.argmax())
+        chosen[best] = True
+        direction = rest[:, best] / strength[best]
+        rest = rest - np.outer(direction, direction @ rest)
+
+
+def project_out(base: Array, columns: Array) -> Array:
+    """What is left of `columns` beside the column space of `base`."""
+    if not base.shape[1]:
+        return columns
+    scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    U = U[:, s > 1e-9 * s[0]]
+    return np.asarray(columns - U @ (U.T @ columns))

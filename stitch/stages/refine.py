@@ -1,0 +1,102 @@
+"""Fit the hand-eye and the effects in use together: match anew, free the views, generalised least squares, repeat."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.capture import Capture
+from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.columns import all_columns
+from stitch.effects.visible import independent, whitened
+from stitch.frames import Array
+from stitch.free_poses import FreePoses, free_poses
+from stitch.hand_eye import Columns, HandEye, fit_hand_eye
+from stitch.match import sample
+from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+
+_MAXIMUM_ITERATIONS = 6
+# Settled when no parameter moves by a twentieth of its sigma.
+_SETTLED = 0.05
+# A parameter that these views know worse than this many times its plausible size stays at zero: it would
+# only borrow from the hand-eye.
+_UNSEEN = 4.0
+_WEAK = 10.0
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Hand-eye and effects; per chain what follows from them."""
+
+    hand_eye: HandEye
+    terms: tuple[Term, ...]
+    sigmas: tuple[Array, ...]  # per term (P,); NaN where the views cannot see a parameter
+    captures: tuple[Capture, ...]  # without the effects
+    freed: tuple[FreePoses, ...]
+    overlaps: tuple[Overlaps, ...]
+    history: tuple[float, ...]
+
+
+def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate: Sequence[float]) -> Refinement:
+    """All sessions of a rig share hand-eye and effects.
+
+    Args:
+        terms: effects in use with the values to begin with.
+        T_mount: (4, 4) hand-eye to begin with.
+        gate: per chain the first distance between partners, length_unit.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    terms, history = list(terms), []
+    parameters = [p for term in terms for p in chains[0].parameters(term.effect)]
+    sizes = np.array([p.typical for p in parameters])
+    held = np.array([bool(p.grid) for p in parameters], bool)
+    for _ in range(_MAXIMUM_ITERATIONS):
+        captures, freed = _free(chains, terms, T_mount, gate)
+        columns = [np.hstack([np.zeros((6 * len(c.scans), 0)), *all_columns(chain, terms, terms, T_mount, f)[0]])
+                   for chain, c, f in zip(chains, captures, freed, strict=True)]  # fmt: skip
+        seen = independent(*whitened(captures, freed, T_mount, columns), sizes, 1 / _UNSEEN)
+        values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
+        fitted = fit_hand_eye(
+            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], _WEAK * sizes[seen])
+        )
+        T_mount, before = fitted.T_mount, values.copy()
+        # What the views cannot see stays at zero; the time of an event stays where it was found.
+        values[~held] = 0.0
+        values[seen] = fitted.values
+        terms = _with_values(terms, values)
+        history.append(float(np.median([f.overlaps.gram.rms for f in freed])))
+        sigma = np.sqrt(np.maximum(np.diag(fitted.values_covariance), 1e-300))
+        if not len(values) or np.max(np.abs(values - before)[seen] / sigma, initial=0.0) < _SETTLED:
+            break
+    captures, freed = _free(chains, terms, T_mount, [f.overlaps.gate for f in freed])
+    overlaps = tuple(_settled_overlaps(c, T_mount, gate) for c, gate in zip(captures, gate, strict=True))
+    sigmas = np.full(len(seen), np.nan)
+    sigmas[seen] = np.sqrt(np.diag(fitted.values_covariance))
+    cuts = np.cumsum([len(t.values) for t in terms])[:-1] if terms else []
+    return Refinement(
+        fitted, tuple(terms), tuple(np.split(sigmas, cuts)), captures, tuple(freed), overlaps, tuple(history)
+    )
+
+
+def _free(
+    chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gates: Sequence[float]
+) -> tuple[tuple[Capture, ...], list[FreePoses]]:
+    captures = tuple(corrected(chain, terms, T_mount) for chain in chains)
+    return captures, [free_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True)]
+
+
+def _settled_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
+    """Correspondences of the model's own poses; the gate follows what they leave."""
+    samples = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
+    overlaps = collect(capture, capture.poses(T_mount), gate, samples)
+    return collect(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples)
+
+
+def _with_values(terms: Sequence[Term], values: Array) -> list[Term]:
+    out, at = [], 0
+    for term in terms:
+        out.append(replace(term, values=values[at : at + len(term.values)]))
+        at += len(term.values)
+    return out

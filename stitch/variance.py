@@ -1,0 +1,145 @@
+"""Variance components by restricted maximum likelihood, with or without a prior on some columns of the mean.
+
+    z = A·α + G·θ + noise,   cov(noise) = V = Σ_i λ_i C_i,   θ ~ N(0, S)
+
+The α are free (integrated out with a flat prior: that is REML, Patterson & Thompson 1971, Harville 1977);
+the θ have a prior of the size that is plausible (their integral is the evidence for the columns G). V is
+block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from stitch.frames import Array
+
+# A gamma(2, 0) prior on σ_r and σ_t keeps the maximum off the boundary at zero, where every sigma after it
+# would be too small, by about one standard error (Chung et al. 2013, Psychometrika 78:685).
+_OFF_BOUNDARY = np.array([1.0, 1.0, 0.0])
+_SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What was seen: B blocks of m numbers."""
+
+    z: Array  # (B, m)
+    A: Array  # (B, m, a) columns of the free mean
+    components: Array  # (3, B, m, m) covariance of unit rotation scatter, translation scatter, sensor noise
+
+    @property
+    def size(self) -> int:
+        """Numbers in all."""
+        return int(self.z.size)
+
+
+@dataclass(frozen=True)
+class VarianceFit:
+    """The maximum: variances λ (3,), −2 log of the (restricted) likelihood, and the mean's coefficients."""
+
+    variances: Array  # (3,)
+    deviance: float
+    mean: Array  # (a + g,)
+    covariance: Array  # (a + g, a + g)
+
+
+def fit_variances(
+    evidence: Evidence, G: Array | None = None, prior: Array | None = None, start: Array | None = None,
+    both_starts: bool = False,
+) -> VarianceFit:  # fmt: skip
+    """Maximise over the three variances.
+
+    Args:
+        G: (B, m, g) further columns of the mean.
+        prior: (g,) standard deviations of their coefficients; None leaves them free.
+        start: (3,) variances to begin with; None starts from the spread of z.
+        both_starts: also begin from noise alone, where the likelihood may have a second maximum.
+    """
+    problem = _problem(evidence, G, prior)
+    guess = _guess(evidence) if start is None else start
+    first = np.log(np.maximum(guess, 1e-300))
+    begin = [first, first + [-9.0, -9.0, 0.0]] if both_starts else [first]
+    centre = np.log(_guess(evidence))
+    bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
+    fits = [
+        minimize(_deviance, np.clip(s, *np.array(bounds).T), args=(problem,), jac=True, method="L-BFGS-B",
+                 bounds=bounds, options={"ftol": 1e-9, "gtol": 1e-4, "maxiter": 60})
+        for s in begin
+    ]  # fmt: skip
+    best = min(fits, key=lambda f: float(f.fun))
+    return at_variances(evidence, np.exp(best.x), G, prior)
+
+
+def at_variances(
+    evidence: Evidence, variances: Array, G: Array | None = None, prior: Array | None = None
+) -> VarianceFit:
+    """The same without searching: mean, covariance and deviance for given variances (3,)."""
+    problem = _problem(evidence, G, prior)
+    deviance, _ = _deviance(np.log(variances), problem)
+    V = np.einsum("c,cbij->bij", variances, problem.components)
+    X = problem.X
+    weighted = np.linalg.solve(V, np.concatenate([X, problem.z[..., None]], axis=2))
+    M = np.einsum("bma,bmc->ac", X, weighted[..., :-1]) + np.diag(problem.precision)
+    # Equilibrate: columns count in rad, mm and per hour.
+    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+    covariance = np.linalg.pinv(M * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
+    mean = covariance @ np.einsum("bma,bm->a", X, weighted[..., -1])
+    return VarianceFit(np.asarray(variances), deviance, mean, covariance)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    z: Array  # (B, m)
+    X: Array  # (B, m, a + g)
+    precision: Array  # (a + g,) of the prior
+    components: Array
+    offset: float  # log det of the prior covariance
+
+
+def _problem(evidence: Evidence, G: Array | None, prior: Array | None) -> _Problem:
+    a = evidence.A.shape[2]
+    if G is None:
+        return _Problem(evidence.z, evidence.A, np.zeros(a), evidence.components, 0.0)
+    X = np.concatenate([evidence.A, G], axis=2)
+    if prior is None:
+        return _Problem(evidence.z, X, np.zeros(X.shape[2]), evidence.components, 0.0)
+    precision = np.concatenate([np.zeros(a), 1 / prior**2])
+    return _Problem(evidence.z, X, precision, evidence.components, float(2 * np.log(prior).sum()))
+
+
+def _guess(evidence: Evidence) -> Array:
+    traces = np.einsum("cbii->c", evidence.components)
+    spread = float((evidence.z**2).sum()) or 1e-24
+    return np.array([spread / max(traces[0], 1e-300), spread / max(traces[1], 1e-300), 1.0]) / [4.0, 4.0, 1.0]
+
+
+def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
+    """−2 log restricted likelihood and its slope in the log variances."""
+    variances = np.exp(log_variances)
+    V = np.einsum("c,cbij->bij", variances, problem.components)
+    try:
+        L = np.linalg.cholesky(V)
+    except np.linalg.LinAlgError:
+        return 1e300, np.zeros(3)
+    inverse = np.linalg.inv(V)
+    WX = inverse @ problem.X
+    M = np.einsum("bma,bmc->ac", problem.X, WX) + np.diag(problem.precision)
+    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+    values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
+    keep = values > 1e-12
+    half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
+    b = np.einsum("bma,bm->a", WX, problem.z)
+    beta = half @ (half.T @ b)
+    rest = problem.z - problem.X @ beta
+    Wr = np.einsum("bij,bj->bi", inverse, rest)
+    WXh = WX @ half
+    slope = np.empty(3)
+    for i, C in enumerate(problem.components):
+        trace = float((inverse * C).sum()) - float(np.einsum("bmk,bmn,bnk->", WXh, C, WXh, optimize=True))
+        slope[i] = variances[i] * (trace - float(np.einsum("bi,bij,bj->", Wr, C, Wr, optimize=True)))
+    # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
+    square = float(np.einsum("bi,bi->", rest, Wr)) + float(beta @ (problem.precision * beta))
+    logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
+    logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
+    return logdet + square - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
