@@ -44,8 +44,9 @@ def fit(stand: Stand) -> BaseFit:
     """
     start = _start(stand)
     solution = least_squares(
-        lambda x: _residuals(stand, start, x), np.zeros(_size(stand)), x_scale=_scales(stand), method="trf",
-        xtol=1e-13, ftol=1e-13, gtol=1e-13,
+        lambda x: _residuals(stand, start, x), np.zeros(_size(stand)),
+        lambda x: _jacobian(stand, start, x), x_scale=_scales(stand), method="trf",
+        xtol=1e-10, ftol=1e-10, gtol=1e-10,
     )  # fmt: skip
     jacobian = solution.jac * _scales(stand)
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
@@ -57,9 +58,7 @@ def fit(stand: Stand) -> BaseFit:
     covariance = (right.T / values**2) @ right * np.outer(_scales(stand), _scales(stand))
     T_stand, T_base, *_ = _unpack(stand, start, solution.x)
     rail, rod = _misfit(stand, start, solution.x)
-    return BaseFit(
-        T_base, T_stand, covariance[6:12, 6:12], rail, rod, float(2 * solution.cost), len(left) - len(right)
-    )
+    return BaseFit(T_base, T_stand, covariance[6:12, 6:12], rail, rod, float(2 * solution.cost), len(left) - len(right))
 
 
 def _start(stand: Stand) -> tuple[Array, Array]:
@@ -69,7 +68,9 @@ def _start(stand: Stand) -> tuple[Array, Array]:
     there = stand.rod.points
     # The upright pair only decides what two points leave open: a thousandth of the points' spread.
     up = 1e-3 * np.linalg.norm(there - there.mean(axis=0)) * np.array([[0.0, 0.0, 1.0]])
-    turn = Rotation.align_vectors(np.vstack([here - here.mean(axis=0), up]), np.vstack([there - there.mean(axis=0), up]))[0]
+    turn = Rotation.align_vectors(
+        np.vstack([here - here.mean(axis=0), up]), np.vstack([there - there.mean(axis=0), up])
+    )[0]
     R = turn.as_matrix()
     return T_stand, frames.make(R, here.mean(axis=0) - R @ there.mean(axis=0))
 
@@ -94,20 +95,20 @@ def _scales(stand: Stand) -> Array:
 
 
 def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, ...]:
-    """Poses, positions along the rail, and corrections of slide, angle and length."""
+    """Poses, positions along the rail, and corrections of slide, angle and length; x is (..., n)."""
     N, M = len(stand.rail.points), len(stand.slide)
     poses = []
-    for T0, step in zip(start, (x[:6], x[6:12]), strict=True):
-        turned = frames.exp(np.concatenate([step[:3], np.zeros(3)]))[:3, :3] @ T0[:3, :3]
-        poses.append(frames.make(turned, T0[:3, 3] + step[3:]))
-    T_stand = start[0]
-    along = frames.transform(frames.inverse(T_stand), stand.rail.points)[:, 0] + x[12 : 12 + N]
-    return poses[0], poses[1], along, *x[12 + N :].reshape(3, M)
+    for T0, step in zip(start, (x[..., :6], x[..., 6:12]), strict=True):
+        turn = frames.exp(np.concatenate([step[..., :3], np.zeros_like(step[..., :3])], axis=-1))[..., :3, :3]
+        poses.append(frames.make(turn @ T0[:3, :3], T0[:3, 3] + step[..., 3:]))
+    along = frames.transform(frames.inverse(start[0]), stand.rail.points)[:, 0] + x[..., 12 : 12 + N]
+    return poses[0], poses[1], along, *np.moveaxis(x[..., 12 + N :].reshape(*x.shape[:-1], 3, M), -2, 0)
 
 
 def _misfit(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
+    """Touched minus fitted points, each in the base of the robot that touched them."""
     T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
-    rail = frames.transform(T_stand, along[:, None] * np.array([1.0, 0.0, 0.0]))
+    rail = frames.transform(T_stand, along[..., None] * np.array([1.0, 0.0, 0.0]))
     cup = rod_points(stand.slide + slide, stand.angle + angle, stand.length + length, stand.turn)
     rod = frames.transform(frames.inverse(T_base) @ T_stand, cup)
     return stand.rail.points - rail, stand.rod.points - rod
@@ -120,13 +121,21 @@ def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
     known = np.isfinite(stand.rail_slide)
     rows = [
         _whiten(rail, stand.rail.covariance), _whiten(rod, stand.rod.covariance),
-        (along[known] - stand.rail_slide[known]) / stand.sigma_slide, slide / stand.sigma_slide,
-        angle / stand.sigma_angle, length / stand.sigma_length, [T_stand[2, 1] / stand.sigma_level_stand],
+        (along[..., known] - stand.rail_slide[known]) / stand.sigma_slide, slide / stand.sigma_slide,
+        angle / stand.sigma_angle, length / stand.sigma_length, T_stand[..., 2, 1:2] / stand.sigma_level_stand,
     ]  # fmt: skip
     if stand.sigma_level_base is not None:
-        rows.append(T_base[:2, 2] / stand.sigma_level_base)
-    return np.concatenate(rows)
+        rows.append(T_base[..., :2, 2] / stand.sigma_level_base)
+    return np.concatenate(rows, axis=-1)
+
+
+def _jacobian(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
+    """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
+    steps = np.diag(1e-2 * _scales(stand))
+    both = _residuals(stand, start, x + np.stack([steps, -steps]))
+    return np.asarray((both[0] - both[1]).T / (2e-2 * _scales(stand)))
 
 
 def _whiten(residuals: Array, covariance: Array) -> Array:
-    return np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None]).ravel()
+    white = np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])
+    return np.asarray(white.reshape(*residuals.shape[:-2], -1))

@@ -39,7 +39,9 @@ def project(stand: Stand) -> Projection:
             not close.
     """
     if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
-        raise NoResultError("the projection takes two points per robot and one slide; the least squares takes any number")
+        raise NoResultError(
+            "the projection takes two points per robot and one slide; the least squares takes any number"
+        )
     R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _rod(stand))
     gamma, p_xy = _plane_xy(stand)
     turned = stand.rod.points @ _rotation(2, gamma).T

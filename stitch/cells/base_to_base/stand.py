@@ -52,7 +52,11 @@ def cylinder_covariance(joint1: Array, radius: Array, sigma: tuple[float, float,
     """Covariance (N, 3, 3) of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
     c, s, zero = np.cos(joint1), np.sin(joint1), np.zeros_like(joint1)
     jacobian = np.stack(
-        [np.stack([-radius * s, c, zero], -1), np.stack([radius * c, s, zero], -1), np.stack([zero, zero, zero + 1], -1)],
+        [
+            np.stack([-radius * s, c, zero], -1),
+            np.stack([radius * c, s, zero], -1),
+            np.stack([zero, zero, zero + 1], -1),
+        ],
         axis=-2,
     )
     return np.asarray(jacobian @ np.diag(np.square(sigma)) @ np.swapaxes(jacobian, -1, -2))
