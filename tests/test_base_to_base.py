@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from stitch.cells.base_to_base.stand import Stand, Touched
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
-EXAMPLE = "examples/base_to_base.toml"
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "base_to_base.toml"
 DRAWS = 1000
 
 
@@ -168,13 +169,13 @@ def test_published_errors_are_ordinary_draws(errors):
 
 
 def test_command(capsys):
-    main_(["base", EXAMPLE, "--json"])
+    main_(["base", str(EXAMPLE), "--json"])
     document = json.loads(capsys.readouterr().out)
     assert np.allclose(np.array(document["T_base1_base2"])[:3, 3], [4, -1, 1], atol=1e-3)
 
 
 def test_command_refuses_with_exit_code_1(tmp_path, capsys):
-    text = open(EXAMPLE, encoding="utf-8").read()
+    text = EXAMPLE.read_text(encoding="utf-8")
     for old, new in (("0.6826", "1.1305"), ("0.7897", "1.1772"), ("length = 4.0\n", "length = 5.0\n"), ("4.4084", "5.5555"),
                      ("3.8822", "5.9093"), ("0.4488", "0.6283")):  # fmt: skip
         text = text.replace(old, new)
@@ -203,7 +204,7 @@ def test_command_refuses_with_exit_code_1(tmp_path, capsys):
     ],
 )  # fmt: skip
 def test_bad_input_is_named(tmp_path, old, new, part):
-    text = open(EXAMPLE, encoding="utf-8").read()
+    text = EXAMPLE.read_text(encoding="utf-8")
     assert old in text
     (tmp_path / "bad.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError) as error:

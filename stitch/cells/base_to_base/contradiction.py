@@ -36,7 +36,7 @@ class Comparison:
 def compare_distances(stand: Stand) -> tuple[Comparison, ...]:
     """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
     found = [_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
-    known = np.flatnonzero(np.isfinite(stand.rail_slide))
+    known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
     found += [_rail_pair(stand, i, j) for i, j in combinations(known, 2)]
     return tuple(sorted(found, key=lambda c: -c.sigmas))
 

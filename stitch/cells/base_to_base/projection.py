@@ -65,7 +65,7 @@ def _plane_xy(stand: Stand) -> tuple[float, Array]:
     P2e = (stand.slide[0] - stand.rail_slide[1]) * np.cos(_slope(P))
     Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
     O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
-    P1P2, R1R2 = _third_side(*O1P, abs(Pr[0] - Pr[1])), _third_side(*O2R, abs(Rr[0] - Rr[1]))
+    P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
     C1, C3 = _angle(O1P[0], P1P2, O1P[1]), _angle(O2R[0], R1R2, O2R[1])
     C2, C4, C7 = np.pi - (C1 + Pr[0]), np.pi - (C3 + Rr[0]), np.pi - (C3 + abs(Rr[0] - Rr[1]))
     C5, C6 = _angle(rod[0], R1R2, rod[1]), _angle(R1R2, rod[1], rod[0])

@@ -83,7 +83,8 @@ def _touched(
     readings = {"slide"} if name == "main" else {"slide", "angle", "length"}
     sigma = robot.get("sigma", {})
     check_keys(file, f"{name}.sigma", sigma, {"point", *_CYLINDER})
-    points, covariances = [], []
+    points: list[Array] = []
+    covariances: list[Array] = []
     for i, entry in enumerate(entries):
         place = f"{name}.points[{i + 1}]"
         check_keys(file, place, entry, {"name", "point", *_CYLINDER, *readings})
@@ -91,7 +92,7 @@ def _touched(
             point = entry["point"]
             if not isinstance(point, list) or len(point) != 3:
                 raise InputError(f"{file}: {place}.point must be three numbers [x, y, z] in the robot's base frame")
-            points.append([finite(file, f"{place}.point", value) for value in point])
+            points.append(np.array([finite(file, f"{place}.point", value) for value in point]))
             covariances.append(np.eye(3) * _sigma(file, f"{name}.sigma", sigma, "point", _POINT / unit) ** 2)
             continue
         joint1, radius, height = (_entry(file, place, entry, key) for key in _CYLINDER)
