@@ -112,7 +112,7 @@ def tables(draws: int) -> str:
             rms, median, high = np.sqrt((found**2).mean(0)), np.median(found, 0), np.quantile(found, 0.95, 0)
             cells = [f"{a * 1e6:.0f} / {b * 1e6:.0f}" for a, b in (rms, median, high, published)]
             lines.append(f"| {experiment} | {lam} | {name} | {' | '.join(cells)} |")
-    lines += ["", "The source's noisy positions of experiment 1 (its table 3, rounded to 0.1 mm), its rod readings:", "",
+    lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", "",
               "| λ | solution | rotation / rad | translation / m | published |", "|---|---|---|---|---|"]  # fmt: skip
     for lam, points in TABLE_3.items():
         P, R = np.array(points[:2]), np.array(points[2:])

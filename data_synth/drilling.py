@@ -85,7 +85,7 @@ class DrillingCell:
         a = across / self.panel_radius
         inward = np.array([-np.sin(a), 0.0, -np.cos(a)])
         middle, lean = np.array([1400.0, 0.0, 900.0]), Rotation.from_euler("zy", [0.4, 0.3])
-        local = np.array([0, along, 0]) - self.panel_radius * (inward + [0, 0, 1])
+        local = np.array([0, along, 0]) - self.panel_radius * (inward + np.array([0.0, 0.0, 1.0]))
         return middle + lean.apply(local), lean.apply(inward)
 
     def _actual(self, position: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +107,9 @@ class DrillingCell:
         position, direction = self.actual[name]
         centre = frames.transform(T_flange_base, position[None])[0]
         normal = T_flange_base[:3, :3] @ direction
-        return self._read(self.ranges(centre, normal)), self.image(centre[None])[0] + self.rng.normal(0, self.sizes.pixel, 2)
+        return self._read(self.ranges(centre, normal)), self.image(centre[None])[0] + self.rng.normal(
+            0, self.sizes.pixel, 2
+        )
 
     def ranges(self, centre: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Beam lengths to the panel around a hole: (p − c)·n = (across² of p − c) / (2 radius), sagging inwards."""

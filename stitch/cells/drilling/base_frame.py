@@ -33,7 +33,9 @@ def fit_circle(points: Array) -> Circle:
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd(points - middle)
     if len(points) < 4 or spread[1] < 1e-6 * spread[0]:
-        raise NoResultError("a circle needs four or more marker positions that do not lie on a line; turn the joint further")
+        raise NoResultError(
+            "a circle needs four or more marker positions that do not lie on a line; turn the joint further"
+        )
     flat = (points - middle) @ axes[:2].T
     # Algebraic circle |p|² = 2 c·p + k as a start.
     solved = np.linalg.lstsq(np.column_stack([2 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]

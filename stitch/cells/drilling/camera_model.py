@@ -7,6 +7,7 @@ seen at many places and heights, told by robot and rangers, shows them.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from stitch.cells.drilling.homography import normaliser
@@ -24,7 +25,7 @@ class Observations:
 
     xyz: Array  # (N, 3) in the flange frame, length unit
     uv: Array  # (N, 2) pixels
-    on_plate: Array  # (N,) bool: hole of the calibration plate, whose z is the plate's stated height
+    on_plate: NDArray[np.bool_]  # (N,): hole of the calibration plate, whose z is the plate's stated height
     image_size: tuple[float, float]  # width, height in pixels
 
 
@@ -86,9 +87,13 @@ def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
         NoResultError: too few holes, all at one height, or a plate height error asked for without a plate.
     """
     if len(seen.xyz) < 8 or np.ptp(seen.xyz[:, 2]) < 1e-3 * np.ptp(seen.xyz[:, 0]):
-        raise NoResultError("a camera beyond its work plane needs eight or more holes at different heights; measure some")
+        raise NoResultError(
+            "a camera beyond its work plane needs eight or more holes at different heights; measure some"
+        )
     if "plate_height" in effects and not (seen.on_plate.any() and np.unique(seen.xyz[~seen.on_plate, 2]).size > 1):
-        raise NoResultError("a plate height error shows only against a hole seen at several other heights; measure some")
+        raise NoResultError(
+            "a plate height error shows only against a hole seen at several other heights; measure some"
+        )
     centre = np.array(seen.image_size) / 2 - 0.5
     corner = float(np.linalg.norm(seen.image_size) / 2)
     # Normalised as the DLT wants it, for the refinement's conditioning too.

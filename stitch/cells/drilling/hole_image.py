@@ -30,7 +30,7 @@ def find_holes(image: NDArray[np.uint8], smallest: float = 20.0) -> Array:
     cv2 = _opencv()
     if image.ndim != 2 or image.dtype != np.uint8:
         raise InputError(f"the image has shape {image.shape} and type {image.dtype}; give one grey channel of 8 bits")
-    level, mask = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
+    _, mask = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     centres = []
     for contour in contours:
@@ -69,5 +69,7 @@ def _centroid(image: NDArray[np.uint8], box: tuple[int, int, int, int]) -> Array
     plate = float(np.median(np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])))
     # Noise on the plate must not pull the mean: only what is clearly darker counts.
     weight = np.where(patch < plate - 0.1 * (plate - patch.min()), plate - patch, 0.0)
-    v_index, u_index = np.mgrid[rows.start : rows.start + patch.shape[0], columns.start : columns.start + patch.shape[1]]
-    return np.array([(weight * u_index).sum(), (weight * v_index).sum()]) / weight.sum()
+    v_index, u_index = np.mgrid[
+        rows.start : rows.start + patch.shape[0], columns.start : columns.start + patch.shape[1]
+    ]
+    return np.asarray([(weight * u_index).sum() / weight.sum(), (weight * v_index).sum() / weight.sum()], float)

@@ -17,7 +17,9 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     """
     xy, uv = np.asarray(xy, float), np.asarray(uv, float)
     if len(xy) < 4:
-        raise NoResultError(f"a homography needs four or more holes, {len(xy)} are given; find more of them in the image")
+        raise NoResultError(
+            f"a homography needs four or more holes, {len(xy)} are given; find more of them in the image"
+        )
     to_xy, to_uv = normaliser(xy), normaliser(uv)
     p, q = _apply(to_xy, xy), _apply(to_uv, uv)
     one, zero = np.ones(len(p)), np.zeros((len(p), 3))
@@ -30,7 +32,7 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     # In normalised coordinates the plane's centre maps near the image's, so the last entry is far from zero.
     start = h[:8] / h[8]
     refined = least_squares(
-        lambda x: (_apply(np.append(x, 1.0).reshape(3, 3), p) - q).ravel(), start, method="lm"
+        lambda x: (_apply(np.asarray(np.append(x, 1.0).reshape(3, 3)), p) - q).ravel(), start, method="lm"
     ).x  # fmt: skip
     H = np.linalg.inv(to_uv) @ np.append(refined, 1.0).reshape(3, 3) @ to_xy
     return np.asarray(H / H[2, 2])
@@ -43,7 +45,7 @@ def to_image(H: Array, xy: Array) -> Array:
 
 def to_plane(H: Array, uv: Array) -> Array:
     """Work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
-    return _apply(np.linalg.inv(H), np.asarray(uv, float))
+    return _apply(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
 
 
 def leave_one_out(xy: Array, uv: Array) -> Array:

@@ -55,7 +55,7 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
     scale = np.linalg.norm(matrix, axis=0)
     if len(planes) < 6 or (scale == 0).any() or np.linalg.cond(matrix / scale) > 1e6:
         raise NoResultError(
-            "six or more plane positions are needed, tilted both ways and at different distances; measure more positions"
+            "six or more plane positions are needed, tilted both ways and at different distances; measure more"
         )
     start = np.linalg.lstsq(matrix, -offsets, rcond=None)[0]
     n0 = start[3:] / np.linalg.norm(start[3:])
