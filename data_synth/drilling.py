@@ -33,11 +33,11 @@ NINE = np.array([[x, y] for y in (-12.0, 0.0, 12.0) for x in (-12.0, 0.0, 12.0)]
 class Sizes:
     """Error sizes; the defaults bring the source's errors before compensation."""
 
-    part_shift: float = 2.55  # mm, mostly along the holes
+    part_shift: float = 2.58  # mm, mostly along the holes
     part_turn: float = 0.04  # deg
     tool_tilt: float = 3.0  # deg
-    local_tilt: float = 0.35  # deg, of single holes against their stated direction
-    stretch: float = 5e-4  # of positions, a robot's smooth error
+    local_tilt: float = 0.3  # deg, of single holes against their stated direction
+    stretch: float = 4e-4  # of positions, a robot's smooth error
     wave: float = 0.05  # mm, what its gears add over 400 mm
     repeat: float = 0.03  # mm
     ranger: float = 0.05  # mm, one reading; 15 are averaged

@@ -65,7 +65,7 @@ def _placed(cell: DrillingCell, name: str) -> list[object]:
         reported += wanted - cell.true_pose(frames.make(R, reported))[:3, 3]
     T_true = cell.true_pose(frames.make(R, reported))
     offset = T_true[:3, :3].T @ (position - T_true[:3, 3])
-    uv = cell.image((offset + [0.0, 0.0, HEIGHT])[None])[0] + rng.normal(0, cell.sizes.pixel, 2)
+    uv = cell.image((offset + np.array([0.0, 0.0, HEIGHT]))[None])[0] + rng.normal(0, cell.sizes.pixel, 2)
     angles = Rotation.from_matrix(R).as_euler("ZYX", degrees=True)
     return [name, *reported, *angles, *uv, HEIGHT + offset[2] + rng.normal(0, 0.03)]
 

@@ -201,6 +201,7 @@ def test_command_refuses_with_exit_code_1(tmp_path, capsys):
         ("joint1 = 0.6283\nradius = 1.45", "radius = 1.45", "joint1 is missing"),
         ('format = "stitch-base/1"', "format = 1", "expected"),
         ("joint1 = 0.6283", "joint1 = -0.6283", "far apart"),
+        ("joint1 = 0.6283\nradius = 1.45", "slide = 1.0\njoint1 = 0.6283\nradius = 1.45", "the slide grows"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(tmp_path, old, new, part):
@@ -210,6 +211,47 @@ def test_bad_input_is_named(tmp_path, old, new, part):
     with pytest.raises(InputError) as error:
         read_stand(tmp_path / "bad.toml")
     assert part in str(error.value) and str(tmp_path / "bad.toml") in str(error.value)
+
+
+def test_millimetres_and_degrees_give_the_same(tmp_path):
+    """The same points in base coordinates, mm and degrees, with the sigmas left to their defaults in both."""
+    s = read_stand(EXAMPLE)
+    lines = [
+        'format = "stitch-base/1"',
+        'length_unit = "mm"',
+        'angle_unit = "deg"',
+        "[rod]",
+        "[level]",
+        "second_base = 0.0573",
+    ]
+    for name, points in (("main", s.rail.points), ("second", s.rod.points)):
+        for i, point in enumerate(points):
+            lines += [f"[[{name}.points]]", f"point = {(point * 1000).tolist()}"]
+            if name == "second":
+                lines += [
+                    f"slide = {s.slide[i] * 1000}",
+                    f"angle = {np.degrees(s.angle[i])}",
+                    f"length = {s.length[i] * 1000}",
+                ]
+            elif i == 1:
+                lines += ["slide = 0"]
+    (tmp_path / "mm.toml").write_text("\n".join(lines), encoding="utf-8")
+    found = solve(read_stand(tmp_path / "mm.toml")).fit
+    covariance = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
+    same = replace(s, rail=replace(s.rail, covariance=covariance), rod=replace(s.rod, covariance=covariance),
+                   sigma_level_base=np.radians(0.0573))  # fmt: skip
+    wanted = fit(same)
+    scale = np.diag([1, 1, 1, 1000.0, 1000, 1000])
+    assert np.allclose(found.T_base1_base2[:3, 3], wanted.T_base1_base2[:3, 3] * 1000, atol=1e-3)
+    assert np.allclose(found.covariance, scale @ wanted.covariance @ scale, rtol=1e-3, atol=1e-12)
+
+
+def test_a_wrong_height_shows_in_the_chi_square():
+    """10 mm on R2 change |R1R2| by 0.01²/(2·0.607) = 0.08 mm only, but tilt it by 0.016 rad against the level."""
+    s = printed(*EXPERIMENT_1, (0.6283, 0.4488))
+    wrong = replace(s, rod=replace(s.rod, points=s.rod.points + np.array([[0, 0, 0], [0, 0, 0.01]])))
+    with pytest.raises(NoResultError, match="chi-square"):
+        solve(wrong)
 
 
 def main_(arguments):

@@ -46,6 +46,12 @@ def _print(result: JobResult, unit: str) -> None:
             f"{trial.effect}: {verdict}, {trial.value:.4g} ± {trial.sigma:.2g} (F {trial.F:.1f}, "
             f"p {trial.p_value:.1e}, BIC {trial.bic_change:+.1f})."
         )
+    if (tool := result.tool_axis) is not None:
+        verdict = "found" if tool.accepted else "not found"
+        console.print(
+            f"tool axis: {verdict}, {np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}° off z "
+            f"(p {tool.p_value:.1e})."
+        )
     for name, r in result.rangers.items():
         console.print(
             f"Ranger {name}: origin {_numbers(r.origin)}, direction {_numbers(r.direction)}, rms {r.rms:.3f}."
@@ -55,10 +61,10 @@ def _print(result: JobResult, unit: str) -> None:
         table.add_column(heading)
     for drive in result.drives:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
-        angles = _numbers(np.degrees(drive.angles))
-        table.add_row(drive.hole.name, drive.hole.group, _numbers(drive.position), angles, f"{shift:.3f}")
+        angles = _numbers(np.degrees(drive.angles), 3)
+        table.add_row(drive.hole.name, drive.hole.group, _numbers(drive.position, 3), angles, f"{shift:.3f}")
     console.print(table)
 
 
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(f"{value:.4f}" for value in values)
+def _numbers(values: np.ndarray, digits: int = 4) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)

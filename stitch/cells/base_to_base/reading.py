@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points
+from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
 from stitch.cells.toml_tables import check_keys, finite, table
 from stitch.errors import InputError
 from stitch.frames import Array
@@ -138,6 +138,12 @@ def _check_geometry(file: Path, stand: Stand) -> None:
         raise InputError(f"{file}: main.points lie within {2 * extent:.3g}; a rail's direction needs points far apart")
     if not np.isfinite(stand.rail_slide).any():
         raise InputError(f"{file}: no main point has a slide reading; write slide = 0 at the one that sets the zero")
-    x = np.linalg.svd(rail - rail.mean(axis=0))[2][0]
+    x = rail_direction(rail)
+    read = stand.rail_slide[np.isfinite(stand.rail_slide)]
+    if np.isnan(stand.rail_slide[-1]) or (np.diff(rail @ x) <= 0).any() or (np.diff(read) <= 0).any():
+        raise InputError(
+            f"{file}: main.points must be listed in the direction in which the slide grows, the last with its slide "
+            "reading; reorder them, or mend a slide reading"
+        )
     if abs(x[2]) > 0.9:
         raise InputError(f"{file}: the rail stands upright in the main base; it must lie, or the rod has no level")

@@ -24,7 +24,7 @@ class Touched:
 class Stand:
     """Everything that was read. Lengths in length_unit, angles in rad.
 
-    `rail` holds the points of the main robot, all on the rail's line; `rail_slide` the slide reading of the
+    `rail` holds the points of the main robot, listed along the rail from P1 on; `rail_slide` the slide reading of the
     cup touched there, NaN where none was read. `rod` holds the points of the second robot, one per rod setting.
     """
 
@@ -74,7 +74,7 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
 
     The source's choice: the line R–S of its figure 6 is perpendicular to the vertical plane through the rail.
     """
-    x = _direction(rail, rail_slide)
+    x = rail_direction(rail)
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
     known = np.isfinite(rail_slide)
@@ -84,9 +84,7 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
     return T
 
 
-def _direction(rail: Array, rail_slide: Array) -> Array:
-    """Unit direction of growing slide; the points without a reading lie before the others."""
+def rail_direction(rail: Array) -> Array:
+    """Unit direction of growing slide, in which the points are listed."""
     line = np.linalg.svd(rail - rail.mean(axis=0))[2][0]
-    order = np.where(np.isfinite(rail_slide), rail_slide, -np.inf)
-    ahead = rail[np.argmax(order)] - rail[np.argmin(order)]
-    return np.asarray(line * np.sign(line @ ahead))
+    return np.asarray(line * np.sign(line @ (rail[-1] - rail[0])))

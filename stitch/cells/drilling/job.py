@@ -15,6 +15,7 @@ from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_p
 from stitch.cells.drilling.rangers import RangerFit, fit_ranger
 from stitch.cells.drilling.reading import Hole, Job
 from stitch.cells.drilling.servo import hole_coordinate
+from stitch.cells.drilling.tool_axis import ToolAxis, find_tool_axis
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -25,12 +26,13 @@ class Drive:
 
     hole: Hole
     position: Array  # (3,)
-    direction: Array  # (3,)
+    direction: Array  # (3,) of the hole
+    rotation: Array  # (3, 3) reported orientation of the tool
 
     @property
     def angles(self) -> Array:
         """(3,) in rad about z, y', x''."""
-        return euler_zyx(hole_rotation(self.direction))
+        return euler_zyx(self.rotation)
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class JobResult:
     rangers: dict[str, RangerFit]
     T_measuring_base: Array | None
     naming: Naming | None
+    tool_axis: ToolAxis | None
 
 
 def solve_job(job: Job) -> JobResult:
@@ -57,23 +60,33 @@ def solve_job(job: Job) -> JobResult:
     xy = job.plate_xyz[:, :2]
     H = fit_homography(xy, job.plate_uv)
     naming = name_effects(job.checks) if job.checks is not None else None
-    groups, drives = {}, []
+    groups: dict[str, Compensation] = {}
     for group in dict.fromkeys(hole.group for hole in job.holes):
-        members = [hole for hole in job.holes if hole.group == group]
-        references = [hole for hole in members if hole.reference]
+        references = [hole for hole in job.holes if hole.group == group and hole.reference]
         if len(references) < 3:
             raise NoResultError(f"group {group}: {len(references)} reference holes; a group needs three or more")
         actual = np.array([_actual(job, H, naming, hole.name) for hole in references])
-        found = groups[group] = compensate(np.array([hole.position for hole in references]), actual)
-        for hole in members:
-            if not hole.reference:
-                position, direction = found.apply(hole.position[None], hole.direction[None])
-                drives.append(Drive(hole, position[0], direction[0]))
+        groups[group] = compensate(np.array([hole.position for hole in references]), actual)
+    tool_axis = _tool_axis(job, groups)
     return JobResult(
-        H, leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)), groups, tuple(drives),
+        H, leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)), groups,
+        tuple(_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
         {name: fit_ranger(*readings) for name, readings in job.rangers.items()},
-        base_frame(*job.marker_paths) if job.marker_paths else None, naming,
+        base_frame(*job.marker_paths) if job.marker_paths else None, naming, tool_axis,
     )  # fmt: skip
+
+
+def _tool_axis(job: Job, groups: dict[str, Compensation]) -> ToolAxis | None:
+    """From each reference hole once, whatever number of groups it serves."""
+    references = {hole.name: hole for hole in job.holes if hole.reference}
+    directions = [groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in references.values()]
+    return find_tool_axis(np.array([job.placed[name][0][:3, :3] for name in references]), np.array(directions))
+
+
+def _drive(hole: Hole, group: Compensation, tool_axis: ToolAxis | None) -> Drive:
+    position, direction = (found[0] for found in group.apply(hole.position[None], hole.direction[None]))
+    R = hole_rotation(direction)
+    return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
 
 
 def _actual(job: Job, H: Array, naming: Naming | None, name: str) -> Array:
@@ -120,5 +133,10 @@ def document(result: JobResult) -> dict[str, Any]:
             for name, r in result.rangers.items()
         },
         "T_measuring_base": None if result.T_measuring_base is None else result.T_measuring_base.tolist(),
+        "tool_axis": None if result.tool_axis is None else {
+            "axis": result.tool_axis.axis.tolist(), "tilt_deg": float(np.degrees(result.tool_axis.tilt)),
+            "sigma_deg": float(np.degrees(result.tool_axis.sigma)), "p_value": result.tool_axis.p_value,
+            "accepted": result.tool_axis.accepted,
+        },
         "camera_effects": None if naming is None else [vars(trial) for trial in naming.trials],
     }  # fmt: skip
