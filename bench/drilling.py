@@ -117,8 +117,8 @@ def image_table(seeds: int) -> list[str]:
         errors.append(np.linalg.norm(to_plane(H, truth) - NINE, axis=1))
         left_out.append(np.linalg.norm(leave_one_out(NINE, found), axis=1))
     return ["", f"Nine holes found by OpenCV in {seeds} rendered images of {IMAGE[0]} x {IMAGE[1]} pixels: the "
-            f"hand-eye is off by {np.mean(errors):.4f} mm on average and {np.max(errors):.4f} mm at most; leave-one-out "
-            f"{np.mean(left_out):.4f} mm on average."]  # fmt: skip
+            f"hand-eye is off by {np.mean(errors):.4f} mm on average and {np.max(errors):.4f} mm at most; "
+            f"leave-one-out {np.mean(left_out):.4f} mm on average."]  # fmt: skip
 
 
 def main() -> None:

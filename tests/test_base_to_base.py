@@ -213,6 +213,21 @@ def test_bad_input_is_named(tmp_path, old, new, part):
     assert part in str(error.value) and str(tmp_path / "bad.toml") in str(error.value)
 
 
+def test_another_arrangement_is_left_to_the_least_squares():
+    """The second base on the other side of its points: the cosine rules would return a turn wrong by 180°."""
+    rail = Rotation.from_rotvec([0, 0, -1.2])
+    x, y = rail.apply([[1.0, 0, 0], [0, 1.0, 0]])
+    P2, t = np.array([1.17, -0.85, 1.3]), np.array([4, -1, 1.0])
+    theta, length = np.array([0.68, 0.79]), np.array([4, 4.4])
+    cups = P2 + 3.88 * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
+    turn = Rotation.from_rotvec([0, 0, -1.57])
+    s = stand([P2 - 1.7 * x, P2], turn.inv().apply(cups - t), 3.88, theta, length)
+    result = solve(s)
+    assert result.projection is None and "as the source places it" in result.no_projection
+    assert np.abs(result.fit.T_base1_base2[:3, 3] - t).max() < 1e-6
+    assert np.abs(result.fit.T_base1_base2[:3, :3] - turn.as_matrix()).max() < 1e-6
+
+
 def test_millimetres_and_degrees_give_the_same(tmp_path):
     """The same points in base coordinates, mm and degrees, with the sigmas left to their defaults in both."""
     s = read_stand(EXAMPLE)

@@ -351,6 +351,8 @@ def test_effects_left_out_leave_the_reference_holes_wrong(tmp_path):
         ("holes.csv", "101,1,reference", "102,1,reference", "stands twice"),
         ("placed.csv", "101,", "109,", "reference hole 101 is missing"),
         ("placed.csv", "hole,x", "hole,X", "column 'x' is missing"),
+        ("job.toml", "height = 186.61", "height = 186.61 mm", "not valid TOML"),
+        ("holes.csv", "reference,1244", "reference,x1244", "holes.csv:2: x is"),
         ("rangers.csv", "L1,", "L1,a", "rangers.csv:2: a is"),
     ],
 )
@@ -362,6 +364,14 @@ def test_bad_input_is_named(tmp_path, file, old, new, part):
     with pytest.raises(InputError) as error:
         read_job(tmp_path / "job.toml")
     assert part in str(error.value) and str(tmp_path) in str(error.value)
+
+
+def test_directions_out_of_the_part_are_refused(tmp_path):
+    cell = DrillingCell(0)
+    cell.nominal = {name: (position, -direction) for name, (position, direction) in cell.nominal.items()}
+    write_job(tmp_path, cell)
+    with pytest.raises(InputError, match="point into the part"):
+        read_job(tmp_path / "job.toml")
 
 
 def test_two_reference_holes_are_too_few(tmp_path):

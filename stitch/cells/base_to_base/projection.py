@@ -18,8 +18,12 @@ from stitch.cells.base_to_base.stand import Stand, level_stand, rod_points
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
+# The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
+# solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
+_GAP = 0.05
 # R1R2 shorter in a plane than this share of its length gives no angle there.
 _SHORT = 0.05
+_ARRANGEMENT = "rod and joints contradict each other, or the stand is not placed as the source places it"
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ def project(stand: Stand) -> Projection:
 
     Raises:
         NoResultError: other than two points per robot, a slide that moved between R1 and R2, or triangles that do
-            not close.
+            not close as in the source's arrangement.
     """
     if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
         raise NoResultError(
@@ -51,7 +55,11 @@ def project(stand: Stand) -> Projection:
     rotation = _rotation(2, gamma) @ _rotation(1, _level(beta)) @ _rotation(0, _level(alpha))
     offsets = np.array([p_xy, p_xz[::-1], p_zy])
     mean = [(p_xy[0] + p_xz[1]) / 2, (p_xy[1] + p_zy[0]) / 2, (p_xz[0] + p_zy[1]) / 2]
-    return Projection(frames.make(rotation, np.array(mean)), np.array([gamma, beta, alpha]), offsets)
+    T = frames.make(rotation, np.array(mean))
+    gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
+    if not gap < _GAP * stand.length.max():
+        raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; {_ARRANGEMENT}")
+    return Projection(T, np.array([gamma, beta, alpha]), offsets)
 
 
 def _plane_xy(stand: Stand) -> tuple[float, Array]:
@@ -106,10 +114,7 @@ def _angle(a: float, b: float, opposite: float) -> float:
     cosine = (a * a + b * b - opposite * opposite) / (2 * a * b) if a * b > 0 else np.nan
     # A triangle that lies flat may miss ±1 by rounding; one that misses more does not close.
     if not abs(cosine) < 1 + 1e-12:
-        raise NoResultError(
-            f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; rod and joints contradict each "
-            "other, or the stand is not placed as the source places it"
-        )
+        raise NoResultError(f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; {_ARRANGEMENT}")
     return float(np.arccos(np.clip(cosine, -1, 1)))
 
 

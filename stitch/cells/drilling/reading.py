@@ -18,6 +18,8 @@ from stitch.robot import METRES
 
 FORMAT = "stitch-drill/1"
 _FILES = {"plate", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
+# Cosine of the largest angle between tool and hole that a small error explains.
+_ALONG = float(np.cos(np.radians(30)))
 _NEEDED = ("plate", "holes", "placed")
 
 
@@ -113,6 +115,11 @@ def _placed(file: Path, holes: tuple[Hole, ...]) -> dict[str, tuple[Array, Array
     for hole in holes:
         if hole.reference and hole.name not in names:
             raise InputError(f"{file}: reference hole {hole.name} is missing; add where the robot ended on it")
+        if hole.reference and poses[names.index(hole.name), :3, 2] @ hole.direction < _ALONG:
+            raise InputError(
+                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; directions "
+                "point into the part, and a, b, c turn about z, y', x''"
+            )
     return {name: (poses[i], uv[i], float(table.numbers["height"][i])) for i, name in enumerate(names)}
 
 
