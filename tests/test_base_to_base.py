@@ -195,7 +195,7 @@ def test_command_refuses_with_exit_code_1(tmp_path, capsys):
         ("length = 4.0\n", "length = -4.0\n", "must be above zero"),
         ("joint1 = 0.6283", 'joint1 = "a"', "write a finite number"),
         ("slide = 0.0\n", "", "no main point has a slide reading"),
-        ("turn = \"clockwise\"", "turn = \"left\"", "clockwise or anticlockwise"),
+        ("turn = \"clockwise\"", "turn = \"left\"", "rod.turn is 'left'; write one of clockwise, anticlockwise"),
         ("sigma_slide", "sigma_slid", "did you mean 'sigma_slide'"),
         ('length_unit = "m"', 'length_unit = "ft"', "write one of"),
         ("joint1 = 0.6283\nradius = 1.45", "radius = 1.45", "joint1 is missing"),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.cells.toml_tables import LARGEST
 from stitch.errors import InputError
 from stitch.frames import Array
 
@@ -67,6 +68,6 @@ def _number(file: Path, line: int, name: str, value: str | None) -> float:
         number = float(value or "")
     except ValueError:
         number = math.nan
-    if not math.isfinite(number):
+    if not math.isfinite(number) or abs(number) > LARGEST:
         raise InputError(f"{file}:{line}: {name} is {value!r}; write a finite number")
     return number

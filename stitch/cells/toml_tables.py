@@ -7,6 +7,9 @@ from typing import Any
 
 from stitch.errors import InputError
 
+# No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
+SMALLEST, LARGEST = 1e-12, 1e9
+
 
 def table(file: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
     """A required table of a document.
@@ -35,6 +38,17 @@ def check_keys(file: Path, place: str, entries: Any, known: set[str]) -> None:
             raise InputError(f"{file}: unknown key {f'{place}.{key}' if place else key!r}; {mend}")
 
 
+def choice(file: Path, place: str, value: Any, known: tuple[str, ...]) -> str:
+    """One of some words.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not isinstance(value, str) or value not in known:
+        raise InputError(f"{file}: {place} is {value!r}; write one of {', '.join(known)}")
+    return value
+
+
 def finite(file: Path, place: str, value: Any, positive: bool = False) -> float:
     """A finite number, above zero if `positive`.
 
@@ -43,6 +57,8 @@ def finite(file: Path, place: str, value: Any, positive: bool = False) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{file}: {place} is {value!r}; write a finite number")
-    if positive and value <= 0:
+    if abs(value) > LARGEST:
+        raise InputError(f"{file}: {place} is {value!r}; nothing in a cell is that large")
+    if positive and value < SMALLEST:
         raise InputError(f"{file}: {place} is {value!r}; it must be above zero")
     return float(value)

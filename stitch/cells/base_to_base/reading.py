@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
-from stitch.cells.toml_tables import check_keys, finite, table
+from stitch.cells.toml_tables import check_keys, choice, finite, table
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot import METRES
@@ -43,9 +43,7 @@ def read_stand(file: Path | str) -> Stand:
     rod, rod_entries = _touched(file, "second", second, unit, to_rad)
     settings = table(file, document, "rod")
     check_keys(file, "rod", settings, {"turn", "sigma_slide", "sigma_angle", "sigma_length"})
-    turn = settings.get("turn", "clockwise")
-    if turn not in _TURN:
-        raise InputError(f"{file}: rod.turn is {turn!r}; write clockwise or anticlockwise, as seen from above")
+    turn = choice(file, "rod.turn", settings.get("turn", "clockwise"), tuple(_TURN))
     level = document.get("level", {})
     check_keys(file, "level", level, {"stand", "second_base"})
     base = finite(file, "level.second_base", level["second_base"], positive=True) if "second_base" in level else None
@@ -64,12 +62,9 @@ def read_stand(file: Path | str) -> Stand:
 
 def _units(file: Path, document: dict[str, Any]) -> tuple[float, float]:
     """Metres per length unit and rad per angle unit."""
-    length, angle = document.get("length_unit"), document.get("angle_unit")
-    if length not in METRES:
-        raise InputError(f"{file}: length_unit is {length!r}; write one of {', '.join(METRES)}")
-    if angle not in ("rad", "deg"):
-        raise InputError(f"{file}: angle_unit is {angle!r}; write rad or deg")
-    return METRES[str(length)], 1.0 if angle == "rad" else float(np.pi / 180)
+    length = choice(file, "length_unit", document.get("length_unit"), tuple(METRES))
+    angle = choice(file, "angle_unit", document.get("angle_unit"), ("rad", "deg"))
+    return METRES[length], 1.0 if angle == "rad" else float(np.pi / 180)
 
 
 def _touched(

@@ -31,8 +31,8 @@ def compensate(nominal: Array, actual: Array) -> Compensation:
     """
     nominal, actual = np.asarray(nominal, float), np.asarray(actual, float)
     a, b = nominal - nominal.mean(axis=0), actual - actual.mean(axis=0)
-    spread = np.linalg.svd(a, compute_uv=False)
-    if len(nominal) < 3 or spread[1] < 1e-3 * spread[0]:
+    spreads = (np.linalg.svd(points, compute_uv=False) for points in (a, b))
+    if len(nominal) < 3 or any(spread[1] <= 1e-3 * spread[0] for spread in spreads):
         raise NoResultError("a group needs three or more reference holes off one line; add a reference hole")
     R = Rotation.align_vectors(b, a)[0].as_matrix()
     T = frames.make(R, actual.mean(axis=0) - R @ nominal.mean(axis=0))

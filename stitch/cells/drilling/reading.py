@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.toml_tables import check_keys, finite
+from stitch.cells.toml_tables import check_keys, choice, finite
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot import METRES
@@ -65,8 +65,6 @@ def read_job(file: Path | str) -> Job:
     check_keys(file, "", document, {"format", "length_unit", "height", "image_size", *_FILES})
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
-    if document.get("length_unit") not in METRES:
-        raise InputError(f"{file}: length_unit is {document.get('length_unit')!r}; write one of {', '.join(METRES)}")
     paths = {key: _path(file, key, document[key]) for key in _FILES if key in document}
     for key in _NEEDED:
         if key not in paths:
@@ -74,8 +72,9 @@ def read_job(file: Path | str) -> Job:
     plate = read_columns(paths["plate"], "", "x y z u v")
     holes = _holes(paths["holes"])
     return Job(
-        document["length_unit"], finite(file, "height", document.get("height"), positive=True), plate.stack("x y z"),
-        plate.stack("u v"), holes, _placed(paths["placed"], holes), _rangers(paths.get("rangers")),
+        choice(file, "length_unit", document.get("length_unit"), tuple(METRES)),
+        finite(file, "height", document.get("height"), positive=True), plate.stack("x y z"), plate.stack("u v"),
+        holes, _placed(paths["placed"], holes), _rangers(paths.get("rangers")),
         _marker_paths(file, paths), _checks(file, document, paths, plate.stack("x y z"), plate.stack("u v")),
     )  # fmt: skip
 
