@@ -9,7 +9,9 @@ from importlib.metadata import entry_points
 
 import typer
 
+from stitch.cli.base import base
 from stitch.cli.check import check
+from stitch.cli.drill import drill
 from stitch.cli.run import run
 from stitch.errors import StitchError
 
@@ -23,6 +25,8 @@ def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app.command()(run)
     app.command()(check)
+    app.command()(base)
+    app.command()(drill)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

@@ -1,0 +1,154 @@
+"""Base to base on the source's two experiments: writes the tables of docs/base-to-base.md.
+
+Run: python bench/base_to_base.py [--draws N]
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stitch import frames
+from stitch.cells.base_to_base.contradiction import compare_distances
+from stitch.cells.base_to_base.fit import fit
+from stitch.cells.base_to_base.projection import project
+from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_points
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+TRUE = {1: [4.0, -1.0, 1.0], 2: [6.0, -4.0, 1.0]}
+JOINTS = {1: (0.6283, 0.4488), 2: (1.0472, 0.6283)}
+SLIDE, ANGLE, LENGTH = (
+    {1: 3.8822, 2: 5.9093}, {1: [0.6826, 0.7897], 2: [1.1305, 1.1772]}, {1: [4.0, 4.4084], 2: [5.0, 5.5555]},
+)  # fmt: skip
+PUBLISHED = {
+    (1, 0.1): (1.0e-4, 1.4e-4),
+    (1, 0.5): (1.7e-4, 2.2e-4),
+    (2, 0.1): (1.4e-4, 1.4e-4),
+    (2, 0.5): (5.4e-4, 3.6e-4),
+}
+# Table 3 of the source, experiment 1: P1, P2, R1, R2.
+TABLE_3 = {
+    0.1: [[1.1731, 0.8523, 1.3], [1.1731, -0.8523, 1.3], [0.6307, -0.3037, 0.3], [0.6306, 0.3037, 0.3]],
+    0.5: [[1.1728, 0.8520, 1.3002], [1.1730, -0.8524, 1.3002], [0.6307, -0.3037, 0.3], [0.6307, 0.3037, 0.3]],
+}
+# Change of radius and height per rad of joints 2 and 5 of the main robot, from the noisy angles of the source's
+# table 2 and the positions of its table 3; the arm's dimensions are not published.
+LEVERS = np.array([[0.76, -0.51], [-0.80, -0.13]])
+
+
+def exact_stand(experiment: int, joints: tuple[float, float]) -> Stand:
+    """The true stand: T and joint angles exact, rod readings computed, so that nothing contradicts anything."""
+    (p, r), t = joints, np.array(TRUE[experiment])
+    P = cylinder_points(np.array([p, -p]), np.full(2, 1.45), np.full(2, 1.3))
+    R = cylinder_points(np.array([-r, r]), np.full(2, 0.7), np.full(2, 0.3))
+    R1 = np.stack([R[:, 1], -R[:, 0], R[:, 2]], -1) + t
+    pivot = P[1] - [0, SLIDE[experiment], 0]
+    arm = R1 - pivot
+    return stand_of(P, R, SLIDE[experiment], np.arctan2(arm[:, 0], arm[:, 1]), np.linalg.norm(arm, axis=1))
+
+
+def stand_of(P: np.ndarray, R: np.ndarray, slide: float, angle: np.ndarray, length: np.ndarray) -> Stand:
+    return Stand(
+        "m", Touched(("P1", "P2"), P, np.tile(np.eye(3) * 1e-8, (2, 1, 1))), np.array([np.nan, 0.0]),
+        Touched(("R1", "R2"), R, np.tile(np.eye(3) * 1e-8, (2, 1, 1))), np.full(2, slide), np.asarray(angle),
+        np.asarray(length), 1.0, 1e-6, 1e-6, 1e-6, 1e-4, 1e-4,
+    )  # fmt: skip
+
+
+def noisy(stand: Stand, joints: tuple[float, float], lam: float, rng: np.random.Generator) -> Stand:
+    """The source's noise, formula 12, on every joint angle; angles of zero stay exact."""
+
+    def u(t):
+        return t + lam * 1e-3 * t * (rng.random(np.shape(t)) - 0.5)
+
+    p, r = joints
+    q25 = u(np.full((2, 2), np.pi / 2)) - np.pi / 2
+    dr, dz = LEVERS @ q25
+    P = cylinder_points(u(np.array([p, -p])), 1.45 + dr, 1.3 + dz)
+    R = cylinder_points(u(np.array([-r, r])), np.full(2, 0.7), np.full(2, 0.3))
+    spread = lam * 1e-3 / np.sqrt(12)
+    return replace(stand, rail=replace(stand.rail, points=P, covariance=covariance(P, p * spread, spread * np.pi / 2)),
+                   rod=replace(stand.rod, points=R, covariance=covariance(R, r * spread, 1e-6)))  # fmt: skip
+
+
+def covariance(points: np.ndarray, sigma_joint1: float, sigma_other: float) -> np.ndarray:
+    """(N, 3, 3): tangent by joint 1, radius and height by the other joints."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    radial = np.stack([points[:, 0] / radius, points[:, 1] / radius, 0 * radius], -1)
+    axes = np.stack(
+        [np.stack([-radial[:, 1], radial[:, 0], 0 * radius], -1), radial, np.tile([0.0, 0, 1], (len(points), 1))], -1
+    )
+    sigma = np.stack([radius * sigma_joint1, 0 * radius + sigma_other, 0 * radius + sigma_other], -1)
+    return np.einsum("nij,nj,nkj->nik", axes, sigma**2, axes)
+
+
+def errors(T: np.ndarray, experiment: int) -> tuple[float, float]:
+    """Rotation (rad) and translation (m) error against the truth, −90° about z."""
+    truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
+    truth[:3, 3] = TRUE[experiment]
+    return float(frames.angle_between(T, truth)), float(np.linalg.norm(T[:3, 3] - truth[:3, 3]))
+
+
+def draw(experiment: int, lam: float, draws: int) -> dict[str, np.ndarray]:
+    """Errors (draws, 2) of both solutions under the source's noise."""
+    # Experiment 2's own joint angles contradict its rod; with those of experiment 1 everything closes.
+    stand, rng = exact_stand(experiment, JOINTS[1]), np.random.default_rng(int(1000 * lam) + experiment)
+    stands = [noisy(stand, JOINTS[1], lam, rng) for _ in range(draws)]
+    return {
+        "projection": np.array([errors(project(s).T_base1_base2, experiment) for s in stands]),
+        "least squares": np.array([errors(fit(s).T_base1_base2, experiment) for s in stands]),
+    }
+
+
+def tables(draws: int) -> str:
+    lines = [
+        f"Errors under the source's noise, {draws} draws; rotation in µrad / translation in µm.", "",
+        "| experiment | λ | solution | rms | median | 95 % | published, one draw | draws below that |",
+        "|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for (experiment, lam), published in PUBLISHED.items():
+        for name, found in draw(experiment, lam, draws).items():
+            rms, median, high = np.sqrt((found**2).mean(0)), np.median(found, 0), np.quantile(found, 0.95, 0)
+            cells = [f"{a * 1e6:.0f} / {b * 1e6:.0f}" for a, b in (rms, median, high, published)]
+            cells.append(" / ".join(f"{share:.0%}" for share in (found <= published).mean(axis=0)))
+            lines.append(f"| {experiment} | {lam} | {name} | {' | '.join(cells)} |")
+    lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", "",
+              "| λ | solution | rotation / rad | translation / m | published |", "|---|---|---|---|---|"]  # fmt: skip
+    for lam, points in TABLE_3.items():
+        P, R = np.array(points[:2]), np.array(points[2:])
+        stand = stand_of(P, R, SLIDE[1], np.array(ANGLE[1]), np.array(LENGTH[1]))
+        for name, T in (("projection", project(stand).T_base1_base2), ("least squares", fit(stand).T_base1_base2)):
+            rotation, translation = errors(T, 1)
+            p = PUBLISHED[1, lam]
+            lines.append(f"| {lam} | {name} | {rotation:.5f} | {translation:.5f} | {p[0]:.5f} / {p[1]:.5f} |")
+    lines += ["", "Distance R1 to R2 with the rod readings and joint angles as printed:", "",
+              "| rod of | joints of | by rod / m | by joints / m | difference / m | translation found |",
+              "|---|---|---|---|---|---|"]  # fmt: skip
+    for rod, joints in ((1, 1), (2, 2), (2, 1)):
+        lines.append(_closing(rod, joints))
+    return "\n".join(lines)
+
+
+def _closing(rod: int, joints: int) -> str:
+    p, r = JOINTS[joints]
+    P = cylinder_points(np.array([p, -p]), np.full(2, 1.45), np.full(2, 1.3))
+    R = cylinder_points(np.array([-r, r]), np.full(2, 0.7), np.full(2, 0.3))
+    stand = stand_of(P, R, SLIDE[rod], np.array(ANGLE[rod]), np.array(LENGTH[rod]))
+    c = compare_distances(stand)[0]
+    found = "refused" if abs(c.difference) > 1e-3 else np.array2string(fit(stand).T_base1_base2[:3, 3], precision=4)
+    return f"| {rod} | {joints} | {c.by_stand:.4f} | {c.by_robot:.4f} | {c.difference:+.4f} | {found} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=1000)
+    text = tables(parser.parse_args().draws)
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(page.split(BEGIN)[0] + BEGIN + "\n" + text + "\n" + END + page.split(END)[1], encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""A stand file (TOML) -> `Stand`; every check of the input is made here."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
+from stitch.cells.toml_tables import check_keys, choice, finite, table
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.robot import METRES
+
+FORMAT = "stitch-base/1"
+# Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
+# that an eye can tell, and calls its distance and angle sensors better than that.
+_POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
+
+_TURN = {"clockwise": 1.0, "anticlockwise": -1.0}
+_CYLINDER = ("joint1", "radius", "height")
+
+
+def read_stand(file: Path | str) -> Stand:
+    """Read and check a stand file.
+
+    Raises:
+        InputError: the file is missing, not TOML, or an entry is missing, unknown, not a number or impossible.
+    """
+    file = Path(file)
+    try:
+        document = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; see examples/base_to_base.toml for how a stand file looks") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid TOML: {error}") from None
+    if document.get("format") != FORMAT:
+        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
+    check_keys(file, "", document, {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"})
+    unit, to_rad = _units(file, document)
+    main, second = table(file, document, "main"), table(file, document, "second")
+    rail, rail_entries = _touched(file, "main", main, unit, to_rad)
+    rod, rod_entries = _touched(file, "second", second, unit, to_rad)
+    settings = table(file, document, "rod")
+    check_keys(file, "rod", settings, {"turn", "sigma_slide", "sigma_angle", "sigma_length"})
+    turn = choice(file, "rod.turn", settings.get("turn", "clockwise"), tuple(_TURN))
+    level = document.get("level", {})
+    check_keys(file, "level", level, {"stand", "second_base"})
+    base = finite(file, "level.second_base", level["second_base"], positive=True) if "second_base" in level else None
+    stand = Stand(
+        str(document["length_unit"]), rail, _column(file, "main", rail_entries, "slide", optional=True), rod,
+        _column(file, "second", rod_entries, "slide"), _column(file, "second", rod_entries, "angle") * to_rad,
+        _column(file, "second", rod_entries, "length", positive=True), _TURN[turn],
+        _sigma(file, "rod", settings, "sigma_slide", _SLIDE / unit),
+        _sigma(file, "rod", settings, "sigma_angle", _ANGLE / to_rad) * to_rad,
+        _sigma(file, "rod", settings, "sigma_length", _LENGTH / unit),
+        _sigma(file, "level", level, "stand", _LEVEL / to_rad) * to_rad, None if base is None else base * to_rad,
+    )  # fmt: skip
+    _check_geometry(file, stand)
+    return stand
+
+
+def _units(file: Path, document: dict[str, Any]) -> tuple[float, float]:
+    """Metres per length unit and rad per angle unit."""
+    length = choice(file, "length_unit", document.get("length_unit"), tuple(METRES))
+    angle = choice(file, "angle_unit", document.get("angle_unit"), ("rad", "deg"))
+    return METRES[length], 1.0 if angle == "rad" else float(np.pi / 180)
+
+
+def _touched(
+    file: Path, name: str, robot: dict[str, Any], unit: float, to_rad: float
+) -> tuple[Touched, list[dict[str, Any]]]:
+    """The points of one robot, from coordinates or from joint 1, radius and height."""
+    check_keys(file, name, robot, {"points", "sigma"})
+    entries = robot.get("points")
+    if not isinstance(entries, list) or len(entries) < 2:
+        raise InputError(f"{file}: [[{name}.points]] needs at least two entries")
+    readings = {"slide"} if name == "main" else {"slide", "angle", "length"}
+    sigma = robot.get("sigma", {})
+    check_keys(file, f"{name}.sigma", sigma, {"point", *_CYLINDER})
+    points: list[Array] = []
+    covariances: list[Array] = []
+    for i, entry in enumerate(entries):
+        place = f"{name}.points[{i + 1}]"
+        check_keys(file, place, entry, {"name", "point", *_CYLINDER, *readings})
+        if "point" in entry:
+            point = entry["point"]
+            if not isinstance(point, list) or len(point) != 3:
+                raise InputError(f"{file}: {place}.point must be three numbers [x, y, z] in the robot's base frame")
+            points.append(np.array([finite(file, f"{place}.point", value) for value in point]))
+            covariances.append(np.eye(3) * _sigma(file, f"{name}.sigma", sigma, "point", _POINT / unit) ** 2)
+            continue
+        joint1, radius, height = (_entry(file, place, entry, key) for key in _CYLINDER)
+        points.append(cylinder_points(np.array(joint1 * to_rad), np.array(radius), np.array(height)))
+        default = sigma.get("point", _POINT / unit)
+        spread = (
+            _sigma(file, f"{name}.sigma", sigma, "joint1", default / radius / to_rad) * to_rad,
+            _sigma(file, f"{name}.sigma", sigma, "radius", default),
+            _sigma(file, f"{name}.sigma", sigma, "height", default),
+        )
+        covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
+    names = tuple(str(entry.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
+    return Touched(names, np.array(points, float), np.array(covariances, float)), entries
+
+
+def _entry(file: Path, place: str, entry: dict[str, Any], key: str) -> float:
+    if key not in entry:
+        raise InputError(f"{file}: {place}.{key} is missing; give point = [x, y, z] or joint1, radius and height")
+    return finite(file, f"{place}.{key}", entry[key], positive=key == "radius")
+
+
+def _column(
+    file: Path, name: str, entries: list[dict[str, Any]], key: str, optional: bool = False, positive: bool = False
+) -> Array:
+    values = []
+    for i, entry in enumerate(entries):
+        place = f"{name}.points[{i + 1}].{key}"
+        if key not in entry and not optional:
+            raise InputError(f"{file}: {place} is missing; every point of the rod needs slide, angle and length")
+        values.append(finite(file, place, entry[key], positive) if key in entry else np.nan)
+    return np.array(values, float)
+
+
+def _sigma(file: Path, place: str, entries: dict[str, Any], key: str, default: float) -> float:
+    return finite(file, f"{place}.{key}", entries.get(key, default), positive=True)
+
+
+def _check_geometry(file: Path, stand: Stand) -> None:
+    """Points that leave the rail without a line, a zero or a level."""
+    rail = stand.rail.points
+    extent = float(np.linalg.norm(rail - rail.mean(axis=0), axis=1).max())
+    if extent < 100 * np.sqrt(np.trace(stand.rail.covariance[0]) / 3):
+        raise InputError(f"{file}: main.points lie within {2 * extent:.3g}; a rail's direction needs points far apart")
+    if not np.isfinite(stand.rail_slide).any():
+        raise InputError(f"{file}: no main point has a slide reading; write slide = 0 at the one that sets the zero")
+    x = rail_direction(rail)
+    read = stand.rail_slide[np.isfinite(stand.rail_slide)]
+    if np.isnan(stand.rail_slide[-1]) or (np.diff(rail @ x) <= 0).any() or (np.diff(read) <= 0).any():
+        raise InputError(
+            f"{file}: main.points must be listed in the direction in which the slide grows, the last with its slide "
+            "reading; reorder them, or mend a slide reading"
+        )
+    if abs(x[2]) > 0.9:
+        raise InputError(f"{file}: the rail stands upright in the main base; it must lie, or the rod has no level")

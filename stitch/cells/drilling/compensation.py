@@ -1,0 +1,39 @@
+"""Correct a group of holes by the rigid motion that its reference holes show."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.errors import NoResultError
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class Compensation:
+    """Nominal to actual drive coordinates of one group."""
+
+    T_actual_nominal: Array  # (4, 4)
+    residuals: Array  # (N, 3) actual minus mapped
+    errors: Array  # (N, 3) drive errors, actual minus nominal
+
+    def apply(self, positions: Array, directions: Array) -> tuple[Array, Array]:
+        """Corrected positions and directions (M, 3) of holes of the group."""
+        return frames.transform(self.T_actual_nominal, positions), frames.rotate(self.T_actual_nominal, directions)
+
+
+def compensate(nominal: Array, actual: Array) -> Compensation:
+    """Rigid motion from three or more reference holes (N, 3) by SVD (Kabsch 1976; source, formulas 15 and 16).
+
+    Raises:
+        NoResultError: fewer than three holes, or holes on a line.
+    """
+    nominal, actual = np.asarray(nominal, float), np.asarray(actual, float)
+    a, b = nominal - nominal.mean(axis=0), actual - actual.mean(axis=0)
+    spreads = (np.linalg.svd(points, compute_uv=False) for points in (a, b))
+    if len(nominal) < 3 or any(spread[1] <= 1e-3 * spread[0] for spread in spreads):
+        raise NoResultError("a group needs three or more reference holes off one line; add a reference hole")
+    R = Rotation.align_vectors(b, a)[0].as_matrix()
+    T = frames.make(R, actual.mean(axis=0) - R @ nominal.mean(axis=0))
+    return Compensation(T, actual - frames.transform(T, nominal), actual - nominal)

@@ -1,0 +1,275 @@
+"""Base to base: the source's printed readings, closed forms, and noise; truth is built here, not by the package."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stitch.cells.base_to_base import fit, project, read_stand, solve
+from stitch.cells.base_to_base.contradiction import compare_distances
+from stitch.cells.base_to_base.stand import Stand, Touched
+from stitch.cli.main import main
+from stitch.errors import InputError, NoResultError
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "base_to_base.toml"
+DRAWS = 1000
+
+
+def printed(slide, angles, lengths, joints):
+    """A stand with the source's printed readings, computed with complex numbers instead of the package's helpers."""
+    p, r = joints
+    P = [1.45 * np.exp(1j * p), 1.45 * np.exp(-1j * p)]
+    R = [0.7 * np.exp(-1j * r), 0.7 * np.exp(1j * r)]
+    return stand([[z.real, z.imag, 1.3] for z in P], [[z.real, z.imag, 0.3] for z in R], slide, angles, lengths)
+
+
+def stand(P, R, slide, angles, lengths, sigma=1e-4, level=1e-4, rail_slide=(np.nan, 0.0)):
+    def touched(letter, points):
+        names = tuple(f"{letter}{i + 1}" for i in range(len(points)))
+        return Touched(names, np.array(points), np.tile(np.eye(3) * sigma**2, (len(points), 1, 1)))
+
+    return Stand("m", touched("P", P), np.array(rail_slide), touched("R", R), np.full(len(R), slide), np.array(angles),
+                 np.array(lengths), 1.0, sigma, sigma, sigma, level, level)  # fmt: skip
+
+
+EXPERIMENT_1 = (3.8822, [0.6826, 0.7897], [4.0, 4.4084])
+EXPERIMENT_2 = (5.9093, [1.1305, 1.1772], [5.0, 5.5555])
+
+
+@pytest.mark.parametrize("rod, t", [(EXPERIMENT_1, [4, -1, 1]), (EXPERIMENT_2, [6, -4, 1])])
+def test_printed_readings_give_the_printed_transform(rod, t):
+    """Both rod angles are rounded by up to 5e-5 rad: 5e-5·L across at each end of R1R2 = 0.607 m, and at O2."""
+    rounded = 5e-5 * max(rod[2])
+    s = printed(*rod, (0.6283, 0.4488))
+    for T in (project(s).T_base1_base2, fit(s).T_base1_base2):
+        assert np.abs(T[:3, 3] - t).max() < 3 * rounded
+        assert np.abs(T[:3, :3] - [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]).max() < 2 * rounded / 0.607
+
+
+def test_experiment_2_as_printed_is_refused_with_the_size():
+    """|R1R2| = 2·0.7·sin(0.6283) = 0.8229 m by joints; by the rod 0.6076 m from the law of cosines."""
+    s = printed(*EXPERIMENT_2, (1.0472, 0.6283))
+    by_rod = np.sqrt(25 + 5.5555**2 - 2 * 5 * 5.5555 * np.cos(1.1772 - 1.1305))
+    by_joints = 1.4 * np.sin(0.6283)
+    with pytest.raises(
+        NoResultError, match=rf"R1 to R2 is {by_rod:.4f} m .*{by_joints:.4f} m .*\+{by_joints - by_rod:.4f} m"
+    ):
+        solve(s)
+    found = compare_distances(s)[0]
+    # Sigma of the joints' side: 1e-4·√2; of the rod's side: two lengths almost along, two angles almost across it.
+    assert 1.4e-4 < found.sigma < 6e-4
+    assert found.sigmas == pytest.approx(abs(found.difference) / found.sigma)
+
+
+def general(seed, points, settings, noise=0.0):
+    """A tilted second base and stand with many points, all readings made from the truth; returns T, stand."""
+    rng = np.random.default_rng(seed)
+    up = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)])
+    tilt = Rotation.from_euler("zyx", [rng.uniform(-3, 3), *rng.normal(0, 0.05, 2)])
+    t = rng.uniform(-4, 4, 3)
+    x, y = up.apply([[1.0, 0, 0], [0, 1.0, 0]])
+    along = np.linspace(-1.5, 0.5, points)
+    zero = rng.uniform(-1, 1, 3)
+    slide = np.linspace(3, 5, settings)
+    theta, length = rng.uniform(0.4, 1.2, settings), rng.uniform(3, 5, settings)
+    cups = zero + slide[:, None] * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
+    s = stand(zero + along[:, None] * x + rng.normal(0, noise, (points, 3)),
+              tilt.inv().apply(cups - t) + rng.normal(0, noise, (settings, 3)), 0.0,
+              theta + rng.normal(0, noise, settings), length + rng.normal(0, noise, settings), rail_slide=along)  # fmt: skip
+    s = replace(s, slide=slide, sigma_level_base=None)
+    return tilt.as_matrix(), t, s
+
+
+def test_many_points_without_a_level_of_the_second_base():
+    for seed in range(10):
+        R, t, s = general(seed, points=3, settings=5)
+        found = fit(s)
+        assert np.abs(found.T_base1_base2[:3, :3] - R).max() < 1e-7
+        assert np.abs(found.T_base1_base2[:3, 3] - t).max() < 1e-7
+        with pytest.raises(NoResultError):
+            project(s)
+
+
+def test_covariance_is_the_scatter_of_repeated_measurements():
+    """200 draws: a variance is known to ±√(2/200) = 10 %; five of those on the mean of all six is far below 30 %."""
+    scaled = []
+    for draw in range(200):
+        R, t, s = general(3, points=3, settings=5)
+        rng = np.random.default_rng(draw)
+        s = replace(
+            s, rail=replace(s.rail, points=s.rail.points + rng.normal(0, 1e-4, (3, 3))),
+            rod=replace(s.rod, points=s.rod.points + rng.normal(0, 1e-4, (5, 3))), slide=s.slide + rng.normal(0, 1e-4, 5),
+            angle=s.angle + rng.normal(0, 1e-4, 5), length=s.length + rng.normal(0, 1e-4, 5),
+            rail_slide=s.rail_slide + rng.normal(0, 1e-4, 3),
+        )  # fmt: skip
+        found = fit(s)
+        turn = Rotation.from_matrix(found.T_base1_base2[:3, :3] @ R.T).as_rotvec()
+        scaled.append(
+            np.concatenate([turn, found.T_base1_base2[:3, 3] - t])
+            @ np.linalg.inv(np.linalg.cholesky(found.covariance)).T
+        )
+    assert np.mean(np.square(scaled)) == pytest.approx(1, abs=0.3)
+
+
+def test_two_points_leave_the_turn_about_their_line_open():
+    s = replace(printed(*EXPERIMENT_1, (0.6283, 0.4488)), sigma_level_base=None)
+    with pytest.raises(NoResultError, match="third point"):
+        fit(s)
+
+
+def test_mirrored_stand_gives_the_mirrored_transform():
+    """Seen in a mirror at the x-z plane the rod turns the other way, y and the turn about z change sign."""
+    s = printed(*EXPERIMENT_1, (0.6283, 0.4488))
+    flip = np.array([1.0, -1.0, 1.0])
+    m = replace(
+        s, turn=-1.0, rail=replace(s.rail, points=s.rail.points * flip), rod=replace(s.rod, points=s.rod.points * flip)
+    )
+    for solver in (project, fit):
+        T, M = solver(s).T_base1_base2, solver(m).T_base1_base2
+        assert np.allclose(M, np.diag([*flip, 1]) @ T @ np.diag([*flip, 1]), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def errors():
+    """Errors (draws, 2) of projection and least squares under formula 12 at λ = 0.5, all joints that are not zero."""
+    rng = np.random.default_rng(7)
+    exact_P, exact_R = 1.45 * np.exp(1j * np.array([0.6283, -0.6283])), 0.7 * np.exp(1j * np.array([-0.4488, 0.4488]))
+    pivot = exact_P[1] - 3.8822j
+    arm = (4 - 1j) + exact_R * -1j - pivot
+    found = {"projection": [], "least squares": []}
+    for _ in range(DRAWS):
+        u = 0.5e-3 * (rng.random((3, 2)) - 0.5)
+        lift = u[2] * np.pi / 2
+        P, R = (
+            exact_P * np.exp(1j * np.array([0.6283, -0.6283]) * u[0]),
+            exact_R * np.exp(1j * np.array([-0.4488, 0.4488]) * u[1]),
+        )
+        s = stand([[z.real, z.imag, 1.3 + h] for z, h in zip(P, 0.8 * lift, strict=True)], [[z.real, z.imag, 0.3] for z in R],
+                  3.8822, np.arctan2(arm.real, arm.imag), np.abs(arm), sigma=1e-4)  # fmt: skip
+        s = replace(s, sigma_angle=1e-6, sigma_length=1e-6, sigma_slide=1e-6)
+        for name, T in (("projection", project(s).T_base1_base2), ("least squares", fit(s).T_base1_base2)):
+            turn = Rotation.from_matrix(T[:3, :3] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])).magnitude()
+            found[name].append([turn, np.linalg.norm(T[:3, 3] - [4, -1, 1])])
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def test_least_squares_beats_the_projection(errors):
+    rms = {name: np.sqrt(np.mean(values**2, axis=0)) for name, values in errors.items()}
+    assert (rms["least squares"] < rms["projection"]).all()
+
+
+def test_published_errors_are_ordinary_draws(errors):
+    """Published at λ = 0.5: 0.00017 rad and 0.00022 m, one draw; it lies within the middle 95 % of ours."""
+    for column, published in ((0, 1.7e-4), (1, 2.2e-4)):
+        low, high = np.quantile(errors["projection"][:, column], [0.025, 0.975])
+        assert low < published < high
+
+
+def test_command(capsys):
+    main_(["base", str(EXAMPLE), "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert np.allclose(np.array(document["T_base1_base2"])[:3, 3], [4, -1, 1], atol=1e-3)
+
+
+def test_command_refuses_with_exit_code_1(tmp_path, capsys):
+    text = EXAMPLE.read_text(encoding="utf-8")
+    for old, new in (("0.6826", "1.1305"), ("0.7897", "1.1772"), ("length = 4.0\n", "length = 5.0\n"), ("4.4084", "5.5555"),
+                     ("3.8822", "5.9093"), ("0.4488", "0.6283")):  # fmt: skip
+        text = text.replace(old, new)
+    (tmp_path / "two.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(SystemExit) as stop:
+        main(["base", str(tmp_path / "two.toml")])
+    assert stop.value.code == 1
+    by_rod = np.sqrt(25 + 5.5555**2 - 2 * 5 * 5.5555 * np.cos(1.1772 - 1.1305))
+    message = capsys.readouterr().err
+    assert "contradict" in message and f"{1.4 * np.sin(0.6283) - by_rod:+.4f} m" in message
+
+
+@pytest.mark.parametrize(
+    "old, new, part",
+    [
+        ("length = 4.0\n", "", "second.points[1].length is missing"),
+        ("length = 4.0\n", "length = -4.0\n", "must be above zero"),
+        ("joint1 = 0.6283", 'joint1 = "a"', "write a finite number"),
+        ("slide = 0.0\n", "", "no main point has a slide reading"),
+        ("turn = \"clockwise\"", "turn = \"left\"", "rod.turn is 'left'; write one of clockwise, anticlockwise"),
+        ("sigma_slide", "sigma_slid", "did you mean 'sigma_slide'"),
+        ('length_unit = "m"', 'length_unit = "ft"', "write one of"),
+        ("joint1 = 0.6283\nradius = 1.45", "radius = 1.45", "joint1 is missing"),
+        ('format = "stitch-base/1"', "format = 1", "expected"),
+        ("joint1 = 0.6283", "joint1 = -0.6283", "far apart"),
+        ("joint1 = 0.6283\nradius = 1.45", "slide = 1.0\njoint1 = 0.6283\nradius = 1.45", "the slide grows"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_named(tmp_path, old, new, part):
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        read_stand(tmp_path / "bad.toml")
+    assert part in str(error.value) and str(tmp_path / "bad.toml") in str(error.value)
+
+
+def test_another_arrangement_is_left_to_the_least_squares():
+    """The second base on the other side of its points: the cosine rules would return a turn wrong by 180°."""
+    rail = Rotation.from_rotvec([0, 0, -1.2])
+    x, y = rail.apply([[1.0, 0, 0], [0, 1.0, 0]])
+    P2, t = np.array([1.17, -0.85, 1.3]), np.array([4, -1, 1.0])
+    theta, length = np.array([0.68, 0.79]), np.array([4, 4.4])
+    cups = P2 + 3.88 * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
+    turn = Rotation.from_rotvec([0, 0, -1.57])
+    s = stand([P2 - 1.7 * x, P2], turn.inv().apply(cups - t), 3.88, theta, length)
+    result = solve(s)
+    assert result.projection is None and "as the source places it" in result.no_projection
+    assert np.abs(result.fit.T_base1_base2[:3, 3] - t).max() < 1e-6
+    assert np.abs(result.fit.T_base1_base2[:3, :3] - turn.as_matrix()).max() < 1e-6
+
+
+def test_millimetres_and_degrees_give_the_same(tmp_path):
+    """The same points in base coordinates, mm and degrees, with the sigmas left to their defaults in both."""
+    s = read_stand(EXAMPLE)
+    lines = [
+        'format = "stitch-base/1"',
+        'length_unit = "mm"',
+        'angle_unit = "deg"',
+        "[rod]",
+        "[level]",
+        "second_base = 0.0573",
+    ]
+    for name, points in (("main", s.rail.points), ("second", s.rod.points)):
+        for i, point in enumerate(points):
+            lines += [f"[[{name}.points]]", f"point = {(point * 1000).tolist()}"]
+            if name == "second":
+                lines += [
+                    f"slide = {s.slide[i] * 1000}",
+                    f"angle = {np.degrees(s.angle[i])}",
+                    f"length = {s.length[i] * 1000}",
+                ]
+            elif i == 1:
+                lines += ["slide = 0"]
+    (tmp_path / "mm.toml").write_text("\n".join(lines), encoding="utf-8")
+    found = solve(read_stand(tmp_path / "mm.toml")).fit
+    covariance = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
+    same = replace(s, rail=replace(s.rail, covariance=covariance), rod=replace(s.rod, covariance=covariance),
+                   sigma_level_base=np.radians(0.0573))  # fmt: skip
+    wanted = fit(same)
+    scale = np.diag([1, 1, 1, 1000.0, 1000, 1000])
+    assert np.allclose(found.T_base1_base2[:3, 3], wanted.T_base1_base2[:3, 3] * 1000, atol=1e-3)
+    assert np.allclose(found.covariance, scale @ wanted.covariance @ scale, rtol=1e-3, atol=1e-12)
+
+
+def test_a_wrong_height_shows_in_the_chi_square():
+    """10 mm on R2 change |R1R2| by 0.01²/(2·0.607) = 0.08 mm only, but tilt it by 0.016 rad against the level."""
+    s = printed(*EXPERIMENT_1, (0.6283, 0.4488))
+    wrong = replace(s, rod=replace(s.rod, points=s.rod.points + np.array([[0, 0, 0], [0, 0, 0.01]])))
+    with pytest.raises(NoResultError, match="chi-square"):
+        solve(wrong)
+
+
+def main_(arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 0
