@@ -32,4 +32,4 @@ def demo(
     print(f"Scanning a blade from {len(measured.clouds)} poses, with one effect hidden → {session}", file=sys.stderr)
     write_session(session, measured, "blade")
     write_truth(truth_path(session), measured, seed)
-    run([session], output=folder / "run", hand_eye=None, effects="", recording=True, mesh=False, as_json=False)
+    run([session], output=folder / "run", recording=False)

@@ -19,6 +19,15 @@ _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps sc
 
 
 @dataclass(frozen=True)
+class Fitted:
+    """One parameter of an effect; sigma NaN where the views cannot see it (it stays at its value)."""
+
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class Model:
     """Hand-eye (4, 4) in length_unit with its covariance, and the effects with their parameters."""
 
@@ -27,7 +36,8 @@ class Model:
     T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
     T_mount_coarse: Array  # (4, 4)
     covariance: Array  # (6, 6)
-    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+    effects: dict[str, dict[str, Fitted]] = field(default_factory=dict)
+    effects_file: str | None = None  # Python file with effects of the user's own
 
 
 def write_model(model: Model, path: Path) -> None:
@@ -43,8 +53,10 @@ def write_model(model: Model, path: Path) -> None:
             "sigma": np.sqrt(np.diag(model.covariance)).tolist(),
             "covariance": model.covariance.tolist(),
         },
-        "effects": model.effects,
+        "effects": {name: {p: _written(f) for p, f in fitted.items()} for name, fitted in model.effects.items()},
     }
+    if model.effects_file:
+        document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
     path.write_text(header + tomli_w.dumps(document), encoding="utf-8")
 
@@ -73,8 +85,29 @@ def read_model(path: Path) -> Model:
     covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
     return Model(
         str(document.get("length_unit")), str(document.get("mount")), corrected, coarse, covariance,
-        document.get("effects", {}),
+        _effects(path, document.get("effects", {})), document.get("effects_file"),
     )  # fmt: skip
+
+
+def _written(fitted: Fitted) -> dict[str, Any]:
+    """TOML has a nan, but who reads it expects a word."""
+    known = {"sigma": fitted.sigma} if np.isfinite(fitted.sigma) else {"observable": False}
+    return {"value": fitted.value, **known, "unit": fitted.unit}
+
+
+def _effects(path: Path, table: Any) -> dict[str, dict[str, Fitted]]:
+    try:
+        return {
+            str(name): {
+                str(p): Fitted(float(f["value"]), float(f.get("sigma", np.nan)), str(f.get("unit", "")))
+                for p, f in parameters.items()
+            }
+            for name, parameters in table.items()
+        }
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{path}: effects must be tables such as [effects.joint_compliance.c2] with value, sigma, unit"
+        ) from None
 
 
 def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
@@ -98,4 +131,17 @@ def in_unit(model: Model, length_unit: str) -> Model:
         T = T.copy()
         T[:3, 3] *= factor
         moved.append(T)
-    return Model(length_unit, model.mount, moved[0], moved[1], model.covariance * np.outer(scale, scale), model.effects)
+    effects = {name: {p: _rescaled(f, model.length_unit, length_unit, factor) for p, f in fitted.items()}
+               for name, fitted in model.effects.items()}  # fmt: skip
+    return Model(
+        length_unit, model.mount, moved[0], moved[1], model.covariance * np.outer(scale, scale), effects,
+        model.effects_file,
+    )  # fmt: skip
+
+
+def _rescaled(fitted: Fitted, old: str, new: str, factor: float) -> Fitted:
+    """A unit counts lengths where `old` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
+    above, _, below = fitted.unit.partition("/")
+    power = (above.strip() == old) - (below.strip() == old)
+    unit = "/".join(new if part.strip() == old else part for part in fitted.unit.split("/"))
+    return Fitted(fitted.value * factor**power, fitted.sigma * factor**power, unit)

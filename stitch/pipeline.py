@@ -1,147 +1,149 @@
 """The run: coarse → correct → register → fuse, for one session or several of one rig."""
 
-import time
 from collections.abc import Sequence
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from stitch.capture import Capture, capture
+from stitch.diagnosis.start import start_values
+from stitch.effects.chain import Chain, Term, chain_of, corrected
+from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.errors import InputError
-from stitch.frames import Array
 from stitch.match import sample
 from stitch.model import Model, in_unit
-from stitch.noise import noise_floor
-from stitch.observability import unobservable
-from stitch.overlaps import Overlaps, collect
+from stitch.overlaps import collect
 from stitch.recorder import Recorder, Silent
-from stitch.repeatability import Repeatability
-from stitch.result import Run, StageResult
+from stitch.result import Run, StageResult, Step
 from stitch.session import Session
-from stitch.solve import RMS_GATE
-from stitch.stages.coarse import Coarse, coarse, given
+from stitch.stages.coarse import COARSE_GATE, Coarse, coarse, given, part_size
 from stitch.stages.correct import COARSE_SAMPLES, Correction, correct
-from stitch.stages.fuse import fuse, view_residuals
-from stitch.stages.register import register
+from stitch.stages.finish import finish, show
+from stitch.stages.refine import refine
 from stitch.stages.reuse import reuse
-from stitch.threads import library_threads_off
-from stitch.verdict import coarse_note, correct_note, sentence, warnings
+from stitch.state import State
+from stitch.threads import Clock, library_threads_off
+from stitch.verdict import coarse_note
 
 
-def run(session: Session, model: Model | None = None, recorder: Recorder | None = None) -> Run:
-    """Stitch one session; with `model`, use its hand-eye as it is instead of correcting.
+def run(
+    session: Session, model: Model | None = None, recorder: Recorder | None = None, effects: Sequence[str] = ()
+) -> Run:
+    """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
+
+    Args:
+        effects: names of effects to fit together with the hand-eye.
 
     Raises:
-        InputError: the model belongs to another mount.
+        InputError: the model belongs to another mount, or the session cannot have an effect.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
-    return run_rig([session], model, [recorder or Silent()])[0]
+    return run_rig([session], model, [recorder or Silent()], effects)[0]
 
 
 def run_rig(
-    sessions: Sequence[Session], model: Model | None = None, recorders: Sequence[Recorder] | None = None
-) -> list[Run]:
-    """Stitch several sessions of one rig with one common hand-eye; one run per session."""
+    sessions: Sequence[Session], model: Model | None = None, recorders: Sequence[Recorder] | None = None,
+    effects: Sequence[str] = (),
+) -> list[Run]:  # fmt: skip
+    """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
     _same_rig(sessions, model)
-    with library_threads_off():
-        return _run_rig(sessions, model, recorders)
-
-
-def _run_rig(sessions: Sequence[Session], model: Model | None, recorders: Sequence[Recorder] | None) -> list[Run]:
     recorders = recorders or [Silent() for _ in sessions]
-    for session, recorder in zip(sessions, recorders, strict=True):
-        recorder.start(session)
-    clock = _Clock()
-    captures = [capture(session) for session in sessions]
-    if model:
-        model = in_unit(model, sessions[0].length_unit)
-        start = given(captures, model.T_mount)
-    else:
-        known = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
-        start = coarse(captures) if known is None else given(captures, known)
-    seconds = clock.lap()
-    before = [_begin(c, start, seconds, r) for c, r in zip(captures, recorders, strict=True)]
-    clock.lap()
-    if model:
-        correction = reuse(captures, model)
-    else:
-        correction = correct(captures, start.T_mount, start.gate, recorders[0])
-    seconds = clock.lap()
-    return [
-        _finish(session, captures[i], i, start, before[i], correction, captures, recorders[i], seconds)
-        for i, session in enumerate(sessions)
-    ]
+    with library_threads_off():
+        clock = Clock()
+        for session, recorder in zip(sessions, recorders, strict=True):
+            recorder.start(session)
+        chains = [chain_of(session, capture(session)) for session in sessions]
+        for chain in chains:
+            for name in effects:
+                require(chain, known(name))
+        start = _start(sessions, chains, model)
+        seconds = clock.lap()
+        before = [_begin(c, start, seconds, r) for c, r in zip(chains, recorders, strict=True)]
+        clock.lap()
+        correction = _correct(chains, start, model, effects, recorders[0])
+        seconds = clock.lap()
+        place = _Place(start, correction, (), model.effects_file if model else None)
+        return [
+            _finish(session, chain, i, place, before[i], recorders[i], seconds)
+            for i, (session, chain) in enumerate(zip(sessions, chains, strict=True))
+        ]
 
 
-def _begin(own: Capture, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+def change(state: State, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+    """The run with these effects in its model: hand-eye and all effects fitted together, matched anew.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    recorder = recorder or Silent()
+    with library_threads_off():
+        clock = Clock()
+        chain = state.chain
+        recorder.start(state.session)
+        for name in effects:
+            require(chain, known(name))
+        kept = [t for t in state.terms if t.effect.name in effects]
+        used = [t.effect.name for t in kept]
+        terms = [*kept, *start_values(state, [known(name) for name in effects if name not in used])]
+        start = Coarse(state.T_mount_coarse, part_size([chain.capture]) * COARSE_GATE, "of the first run", ())
+        before = _begin(chain, start, clock.lap(), recorder)
+        clock.lap()
+        refined = refine([chain], terms, state.T_mount, [state.gate])
+        place = _Place(start, refined.as_correction(), state.ledger, state.effects_file)
+        return _finish(state.session, chain, 0, place, before, recorder, clock.lap())
+
+
+@dataclass(frozen=True)
+class _Place:
+    """What all sessions of a rig have in common at the end of the correction."""
+
+    start: Coarse
+    correction: Correction
+    ledger: tuple[Step, ...]
+    effects_file: str | None
+
+
+def _start(sessions: Sequence[Session], chains: Sequence[Chain], model: Model | None) -> Coarse:
+    captures = [chain.capture for chain in chains]
+    stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
+    T_mount = in_unit(model, sessions[0].length_unit).T_mount if model else stated
+    return coarse(captures) if T_mount is None else given(captures, T_mount)
+
+
+def _correct(
+    chains: Sequence[Chain], start: Coarse, model: Model | None, effects: Sequence[str], recorder: Recorder
+) -> Correction:
+    """The hand-eye from the scans; with effects, both; with a model, neither is changed."""
+    captures: list[Capture] = [chain.capture for chain in chains]
+    if model:
+        model = in_unit(model, chains[0].length_unit)
+        terms: list[Term] = terms_of(model, chains[0])
+        captures = [corrected(chain, terms, model.T_mount) for chain in chains]
+        return reuse(captures, model, terms)
+    first = correct(captures, start.T_mount, start.gate, recorder)
+    if not effects:
+        return first
+    terms = [empty_term(chains[0], known(name)) for name in effects]
+    gates = [overlaps.gate for overlaps in first.overlaps]
+    return refine(chains, terms, first.hand_eye.T_mount, gates).as_correction()
+
+
+def _begin(chain: Chain, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
     """How well the views of one session meet under the coarse hand-eye."""
-    poses = own.poses(start.T_mount)
+    own, poses = chain.capture, chain.capture.poses(start.T_mount)
     g = collect(own, poses, start.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
     stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
-    _show(recorder, stage, own, poses, g.rms)
+    show(recorder, stage, own, poses, g.rms)
     return stage
 
 
 def _finish(
-    session: Session, own: Capture, index: int, start: Coarse, before: StageResult, correction: Correction,
-    captures: Sequence[Capture], recorder: Recorder, seconds: float,
-) -> Run:  # fmt: skip
-    """Register and fuse one session under the common hand-eye, and tell the recorder."""
-    clock = _Clock()
-    hand_eye, overlaps = correction.hand_eye, correction.overlaps[index]
-    scatter: Repeatability = hand_eye.repeatability[index]
-    poses_model = own.poses(hand_eye.T_mount)
-    g, iterations = overlaps.gram, len(correction.history)
-    note = correct_note(before.rms, g.rms)
-    stages = [before, StageResult("correct", g.rms, int(g.count.sum()), iterations, seconds, note)]
-    _show(recorder, stages[1], own, poses_model, g.rms)
-    clock.lap()
-    registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
-    final = registration.overlaps
-    stages.append(
-        StageResult("register", final.gram.rms, int(final.gram.count.sum()), len(registration.history), clock.lap())
-    )
-    fused = fuse(own, registration.poses)
-    stages.append(StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap()))
-    _show(recorder, stages[2], own, registration.poses, final.gram.rms)
-    floor = noise_floor(own, final, session.scanner.noise)
-    joints = None if any(v.joints is None for v in session.views) else np.array([v.joints for v in session.views])
-    result = Run(
-        session=session, T_mount=hand_eye.T_mount, T_mount_coarse=start.T_mount,
-        mount_covariance=hand_eye.covariance,
-        unobservable=unobservable(captures, hand_eye.T_mount, session.robot, joints if len(captures) == 1 else None),
-        stages=tuple(stages), poses_model=poses_model, poses=registration.poses,
-        corrections=registration.corrections, view_rms=per_view_rms(final, len(own.scans)),
-        residual_rms=overlaps.gram.rms, heldout_rms=overlaps.gram.rms * hand_eye.heldout_ratio,
-        noise_floor=floor, fused=fused, repeatability=scatter, overlaps=overlaps,
-        verdict=sentence(overlaps.gram.rms, final.gram.rms, floor, scatter, session.length_unit),
-        convergence={"correct": list(correction.history), "register": list(registration.history)},
-        notes=warnings(start, hand_eye.inflation),
-    )  # fmt: skip
+    session: Session, chain: Chain, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float
+) -> Run:
+    result = finish(session, chain, index, place.start, place.correction, before, recorder, seconds)
+    step = Step(tuple(result.effects), result.residual_rms, result.heldout_rms, result.noise_floor, result.T_mount)
+    result = replace(result, ledger=(*place.ledger, step), effects_file=place.effects_file)
     recorder.finish(result)
     return result
-
-
-def per_view_rms(overlaps: Overlaps, views: int) -> Array:
-    """(V,) rms of the residuals that touch a view, inside the robust gate."""
-    square, count = np.zeros(views), np.zeros(views)
-    for (v, w), s, n in zip(overlaps.gram.pairs, overlaps.gram.raw_square, overlaps.gram.count, strict=True):
-        square[[v, w]] += s
-        count[[v, w]] += n
-    return np.sqrt(square / np.maximum(count, 1))
-
-
-def _show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array, rms: float) -> None:
-    # The cell of the residual map must hold the step between the views.
-    if not isinstance(recorder, Silent):
-        recorder.stage(stage, poses, view_residuals(own, poses, max(2 * own.spacing, 3 * min(rms, own.spacing * 3))))
-
-
-def _fused_rms(residual: Array) -> float:
-    seen = residual[np.isfinite(residual)]
-    if not len(seen):
-        return float("nan")
-    # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
-    return float(np.sqrt(np.mean(seen[seen < RMS_GATE * 1.4826 * np.median(seen)] ** 2)))
 
 
 def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:
@@ -161,15 +163,3 @@ def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:
             raise InputError(f"{session.path}: views without clouds; `stitch run` stitches cloud sessions")
         if len(session.views) < 2:
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
-
-
-class _Clock:
-    """Seconds between calls."""
-
-    def __init__(self) -> None:
-        self.last = time.perf_counter()
-
-    def lap(self) -> float:
-        now = time.perf_counter()
-        self.last, before = now, self.last
-        return now - before

@@ -1,11 +1,19 @@
 """What a run computed, as plain frozen data; `run_folder.py` writes it to disk."""
 
-from dataclasses import dataclass, field
+from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from stitch.effects.chain import Chain, Term
 from stitch.frames import Array
 from stitch.overlaps import Overlaps
 from stitch.repeatability import Repeatability
 from stitch.session import Session
+
+if TYPE_CHECKING:
+    from stitch.diagnosis.diagnose import Diagnosis
 
 
 @dataclass(frozen=True)
@@ -31,16 +39,28 @@ class FusedCloud:
 
 
 @dataclass(frozen=True)
+class Step:
+    """One change of the model: a line of ledger.json."""
+
+    effects: tuple[str, ...]
+    residual_rms: float
+    heldout_rms: float
+    noise_floor: float
+    T_mount: Array  # (4, 4)
+
+
+@dataclass(frozen=True)
 class Run:
     """Everything `result.json` and the report show."""
 
     session: Session
+    chain: Chain  # what was measured
     T_mount: Array  # (4, 4) corrected hand-eye
     T_mount_coarse: Array  # (4, 4)
     mount_covariance: Array  # (6, 6) of the right perturbation T·exp(ξ), rotation first
     unobservable: tuple[str, ...]  # plain words, one per unobservable direction
     stages: tuple[StageResult, ...]
-    poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot + hand-eye)
+    poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
     poses: Array  # (V, 4, 4) T_reference_scanner after register
     corrections: Array  # (V, 6) twists: poses = exp(corrections) @ poses_model, reference frame
     view_rms: Array  # (V,)
@@ -51,5 +71,35 @@ class Run:
     repeatability: Repeatability  # of the flange poses, as the overlaps show it
     overlaps: Overlaps  # correspondences of the model, before register moves single views
     verdict: str  # one plain sentence
+    terms: tuple[Term, ...] = ()  # effects in use
+    sigmas: tuple[Array, ...] = ()  # per term (P,); NaN where the views cannot see a parameter
+    ledger: tuple[Step, ...] = ()
+    effects_file: str | None = None
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
+
+    def diagnose(self) -> Diagnosis:
+        """Which effect is missing."""
+        from stitch.diagnosis.diagnose import diagnose
+        from stitch.state import state_of
+
+        return diagnose(state_of(self))
+
+    def add(self, *effects: str) -> Run:
+        """The run with further effects in its model, fitted anew."""
+        from stitch.pipeline import change
+        from stitch.state import state_of
+
+        return change(state_of(self), [*self.effects, *(e for e in effects if e not in self.effects)])
+
+    def drop(self, *effects: str) -> Run:
+        """The run without some effects, fitted anew."""
+        from stitch.pipeline import change
+        from stitch.state import state_of
+
+        return change(state_of(self), [e for e in self.effects if e not in effects])
+
+    @property
+    def effects(self) -> Sequence[str]:
+        """Names of the effects in use."""
+        return [term.effect.name for term in self.terms]

@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from plyfile import PlyData, PlyElement
 
+from stitch.effects.terms import fitted_of
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.model import Model, write_model
@@ -62,18 +63,36 @@ def _umask() -> int:
     return mask
 
 
+def take_over(scratch: Path, path: Path) -> None:
+    """Move every file of `scratch` into the run folder; a diagnosis of the old model goes."""
+    for stale in ("diagnosis.json", "mesh.ply"):
+        (path / stale).unlink(missing_ok=True)
+    for file in sorted(scratch.iterdir()):
+        file.replace(path / file.name)
+    scratch.rmdir()
+
+
+def extend(group: str, *arguments: Any) -> None:
+    """Call what other packages offer under an entry-point group."""
+    for entry in entry_points(group=group):
+        entry.load()(*arguments)
+
+
 def write_run(run: Run, folder: Path) -> None:
     """Write model.toml, result.json, ledger.json, stitched.ply and residuals.parquet into `folder`."""
     write_model(model_of(run), folder / "model.toml")
-    _write_json(result_document(run), folder / "result.json")
-    _write_json(ledger(run), folder / "ledger.json")
+    write_json(result_document(run), folder / "result.json")
+    write_json(ledger(run), folder / "ledger.json")
     write_cloud(run.fused, folder / "stitched.ply")
     write_residuals(run, folder / "residuals.parquet")
 
 
 def model_of(run: Run) -> Model:
     """The model that a run fitted."""
-    return Model(run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance)
+    return Model(
+        run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance,
+        fitted_of(run.chain, run.terms, run.sigmas), run.effects_file,
+    )  # fmt: skip
 
 
 def result_document(run: Run) -> dict[str, Any]:
@@ -99,7 +118,10 @@ def result_document(run: Run) -> dict[str, Any]:
         "heldout_rms": run.heldout_rms,
         "noise_floor": run.noise_floor,
         "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
-        "effects": {},
+        "effects": {
+            name: {p: {"value": f.value, "sigma": f.sigma, "unit": f.unit} for p, f in fitted.items()}
+            for name, fitted in fitted_of(run.chain, run.terms, run.sigmas).items()
+        },
         "views": [
             {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),
              "points": 0 if view.cloud is None else len(view.cloud.points)}
@@ -115,9 +137,12 @@ def result_document(run: Run) -> dict[str, Any]:
 
 
 def ledger(run: Run) -> list[dict[str, Any]]:
-    """Step 0 of the model's history."""
-    return [{"step": 0, "effects": [], "residual_rms": run.residual_rms, "heldout_rms": run.heldout_rms,
-             "noise_floor": run.noise_floor, "hand_eye": run.T_mount.tolist()}]  # fmt: skip
+    """The model's history, one step per change."""
+    return [
+        {"step": i, "effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms,
+         "noise_floor": s.noise_floor, "hand_eye": s.T_mount.tolist()}
+        for i, s in enumerate(run.ledger)
+    ]  # fmt: skip
 
 
 def _versions() -> dict[str, str]:
@@ -130,8 +155,11 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _write_json(document: Any, path: Path) -> None:
-    path.write_text(json.dumps(_without_nan(document), indent=1) + "\n", encoding="utf-8")
+def write_json(document: Any, path: Path) -> None:
+    """Write JSON whole or not at all; what is not known is null."""
+    scratch = path.with_name(f".{path.name}.new")
+    scratch.write_text(json.dumps(_without_nan(document), indent=1) + "\n", encoding="utf-8")
+    scratch.replace(path)
 
 
 def _without_nan(value: Any) -> Any:

@@ -5,6 +5,7 @@ slow each other down twentyfold; so libraries run single-threaded inside a run.
 """
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -30,3 +31,16 @@ def parallel(function: Callable[[Item], Result], items: Iterable[Item]) -> Itera
 def library_threads_off() -> Any:
     """Limit OpenMP and BLAS to one thread; also a context manager. OpenMP counts per calling thread."""
     return threadpool_limits(1)
+
+
+class Clock:
+    """Seconds between calls."""
+
+    def __init__(self) -> None:
+        self.last = time.perf_counter()
+
+    def lap(self) -> float:
+        """Seconds since the last call."""
+        now = time.perf_counter()
+        self.last, before = now, self.last
+        return now - before

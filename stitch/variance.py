@@ -59,7 +59,7 @@ def fit_variances(
     problem = _problem(evidence, G, prior)
     guess = _guess(evidence) if start is None else start
     first = np.log(np.maximum(guess, 1e-300))
-    begin = [first, first + [-9.0, -9.0, 0.0]] if both_starts else [first]
+    begin = [first, first + np.array([-9.0, -9.0, 0.0])] if both_starts else [first]
     centre = np.log(_guess(evidence))
     bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
     fits = [

@@ -10,8 +10,11 @@ from importlib.metadata import entry_points
 import typer
 
 from stitch.cli.base import base
+from stitch.cli.change import add, drop
 from stitch.cli.check import check
+from stitch.cli.diagnose import diagnose_run, next_measurement
 from stitch.cli.drill import drill
+from stitch.cli.effects import effects
 from stitch.cli.run import run
 from stitch.errors import StitchError
 
@@ -25,6 +28,11 @@ def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app.command()(run)
     app.command()(check)
+    app.command("diagnose")(diagnose_run)
+    app.command()(add)
+    app.command()(drop)
+    app.command("next")(next_measurement)
+    app.command()(effects)
     app.command()(base)
     app.command()(drill)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):

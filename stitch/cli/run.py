@@ -1,6 +1,7 @@
 """`stitch run SESSION...`: coarse → correct → register → fuse, one run folder per call."""
 
 import json
+from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,8 @@ from rich.table import Table
 
 from stitch import run_folder
 from stitch.cli.progress import MICROMETRES, Progress, Tee
+from stitch.effects.terms import known
+from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.mesh import write_mesh
 from stitch.model import read_model, write_model
@@ -29,13 +32,23 @@ def run(
         Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
     ] = None,
     effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
+    effects_file: Annotated[
+        Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
+    ] = None,
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")] = False,
 ) -> None:  # fmt: skip
     """Find and correct the hand-eye, register the views, fuse them."""
-    if effects:
-        raise InputError(f"--effects {effects}: this version has no effects to fit; leave the option out")
+    names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
+    if effects_file:
+        load_effects(effects_file)
+    for name in names_of_effects:
+        known(name)
+    if names_of_effects and hand_eye:
+        raise InputError(
+            "--effects and --hand-eye: a model that is used as it is brings its own effects; name one of the two"
+        )
     loaded = [load_session(path) for path in sessions]
     names = [session.name for session in loaded]
     if len(set(names)) < len(names):
@@ -44,11 +57,15 @@ def run(
         )
     target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
     model = read_model(hand_eye) if hand_eye else None
+    if model and model.effects_file and not effects_file:
+        load_effects(Path(model.effects_file))
     with run_folder.new_folder(target) as scratch:
         folders = [scratch] if len(loaded) == 1 else [scratch / name for name in names]
         for folder in folders:
             folder.mkdir(exist_ok=True)
-        runs = run_rig(loaded, model, [_recorder(folder, recording) for folder in folders])
+        runs = run_rig(loaded, model, [recorder_for(folder, recording) for folder in folders], names_of_effects)
+        if effects_file:
+            runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
             _write(result, folder, mesh)
         if len(runs) > 1:
@@ -60,7 +77,8 @@ def run(
         show(runs, target)
 
 
-def _recorder(folder: Path, recording: bool) -> Recorder:
+def recorder_for(folder: Path, recording: bool) -> Recorder:
+    """Progress on a terminal, and the recording."""
     recorders: list[Recorder] = [Progress()]
     if recording:
         recorders += [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]

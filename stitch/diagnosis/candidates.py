@@ -62,6 +62,15 @@ def candidates_of(evidence: PoseEvidence) -> tuple[list[Candidate], PointGram | 
     return out, sums, missing
 
 
+def candidate_of(evidence: PoseEvidence, effect: Effect) -> Candidate | None:
+    """One effect as a candidate."""
+    parameters = evidence.chain.parameters(effect)
+    terms = _grid_terms(effect, parameters)
+    columns, _, where = evidence.columns(terms)
+    forms = [f for term, c in zip(terms, columns, strict=True) for f in _forms(evidence, term, parameters, c)]
+    return Candidate(effect, parameters, tuple(forms), columns[0], where[0]) if forms else None
+
+
 def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
     """The effect at zero, once for every combination of its gridded parameters."""
     grids = [p.grid or (0.0,) for p in parameters]

@@ -61,7 +61,7 @@ class PoseEvidence:
 
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns of the channel in those units, what hand-eye and model explain projected out."""
-        return project_out(self.white_model, np.linalg.solve(self.half, columns))
+        return project_out(self.white_model, np.asarray(np.linalg.solve(self.half, columns), float))
 
     def whiten(self, twists: Array) -> Array:
         """The same from twists (6V, P)."""
@@ -90,9 +90,8 @@ def pose_evidence(
     sizes = np.array([p.typical for t in terms for p in chain.parameters(t.effect)])
     start = fit_variances(evidence_of(channel), both_starts=True)
     half = np.linalg.cholesky(np.einsum("c,cij->ij", start.variances, evidence_of(channel).components[:, 0]))
-    seen = independent(
-        np.linalg.solve(half, channel.hand_eye), np.linalg.solve(half, channel.left @ extra), sizes, _UNSEEN
-    )
+    own, further = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.left @ extra))
+    seen = independent(own, further, sizes, _UNSEEN)
     model = np.hstack([hand_eye, extra[:, seen]])
     evidence = evidence_of(channel, channel.left @ extra[:, seen])
     null = fit_variances(evidence, both_starts=True)

@@ -70,8 +70,9 @@ def seen_twists(points: PointGram, freed: FreePoses) -> Array:
     g = freed.overlaps.gram
     K = points.vector.shape[2]
     b = np.zeros((g.views, 6, K))
-    np.add.at(b, g.pairs[:, 0], points.vector)
-    np.subtract.at(b, g.pairs[:, 1], points.vector)
+    v, w = g.pairs.astype(np.int64).T
+    np.add.at(b, v, points.vector)
+    np.subtract.at(b, w, points.vector)
     values, vectors, scale = visible_directions(g)
     return np.asarray(
         scale[:, None] * (vectors @ ((vectors.T @ (scale[:, None] * b.reshape(-1, K))) / values[:, None]))

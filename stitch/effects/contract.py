@@ -127,7 +127,7 @@ def _in_unit(
     name: str, unit: str, typical: float, limit: float, grid: tuple[float, ...], length_unit: str
 ) -> Parameter:
     above, _, below = unit.partition("/")
-    factor = _PER_MM[length_unit] ** (("mm" in above) - ("mm" in below))
+    factor = _PER_MM[length_unit] ** ((above == "mm") - (below == "mm"))
     return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, grid)
 
 

@@ -109,7 +109,7 @@ def views_of(session: Session) -> Views:
     moving = bool(speeds) and all(name in covariates for name in speeds)
     velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds])) if moving else None
     standoff = session.scanner.standoff or _median_range(session)
-    torques = _torques(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
+    torques = torques_of(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
     return Views(count, time - time[0], joints, previous, approach, velocity, torques, covariates, standoff)
 
 
@@ -118,7 +118,8 @@ def _median_range(session: Session) -> float:
     return float(np.median(ranges)) if ranges else 1.0
 
 
-def _torques(robot: Robot, joints: Array) -> Torques:
+def torques_of(robot: Robot, joints: Array) -> Torques:
+    """Gravity torques at joint angles (V, n)."""
     n = robot.n_joints
     if robot.has_masses:
         values = kinematics.gravity_torques(robot, joints)

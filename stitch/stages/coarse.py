@@ -29,7 +29,7 @@ _SEARCH_SAMPLES = 120
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
 _SEARCH_ITERATIONS = 7
 # First gate of the search and truncation of the score, as shares of the part's size.
-_GATE_SHARE = 0.35
+COARSE_GATE = 0.35
 _SCORE_SHARE = 0.05
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
@@ -64,7 +64,7 @@ class Coarse:
 
 def given(captures: Sequence[Capture], T_mount: Array) -> Coarse:
     """Take a hand-eye that somebody measured: the gate is wide enough for 5° and 30 mm."""
-    return Coarse(T_mount, _GATE_SHARE * part_size(captures), "given in session.toml", ())
+    return Coarse(T_mount, COARSE_GATE * part_size(captures), "given in session.toml", ())
 
 
 def part_size(captures: Sequence[Capture]) -> float:
@@ -161,7 +161,7 @@ def _close(captures: Sequence[Capture], source: str, T_mount: Array, size: float
     """Close in from one start; None if the views do not overlap there."""
     try:
         T_mount, _, _ = close_in(
-            captures, T_mount, [_GATE_SHARE * size] * len(captures), _SEARCH_SAMPLES, _SEARCH_ITERATIONS
+            captures, T_mount, [COARSE_GATE * size] * len(captures), _SEARCH_SAMPLES, _SEARCH_ITERATIONS
         )
     except NoResultError:
         return None

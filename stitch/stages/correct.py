@@ -12,6 +12,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
+from stitch.effects.chain import Term
 from stitch.frames import Array
 from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, fit_hand_eye, jacobian
@@ -35,6 +36,9 @@ class Correction:
     overlaps: tuple[Overlaps, ...]
     freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
+    captures: tuple[Capture, ...]  # without the effects in use
+    terms: tuple[Term, ...] = ()  # effects in use
+    sigmas: tuple[Array, ...] = ()  # per term (P,)
 
 
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
@@ -103,4 +107,4 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
         for c, o in zip(captures, overlaps, strict=True)
     )
     poses = tuple(f.poses for f in freed)
-    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)))
+    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)), tuple(captures))

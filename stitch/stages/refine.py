@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from stitch.free_poses import FreePoses, free_poses
 from stitch.hand_eye import Columns, HandEye, fit_hand_eye
 from stitch.match import sample
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.stages.correct import Correction
 
 _MAXIMUM_ITERATIONS = 6
 # Settled when no parameter moves by a twentieth of its sigma.
@@ -35,6 +37,11 @@ class Refinement:
     freed: tuple[FreePoses, ...]
     overlaps: tuple[Overlaps, ...]
     history: tuple[float, ...]
+
+    def as_correction(self) -> Correction:
+        """As the stage `correct` returns it."""
+        poses = tuple(f.poses for f in self.freed)
+        return Correction(self.hand_eye, self.overlaps, poses, self.history, self.captures, self.terms, self.sigmas)
 
 
 def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate: Sequence[float]) -> Refinement:
@@ -74,7 +81,7 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
     overlaps = tuple(_settled_overlaps(c, T_mount, gate) for c, gate in zip(captures, gate, strict=True))
     sigmas = np.full(len(seen), np.nan)
     sigmas[seen] = np.sqrt(np.diag(fitted.values_covariance))
-    cuts = np.cumsum([len(t.values) for t in terms])[:-1] if terms else []
+    cuts: Any = np.cumsum([len(t.values) for t in terms])[:-1] if terms else []
     return Refinement(
         fitted, tuple(terms), tuple(np.split(sigmas, cuts)), captures, tuple(freed), overlaps, tuple(history)
     )

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.capture import Capture
+from stitch.effects.chain import Term
+from stitch.frames import Array
 from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, scatter_of
 from stitch.match import sample
@@ -14,28 +16,45 @@ from stitch.stages.coarse import part_size
 from stitch.stages.correct import Correction
 
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
-_GATE_SHARE = 0.05
+REUSE_GATE = 0.05
 _TIGHTENINGS = 4
 
 
-def reuse(captures: Sequence[Capture], model: Model) -> Correction:
+def reuse(captures: Sequence[Capture], model: Model, terms: Sequence[Term] = ()) -> Correction:
     """Overlaps and pose scatter of `captures` under the model's hand-eye, as `correct` returns them.
+
+    Args:
+        captures: without the model's effects, `terms`.
 
     Raises:
         NoResultError: no two views overlap under the hand-eye.
     """
     size = part_size(captures)
-    overlaps = tuple(_settle(c, model, _GATE_SHARE * size) for c in captures)
+    overlaps = tuple(settle(c, model.T_mount, REUSE_GATE * size) for c in captures)
     poses = [c.poses(model.T_mount) for c in captures]
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(scatter_of(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
     hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
-    return Correction(hand_eye, overlaps, tuple(f.poses for f in freed), (pooled_rms(overlaps),))
+    sigmas = tuple(np.full(len(t.values), np.nan) for t in terms)
+    return Correction(
+        hand_eye,
+        overlaps,
+        tuple(f.poses for f in freed),
+        (pooled_rms(overlaps),),
+        tuple(captures),
+        tuple(terms),
+        sigmas,
+    )
 
 
-def _settle(capture: Capture, model: Model, gate: float) -> Overlaps:
+def settle(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
+    """Correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
     samples = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses = capture.poses(model.T_mount)
+    poses = capture.poses(T_mount)
     for _ in range(_TIGHTENINGS):
         overlaps = collect(capture, poses, gate, samples)
         gate = float(np.minimum(gate, next_gate(overlaps, capture)))

@@ -1,0 +1,135 @@
+"""`stitch add RUN EFFECT…`, `stitch drop RUN EFFECT…`: change the model, refit, print the ledger."""
+
+import json
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import run_folder
+from stitch.cli.progress import MICROMETRES
+from stitch.cli.run import recorder_for
+from stitch.diagnosis.suggest import suggest
+from stitch.effects.terms import known, require
+from stitch.errors import InputError
+from stitch.pipeline import change
+from stitch.result import Run
+from stitch.state import State, load_state
+
+_EffectsFile = Annotated[
+    Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
+]
+_Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd anew.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")]
+
+
+def add(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; changed in place.")],
+    effects: Annotated[list[str] | None, typer.Argument(metavar="EFFECT...", help="Effects to add.")] = None,
+    suggested: Annotated[bool, typer.Option("--suggested", help="Diagnose and add until nothing is left.")] = False,
+    at_most: Annotated[int, typer.Option("--at-most", help="Limit for --suggested.")] = 5,
+    effects_file: _EffectsFile = None, recording: _Recording = True, as_json: _Json = False,
+) -> None:  # fmt: skip
+    """Add effects to the model of a run, fit hand-eye and all effects anew, and show what it brought."""
+    if bool(effects) == suggested:
+        raise InputError("name the effects to add, or let the diagnosis choose with --suggested (one of the two)")
+    state = load_state(run, effects_file)
+    if suggested:
+        result, lines = suggest(state, at_most)
+        if result is None:
+            Console(stderr=True).print("\n".join(lines), soft_wrap=True, highlight=False)
+            return
+    else:
+        names = [*(t.effect.name for t in state.terms), *(effects or [])]
+        for name in effects or []:
+            require(state.chain, known(name))
+            if names.count(name) > 1:
+                raise InputError(f"{name} is in the model of {run} already")
+        result, lines = None, []
+        result = _changed(state, names, run, recording)
+    _finish(run, result, lines, recording=recording and suggested, as_json=as_json)
+
+
+def drop(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; changed in place.")],
+    effects: Annotated[list[str], typer.Argument(metavar="EFFECT...", help="Effects to take out.")],
+    effects_file: _EffectsFile = None, recording: _Recording = True, as_json: _Json = False,
+) -> None:  # fmt: skip
+    """Take effects out of the model of a run and fit the rest anew."""
+    state = load_state(run, effects_file)
+    used = [t.effect.name for t in state.terms]
+    for name in effects:
+        if name not in used:
+            raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
+    result = _changed(state, [name for name in used if name not in effects], run, recording)
+    _finish(run, result, [], recording=False, as_json=as_json)
+
+
+def _changed(state: State, names: list[str], run: Path, recording: bool) -> Run:
+    """The recording is written while the fit runs, into a file that takes its place at the end."""
+    scratch = run / ".new"
+    scratch.mkdir(exist_ok=True)
+    return change(state, names, recorder_for(scratch, recording))
+
+
+def _finish(run: Path, result: Run, lines: list[str], recording: bool, as_json: bool) -> None:
+    scratch = run / ".new"
+    scratch.mkdir(exist_ok=True)
+    if recording:
+        from stitch.state import state_of
+
+        result = change(state_of(result), list(result.effects), recorder_for(scratch, True))
+    run_folder.write_run(result, scratch)
+    for entry in entry_points(group="stitch.reports"):
+        entry.load()(result, scratch / "report.html")
+    run_folder.take_over(scratch, run)
+    if as_json:
+        print(json.dumps(run_folder.result_document(result), indent=1))
+        return
+    for line in lines:
+        Console(stderr=True).print(line, soft_wrap=True, highlight=False)
+    show_ledger(result)
+
+
+def show_ledger(result: Run) -> None:
+    """History of the model, fitted parameters, and whether the last effect earned its place."""
+    console, to_um = Console(stderr=True), MICROMETRES[result.session.length_unit]
+    table = Table(title=f"{result.session.name}: history of the model", title_justify="left")
+    for heading in ("step", "effects", "residual (µm)", "held-out (µm)", "noise floor (µm)"):
+        table.add_column(heading, justify="left" if heading == "effects" else "right")
+    for i, s in enumerate(result.ledger):
+        numbers = (f"{x * to_um:.1f}" for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
+        table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
+    console.print(table)
+    for term, sigmas in zip(result.terms, result.sigmas, strict=True):
+        for p, value, sigma in zip(result.chain.parameters(term.effect), term.values, sigmas, strict=True):
+            told = f"± {sigma:.1g}" if np.isfinite(sigma) else "(not seen by these views)"
+            if np.isfinite(sigma) or p.grid:
+                console.print(f"  {term.effect.name}.{p.name} = {value:.4g} {told} {p.unit}", highlight=False)
+    for line in remarks(result):
+        console.print(line, soft_wrap=True, highlight=False)
+
+
+def remarks(result: Run) -> list[str]:
+    """Did the effects earn their place? Are they of a believable size?"""
+    out = []
+    if len(result.ledger) > 1:
+        before, after = result.ledger[-2], result.ledger[-1]
+        grown = set(after.effects) - set(before.effects)
+        if grown and not after.heldout_rms < 0.995 * before.heldout_rms:
+            out.append(f"{', '.join(sorted(grown))} did not earn a place: the held-out residual did not fall.")
+    for term, sigmas in zip(result.terms, result.sigmas, strict=True):
+        parameters = result.chain.parameters(term.effect)
+        wild = [p.name for p, v in zip(parameters, term.values, strict=True) if not p.grid and abs(v) > p.limit]
+        if wild:
+            out.append(f"{term.effect.name}: {', '.join(wild)} is larger than anybody would believe.")
+        known_ = [
+            abs(v) / s for p, v, s in zip(parameters, term.values, sigmas, strict=True) if np.isfinite(s) and not p.grid
+        ]
+        if known_ and max(known_) < 2:
+            out.append(f"{term.effect.name}: no parameter differs from zero by two sigmas; it can be dropped.")
+    return out

@@ -1,0 +1,94 @@
+"""`stitch diagnose RUN`: which effect is missing; `stitch next RUN`: what to measure."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch.cli.progress import MICROMETRES
+from stitch.diagnosis.diagnose import Diagnosis, Suspect, diagnose
+from stitch.diagnosis.document import diagnosis_document
+from stitch.diagnosis.words import amounts_of
+from stitch.run_folder import extend, write_json
+from stitch.state import load_state
+
+_SHOWN = 6
+
+
+def diagnose_run(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    effects_file: Annotated[
+        Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print diagnosis.json alone on standard output.")] = False,
+) -> None:
+    """Say which physical effect is missing in the model of a run, or why nobody can tell."""
+    found, document, unit = _diagnosed(run, effects_file)
+    if as_json:
+        print(json.dumps(document, indent=1))
+    else:
+        show(found, unit)
+
+
+def next_measurement(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    effects_file: Annotated[
+        Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the proposals as JSON.")] = False,
+) -> None:
+    """Say which poses or artefacts would separate what cannot be told apart."""
+    found, document, _ = _diagnosed(run, effects_file)
+    if as_json:
+        print(
+            json.dumps({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}, indent=1)
+        )
+        return
+    console = Console(stderr=True)
+    if not found.next:
+        console.print("Nothing has to be told apart: no two suspects look alike in these views.")
+    for p in found.next:
+        console.print(f"To separate {' from '.join(p.separates)}: {p.do}.", soft_wrap=True, highlight=False)
+
+
+def _diagnosed(run: Path, effects_file: Path | None) -> tuple[Diagnosis, dict[str, object], str]:
+    state = load_state(run, effects_file)
+    found = diagnose(state)
+    document = diagnosis_document(found)
+    write_json(document, run / "diagnosis.json")
+    extend("stitch.diagnosis_reports", found, state, run)
+    return found, document, state.session.length_unit
+
+
+def show(found: Diagnosis, length_unit: str) -> None:
+    """Sentence first, then the suspects, what the poses follow, what to do next."""
+    console, to_um = Console(stderr=True), MICROMETRES[length_unit]
+    console.print(found.sentence, soft_wrap=True, highlight=False, style="bold")
+    table = Table(title="Suspects", title_justify="left")
+    for heading in ("effect", "p", "posterior", "amplitude", "left (µm)", "held-out (µm)", "looks like"):
+        table.add_column(heading, justify="left" if heading in ("effect", "amplitude", "looks like") else "right")
+    for s in found.suspects[:_SHOWN]:
+        table.add_row(*_row(found, s, to_um))
+    console.print(table)
+    unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
+    if unseen:
+        console.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True, highlight=False)
+    for name, needs in found.missing.items():
+        console.print(f"Not tested: {name} (needs {', '.join(needs)}).", soft_wrap=True, highlight=False)
+    for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
+        console.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True, highlight=False)
+    for p in found.next[:3]:
+        console.print(f"Next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True, highlight=False)
+
+
+def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:
+    if not s.ranked.score.observable:
+        return [s.name, "–", "–", "not observable", "–", "–", ""]
+    left = ["–", "–"]
+    if s.left is not None:
+        left = [f"{found.residual_rms * to_um * x**0.5:.1f}" for x in (s.left.inside, s.left.heldout)]
+    alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
+    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", amounts_of(s.ranked, 2), *left, alike]

@@ -1,0 +1,102 @@
+"""The whole diagnosis: evidence, candidates, selection, what to measure next, one plain sentence."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.aliases import Alias, alias_matrix, aliases_of
+from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.heldout import Left, left_by
+from stitch.diagnosis.next_view import Proposal, propose
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.select import Ranked, Selection, select
+from stitch.diagnosis.start import evidence_of_state
+from stitch.diagnosis.unknown import Dependence, dependences
+from stitch.diagnosis.words import sentence_of
+from stitch.frames import Array
+from stitch.state import State
+from stitch.threads import library_threads_off
+
+# Candidates whose prediction on left-out views is computed; the others explain nothing.
+_PREDICTED = 8
+# An effect must not vanish when one view is left out.
+_STEADY = 0.25
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """One candidate as diagnosis.json shows it."""
+
+    ranked: Ranked
+    aliases: tuple[Alias, ...]
+    left: Left | None
+
+    @property
+    def name(self) -> str:
+        return self.ranked.name
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Verdict, suspects, dependences, next measurement."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    sentence: str
+    residual_rms: float
+    noise_floor: float
+    rotation: float  # repeatability under the present model, rad
+    translation: float  # length_unit
+    suspects: tuple[Suspect, ...]
+    matrix: Array  # (S, S) alias matrix of the suspects
+    depends_on: tuple[Dependence, ...]
+    next: tuple[Proposal, ...]
+    missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
+    evidence: PoseEvidence
+    notes: tuple[str, ...] = ()
+
+
+def diagnose(state: State) -> Diagnosis:
+    """Which effect is missing in the model of a run.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    with library_threads_off():
+        evidence = evidence_of_state(state)
+        candidates, points, missing = candidates_of(evidence)
+        selection = select(evidence, candidates, state.session.length_unit)
+        scores = [r.score for r in selection.ranked]
+        matrix = alias_matrix(evidence, scores)
+        suspects = []
+        for k, ranked in enumerate(selection.ranked):
+            clear = ranked.score.observable and k < _PREDICTED and np.isfinite(ranked.score.sigmas).all()
+            left = left_by(evidence, ranked.score, points) if clear else None
+            suspects.append(Suspect(ranked, tuple(aliases_of(k, matrix, scores)), left))
+        selection, notes = checked(selection, suspects)
+        depends = dependences(evidence, selection.empirical)
+        rotation, translation = np.sqrt(evidence.null.variances[:2])
+        found = Diagnosis(
+            selection.verdict, tuple(r.name for r in selection.named), "", state.residual_rms, state.noise_floor,
+            float(rotation), float(translation), tuple(suspects), matrix, tuple(depends),
+            tuple(propose(evidence, selection)), missing, evidence, notes,
+        )  # fmt: skip
+        return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
+
+
+def checked(selection: Selection, suspects: list[Suspect]) -> tuple[Selection, tuple[str, ...]]:
+    """An effect that one view carries, or that does not help on views left out, is not named."""
+    if selection.verdict != "missing_effect":
+        return selection, ()
+    name = selection.named[0].name
+    left = next((s.left for s in suspects if s.name == name), None)
+    if left is None:
+        return selection, ()
+    if left.steadiness < _STEADY:
+        note = f"{name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
+    elif left.heldout > 1 - left.heldout_sigma:
+        share = f"{left.heldout:.2f} ± {left.heldout_sigma:.2f}"
+        note = f"{name} would not help on views left out (mean square {share} of now)"
+    else:
+        return selection, ()
+    return Selection("unknown_effect", (), selection.ranked, selection.empirical), (note,)

@@ -1,0 +1,39 @@
+"""Values to begin a fit with: those that the views suggest at first sight."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.diagnosis.candidates import candidate_of, with_values
+from stitch.diagnosis.pose_evidence import PoseEvidence, pose_evidence
+from stitch.diagnosis.score import score
+from stitch.effects.chain import Term, corrected
+from stitch.effects.contract import Effect
+from stitch.effects.terms import empty_term
+from stitch.free_poses import free_poses
+from stitch.state import State
+
+
+def evidence_of_state(state: State) -> PoseEvidence:
+    """Free the views under the model and reduce them to evidence."""
+    own = corrected(state.chain, state.terms, state.T_mount)
+    freed = free_poses(own, own.poses(state.T_mount), state.gate)
+    return pose_evidence(state.chain, state.terms, own, state.T_mount, freed)
+
+
+def start_values(state: State, effects: Sequence[Effect]) -> list[Term]:
+    """A term for each effect; events and time constants at the value that explains most."""
+    if not effects:
+        return []
+    evidence = evidence_of_state(state)
+    out = []
+    for effect in effects:
+        candidate = candidate_of(evidence, effect)
+        gridded = any(p.grid for p in candidate.parameters) if candidate else False
+        if candidate is None or not gridded:
+            out.append(empty_term(state.chain, effect))
+            continue
+        best = score(evidence, candidate, 1)
+        values = best.values if np.isfinite(best.sigmas).all() else np.zeros(len(best.values))
+        out.append(with_values(best.form, values))
+    return out

@@ -1,0 +1,34 @@
+"""Diagnose, add, and again, until nothing is left to add."""
+
+from stitch.diagnosis.diagnose import diagnose
+from stitch.pipeline import change
+from stitch.result import Run
+from stitch.state import State, state_of
+
+
+def suggest(state: State, at_most: int) -> tuple[Run | None, list[str]]:
+    """The run with everything that the diagnosis names; None where it names nothing. Lines tell the way.
+
+    An effect stays only while the held-out residual falls.
+    """
+    lines: list[str] = []
+    result: Run | None = None
+    for _ in range(at_most):
+        found = diagnose(state)
+        lines.append(found.sentence)
+        if found.verdict != "missing_effect":
+            break
+        tried = change(state, [*(t.effect.name for t in state.terms), found.effects[0]])
+        if not _earned(state, tried):
+            lines.append(
+                f"{found.effects[0]} was tried and did not earn its place: the held-out residual did not fall."
+            )
+            break
+        result, state = tried, state_of(tried)
+    else:
+        lines.append(f"Stopped after {at_most} effects; run it again to go on.")
+    return result, lines
+
+
+def _earned(state: State, tried: Run) -> bool:
+    return not state.ledger or tried.heldout_rms < state.ledger[-1].heldout_rms

@@ -1,0 +1,98 @@
+"""A run as far as the next question needs it: what was measured, and the model."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.capture import capture
+from stitch.effects.chain import Chain, Term, chain_of, corrected
+from stitch.effects.terms import terms_of
+from stitch.effects.user_file import load
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.model import read_model
+from stitch.result import Run, Step
+from stitch.session import Session, load_session
+from stitch.stages.coarse import part_size
+from stitch.stages.reuse import REUSE_GATE, settle
+from stitch.threads import library_threads_off
+
+
+@dataclass(frozen=True)
+class State:
+    """What was measured, the model, and its history."""
+
+    session: Session
+    chain: Chain
+    terms: tuple[Term, ...]
+    T_mount: Array  # (4, 4)
+    T_mount_coarse: Array  # (4, 4)
+    gate: float  # largest distance between partners, length_unit
+    residual_rms: float
+    noise_floor: float
+    ledger: tuple[Step, ...]
+    effects_file: str | None
+
+
+def state_of(run: Run) -> State:
+    """The state of a run in memory."""
+    return State(
+        run.session, run.chain, run.terms, run.T_mount, run.T_mount_coarse, run.overlaps.gate, run.residual_rms,
+        run.noise_floor, run.ledger, run.effects_file,
+    )  # fmt: skip
+
+
+def load_state(folder: Path, effects_file: Path | None = None) -> State:
+    """The state of a run folder; its session is read again.
+
+    Raises:
+        InputError: not a run of one session, its session has gone, or an effect is not known.
+    """
+    document, steps = _documents(folder)
+    model = read_model(folder)
+    file = str(effects_file.resolve()) if effects_file else model.effects_file
+    if file:
+        load(Path(file))
+    path = Path(document["session"])
+    if not path.is_dir():
+        raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
+    session = load_session(path)
+    with library_threads_off():
+        chain = chain_of(session, capture(session))
+        terms = tuple(terms_of(model, chain))
+        own = corrected(chain, terms, model.T_mount)
+        overlaps = settle(own, model.T_mount, REUSE_GATE * part_size([own]))
+    return State(
+        session, chain, terms, model.T_mount, model.T_mount_coarse, overlaps.gate, document["residual_rms"],
+        document["noise_floor"], steps, file,
+    )  # fmt: skip
+
+
+def _documents(folder: Path) -> tuple[dict[str, Any], tuple[Step, ...]]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
+    if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
+        inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
+        if inner:
+            raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
+    try:
+        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        ledger = json.loads((folder / "ledger.json").read_text(encoding="utf-8"))
+        steps = tuple(
+            Step(tuple(s["effects"]), s["residual_rms"], _number(s["heldout_rms"]), s["noise_floor"],
+                 np.array(s["hand_eye"], float))
+            for s in ledger
+        )  # fmt: skip
+        document["residual_rms"], document["noise_floor"], document["session"]
+    except FileNotFoundError as error:
+        raise InputError(f"{error.filename}: not found; name a run folder that `stitch run` wrote") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder}: result.json or ledger.json is damaged ({error}); run `stitch run` again") from None
+    return document, steps
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
