@@ -91,7 +91,7 @@ def _branch(A: Array, B: Array, alpha: Array, beta: Array, open_sign: Array) -> 
             raise NoResultError(
                 "all motions are half turns and fit two hand-eyes equally well; add views turned by another angle"
             )
-    return best
+    return np.asarray(best)
 
 
 def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
