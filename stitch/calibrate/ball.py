@@ -1,0 +1,70 @@
+"""Circle (in a plane) or sphere (in space) through points with outliers: RANSAC, then a robust fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stitch.frames import Array
+
+_TRIALS = 200
+# Points for the search and the fit of one view; the joint fit sees all of them.
+_POINTS = 3000
+# Points this many robust sigmas off the fitted circle or sphere are of something else.
+_GATE = 6.0
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Circle (k = 2) or sphere (k = 3)."""
+
+    centre: Array  # (k,)
+    radius: float
+    sigma: float  # robust sigma of the distances, length unit
+    keep: Array  # (N,) bool: the points of the circle or sphere
+
+
+def fit_ball(points: Array, radius: float | None = None) -> Ball:
+    """Robust fit to points (N, k), k = 2 or 3; with `radius` only the centre is sought.
+
+    The search wants inliers within 2 % of the size of the points; the fit minimises a soft L1 loss of
+    the distances at the scale that they show themselves.
+    """
+    thin = points[:: max(1, len(points) // _POINTS)]
+    centre, found = _ransac(thin)
+    x = np.append(centre, radius or found) if radius is None else centre
+    scale = 0.02 * float(np.ptp(thin, axis=0).max())
+    for _ in range(3):
+        x = least_squares(_distances, x, args=(thin, radius), loss="soft_l1", f_scale=scale, x_scale="jac").x
+        scale = max(1.4826 * float(np.median(np.abs(_distances(x, thin, radius)))), 1e-9 * scale)
+    off = _distances(x, points, radius)
+    sigma = 1.4826 * float(np.median(np.abs(off)))
+    dimension = points.shape[1]
+    return Ball(x[:dimension], float(radius or x[dimension]), sigma, np.abs(off) < _GATE * max(sigma, 1e-12))
+
+
+def _distances(x: Array, points: Array, radius: float | None) -> Array:
+    k = points.shape[1]
+    return np.asarray(np.linalg.norm(points - x[:k], axis=1) - (x[k] if radius is None else radius))
+
+
+def _ransac(points: Array) -> tuple[Array, float]:
+    """Centre and radius with most points within the gate; spheres through k + 1 random points each."""
+    rng = np.random.default_rng(0)
+    k, gate = points.shape[1], 0.02 * float(np.ptp(points, axis=0).max())
+    middle = points.mean(axis=0)
+    local = points - middle
+    draws = local[rng.integers(len(points), size=(_TRIALS, k + 1))]
+    # |p|² = 2 c·p + (r² − |c|²) for each of the k + 1 points.
+    system = np.concatenate([2 * draws, np.ones((_TRIALS, k + 1, 1))], axis=2)
+    good = np.abs(np.linalg.det(system)) > 1e-9 * gate**k
+    whole = np.hstack([2 * local, np.ones((len(local), 1))])
+    candidates = [np.linalg.lstsq(whole, (local**2).sum(axis=1), rcond=None)[0]]
+    candidates += list(np.linalg.solve(system[good], (draws[good] ** 2).sum(axis=2)[..., None])[..., 0])
+    best, most = (local[0], gate), -1
+    for x in candidates:
+        radius = float(np.sqrt(max(x[k] + x[:k] @ x[:k], 0.0)))
+        count = int((np.abs(np.linalg.norm(local - x[:k], axis=1) - radius) < gate).sum())
+        if count > most:
+            best, most = (x[:k], radius), count
+    return best[0] + middle, best[1]
