@@ -22,6 +22,7 @@ class Ball:
     radius: float
     sigma: float  # robust sigma of the distances, length unit
     keep: Array  # (N,) bool: the points of the circle or sphere
+    covariance: Array  # (k + 1, k + 1) of centre and radius, both free, from the points' sigma
 
 
 def fit_ball(points: Array, radius: float | None = None) -> Ball:
@@ -38,9 +39,12 @@ def fit_ball(points: Array, radius: float | None = None) -> Ball:
         x = least_squares(_distances, x, args=(thin, radius), loss="soft_l1", f_scale=scale, x_scale="jac").x
         scale = max(1.4826 * float(np.median(np.abs(_distances(x, thin, radius)))), 1e-9 * scale)
     off = _distances(x, points, radius)
-    sigma = 1.4826 * float(np.median(np.abs(off)))
-    dimension = points.shape[1]
-    return Ball(x[:dimension], float(radius or x[dimension]), sigma, np.abs(off) < _GATE * max(sigma, 1e-12))
+    sigma = max(1.4826 * float(np.median(np.abs(off))), 1e-9 * scale)
+    k, keep = points.shape[1], np.abs(off) < _GATE * sigma
+    outward = points[keep] - x[:k]
+    rows = np.column_stack([outward / np.linalg.norm(outward, axis=1, keepdims=True), np.ones(len(outward))])
+    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
+    return Ball(x[:k], float(radius or x[k]), sigma, keep, covariance)
 
 
 def _distances(x: Array, points: Array, radius: float | None) -> Array:

@@ -34,6 +34,9 @@ class SphereView:
     offset: float  # distance of the centre from the laser plane; zero for an area scan
     sigma: float  # robust sigma of the points about the circle or the sphere, free in this view
     side: float  # +1, -1: the session says where along the normal; 0: it does not
+    directions: Array  # (k, 3) in which the centre is measured: in the laser plane (k = 2) or all (k = 3)
+    measured: Array  # (k + 1,) centre along these directions, and radius of the circle or sphere, all free
+    covariance: Array  # (k + 1, k + 1) of `measured` from the points' sigma
 
 
 def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> SphereView:
@@ -47,8 +50,7 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
     middle = points.mean(axis=0)
     _U, s, Vt = np.linalg.svd(points - middle, full_matrices=False)
     if s[2] > _FLAT * s[0]:
-        ball = fit_ball(points, radius)
-        return SphereView(name, points[ball.keep], int((~ball.keep).sum()), ball.centre, np.zeros(3), 0.0, ball.sigma, 0)
+        return _area(name, points, radius)
     circle = fit_ball((points - middle) @ Vt[:2].T)
     if circle.radius > (1 + _TOO_LARGE) * radius:
         raise InputError(
@@ -56,10 +58,23 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
             "check sphere.radius in session.toml and cloud_unit"
         )
     kept = points[circle.keep]
-    normal = arc_normal(kept, Vt[2])
     offset = float(np.sqrt(max(radius**2 - circle.radius**2, 0.0)))
-    foot = middle + circle.centre @ Vt[:2]
-    return SphereView(name, kept, int((~circle.keep).sum()), foot, normal, offset, circle.sigma, float(np.sign(side)))
+    measured = np.append(circle.centre + Vt[:2] @ middle, circle.radius)
+    return SphereView(
+        name, kept, int((~circle.keep).sum()), middle + circle.centre @ Vt[:2], arc_normal(kept, Vt[2]), offset,
+        circle.sigma, float(np.sign(side)), Vt[:2], measured, circle.covariance,
+    )  # fmt: skip
+
+
+def _area(name: str, points: Array, radius: float) -> SphereView:
+    """The centre with the known radius starts the search; centre and radius, both free, are what is measured."""
+    known = fit_ball(points, radius)
+    kept = points[known.keep]
+    free = fit_ball(kept)
+    return SphereView(
+        name, kept, int((~known.keep).sum()), known.centre, np.zeros(3), 0.0, free.sigma, 0.0,
+        np.eye(3), np.append(free.centre, free.radius), free.covariance,
+    )  # fmt: skip
 
 
 def arc_normal(arc: Array, normal: Array) -> Array:
