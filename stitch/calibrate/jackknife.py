@@ -20,19 +20,20 @@ class Jackknife:
     steps: Array  # (V, n) change of the parameters without each view
 
 
-def jackknife(information: Array, gradient: Array, scale: float = 1.0) -> Jackknife:
-    """Covariance of a whitened least-squares solution.
+def jackknife(information: Array, gradient: Array, model: Array | None = None) -> Jackknife:
+    """Covariance of a weighted least-squares solution.
 
     Args:
-        information: (V, n, n) JᵀJ of each view, whitened.
-        gradient: (V, n) Jᵀe of each view at the solution, e the whitened residual.
-        scale: variance of the whitened residuals, 1 where the whitening is right.
+        information: (V, n, n) JᵀWJ of each view.
+        gradient: (V, n) JᵀWe of each view at the solution, e the residual.
+        model: (n, n) covariance that the scatter of the residuals predicts; without it the inverse of
+            the information, right where the weights W are inverse covariances.
 
     The jackknife of Efron & Stein (1981) never goes below the truth on average, so it only inflates.
     """
     count, n = gradient.shape
     total = information.sum(axis=0)
-    model = np.linalg.inv(total) * scale
+    model = np.linalg.inv(total) if model is None else model
     steps = np.zeros((count, n))
     for v in range(count):
         # Without a view whose loss makes the rest singular no step can be taken: it has no partner.

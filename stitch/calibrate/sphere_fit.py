@@ -1,11 +1,12 @@
-"""Hand-eye, centre and radius together from all views, the robot's pose scatter included.
+"""Hand-eye, centre and radius together from all points of all views; covariance counted in views.
 
 A pose error shifts the whole sphere in its view, and turning it about its centre changes nothing: all
-that a view's points say is the circle or sphere that they lie on. So the points enter by their robust
-circle (centre in the laser plane, radius) or sphere (centre, radius) and its covariance, and every view
-gets one shift ~ N(0, σ_p²) per axis and one error of its apparent radius ~ N(0, σ_ρ²), the scanner's
-own; no number of points averages them out. The second matters for laser lines: near the equator a
-radius off by σ_ρ puts the centre ρ/h·σ_ρ off, h its distance from the plane. Both scatters are found by
+that a view's points say is the circle or sphere that they lie on. So the sum over the points of a view
+is carried by their robust circle (centre in the laser plane, radius) or sphere (centre, radius) with the
+normal matrix of its own fit, and nothing is lost. What the views then scatter by no number of points
+averages out: a shift σ_p per axis of the sphere (the robot), an error σ_ρ of its apparent radius and an
+error of the points σ_c that is one over the view (both the scanner). Near the equator of the sphere a
+radius off by σ_ρ puts the centre ρ/h·σ_ρ off, h its distance from the laser plane. All three are found by
 restricted maximum likelihood (Patterson & Thompson 1971).
 """
 
@@ -16,12 +17,14 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from stitch import frames
-from stitch.calibrate.jackknife import jackknife
+from stitch.calibrate.jackknife import Jackknife, jackknife
 from stitch.calibrate.sphere_views import SphereView
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
-_ROUNDS = 30
+_ROUNDS = 20
+# Relative change of the scatters that ends the search.
+_SMALL = 0.01
 # Step of the central differences (rad and lengths).
 _STEP = 1e-5
 
@@ -35,8 +38,7 @@ class SphereFit:
     radius: float
     covariance: Array  # (9, 9) or (10, 10), counted in views
     inflation: float  # what leaving views out put on it, ≥ 1
-    pose_sigma: float  # σ_p of one coordinate of a view's shift
-    radius_sigma: float  # σ_ρ of a view's apparent radius
+    scatter: Array  # (σ_p, σ_ρ, σ_c) of the views
     point_sigma: float  # median over the views of the points' sigma about their own circle or sphere
     rms: float  # of all points' distances from the one sphere
     view_rms: Array  # (V,) the same by view
@@ -55,13 +57,16 @@ class _State:
 
 
 def fit_sphere(
-    G: Array, views: Sequence[SphereView], T_mount: Array, radius: float, radius_free: bool = False
-) -> SphereFit:
+    G: Array, views: Sequence[SphereView], T_mount: Array, radius: float,
+    radius_free: bool = False, by_views: bool = False,
+) -> SphereFit:  # fmt: skip
     """Refine from a start that has every laser line on the right side of the centre.
 
     Args:
         G: (V, 4, 4) T_reference_mount.
         T_mount: (4, 4) first hand-eye.
+        by_views: weigh the views by the scatter found (generalised least squares); else every point counts
+            the same, which minimises the rms distance of the points from the sphere.
 
     Raises:
         NoResultError: too few views.
@@ -71,24 +76,40 @@ def fit_sphere(
         raise NoResultError(f"{len(views)} views for {n} unknowns; scan the sphere from {n // 3 + 2} or more poses")
     feet = np.array([v.foot for v in views])
     state = _State(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
-    scatter = np.array([0.005, 0.005]) * radius
-    for _ in range(_ROUNDS):
-        state = _solve(G, views, state, scatter, n)
-        e, jacobian, response = _linearise(G, views, state, n)
-        newer = _scatter(views, e, jacobian, response, scatter)
-        change, scatter = float(np.abs(np.log(newer / scatter)).max()), newer
-        if change < 1e-3:
-            break
-    W = _whitening(views, response, scatter)
-    white = [(w @ J, w @ r) for w, J, r in zip(W, jacobian, e, strict=True)]
-    statistics = jackknife(np.array([J.T @ J for J, _ in white]), np.array([J.T @ r for J, r in white]))
+    # Distances from a circle of radius ρ are R/ρ times those from the sphere.
+    by_points = [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
+    scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
+    # The points' own sum has side minima for laser lines; the views' leads to the right one.
+    for weighed in (True,) if by_views else (True, False):
+        for _ in range(_ROUNDS):
+            if weighed:
+                weights = [np.linalg.inv(V) for V in _covariances(views, _residuals(G, views, state)[1], scatter)]
+            state = _solve(G, views, state, weights if weighed else by_points, n)
+            e, jacobian, response = _linearise(G, views, state, n)
+            newer = _scatter(views, e, jacobian, response, scatter)
+            change, scatter = float(np.abs(np.log(newer / scatter)).max()), newer
+            if change < _SMALL:
+                break
+    weights = weights if by_views else by_points
+    statistics = _statistics(e, jacobian, weights, _covariances(views, response, scatter))
     off = [_distances(G[v], view.points, state) for v, view in enumerate(views)]
     return SphereFit(
-        state.T_mount, state.centre, state.radius, statistics.covariance, statistics.inflation,
-        float(scatter[0]), float(scatter[1]), float(np.median([v.sigma for v in views])),
-        float(np.sqrt(np.mean(np.concatenate(off) ** 2))), np.array([np.sqrt(np.mean(d**2)) for d in off]),
-        statistics.steps,
+        state.T_mount, state.centre, state.radius, statistics.covariance, statistics.inflation, scatter,
+        float(np.median([v.sigma for v in views])), float(np.sqrt(np.mean(np.concatenate(off) ** 2))),
+        np.array([np.sqrt(np.mean(d**2)) for d in off]), statistics.steps,
     )  # fmt: skip
+
+
+def _statistics(
+    e: Sequence[Array], jacobian: Sequence[Array], weights: Sequence[Array], covariances: Sequence[Array]
+) -> Jackknife:
+    """Sandwich of the weights and of the covariances that the scatter gives, and the jackknife over it."""
+    left = [J.T @ w for J, w in zip(jacobian, weights, strict=True)]
+    information = np.array([a @ J for a, J in zip(left, jacobian, strict=True)])
+    gradient = np.array([a @ r for a, r in zip(left, e, strict=True)])
+    middle = np.sum([a @ V @ a.T for a, V in zip(left, covariances, strict=True)], axis=0)
+    bread = np.linalg.inv(information.sum(axis=0))
+    return jackknife(information, gradient, bread @ middle @ bread)
 
 
 def _distances(G: Array, points: Array, state: _State) -> Array:
@@ -111,19 +132,18 @@ def _residuals(G: Array, views: Sequence[SphereView], state: _State) -> tuple[li
     return out, response
 
 
-def _whitening(views: Sequence[SphereView], response: Sequence[Array], scatter: Array) -> list[Array]:
-    """Inverse Cholesky factors of each view's covariance: points, shift, apparent radius."""
+def _covariances(views: Sequence[SphereView], response: Sequence[Array], scatter: Array) -> list[Array]:
+    """Covariance of each view's circle or sphere: common error of the points, shift, apparent radius."""
     out = []
     for view, S in zip(views, response, strict=True):
-        covariance = view.covariance + scatter[0] ** 2 * S @ S.T
+        covariance = view.covariance * (1 + (scatter[2] / view.sigma) ** 2) + scatter[0] ** 2 * S @ S.T
         covariance[-1, -1] += scatter[1] ** 2
-        out.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        out.append(covariance)
     return out
 
 
-def _solve(G: Array, views: Sequence[SphereView], state: _State, scatter: Array, n: int) -> _State:
-    """Least squares with the covariances of the state it starts from."""
-    W = _whitening(views, _residuals(G, views, state)[1], scatter)
+def _solve(G: Array, views: Sequence[SphereView], state: _State, weights: Sequence[Array], n: int) -> _State:
+    W = [np.linalg.cholesky(w).T for w in weights]
 
     def residual(x: Array) -> Array:
         return np.concatenate([w @ r for w, r in zip(W, _residuals(G, views, state.moved(x))[0], strict=True)])
@@ -146,10 +166,10 @@ def _linearise(
 def _scatter(
     views: Sequence[SphereView], e: Sequence[Array], jacobian: Sequence[Array], response: Sequence[Array], last: Array
 ) -> Array:
-    """(σ_p, σ_ρ) of the largest restricted likelihood of the linear model."""
+    """(σ_p, σ_ρ, σ_c) of the largest restricted likelihood of the linear model."""
 
     def cost(log_scatter: Array) -> float:
-        W = _whitening(views, response, np.exp(log_scatter))
+        W = [np.linalg.inv(np.linalg.cholesky(V)) for V in _covariances(views, response, np.exp(log_scatter))]
         J = np.concatenate([w @ j for w, j in zip(W, jacobian, strict=True)])
         r = np.concatenate([w @ x for w, x in zip(W, e, strict=True)])
         R, Q = np.linalg.qr(J)[::-1]
