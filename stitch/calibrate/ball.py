@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from stitch.frames import Array
@@ -21,7 +22,7 @@ class Ball:
     centre: Array  # (k,)
     radius: float
     sigma: float  # robust sigma of the distances, length unit
-    keep: Array  # (N,) bool: the points of the circle or sphere
+    keep: NDArray[np.bool_]  # (N,) the points of the circle or sphere
     covariance: Array  # (k + 1, k + 1) of centre and radius, both free, from the points' sigma
 
 

@@ -77,13 +77,18 @@ def fit_sphere(
     feet = np.array([v.foot for v in views])
     state = _State(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
     # Distances from a circle of radius ρ are R/ρ times those from the sphere.
-    by_points = [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
+    by_points: list[Array] = [
+        np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views
+    ]
+    weights = by_points
     scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
     # The points' own sum has side minima for laser lines; the views' leads to the right one.
     for weighed in (True,) if by_views else (True, False):
         for _ in range(_ROUNDS):
             if weighed:
-                weights = [np.linalg.inv(V) for V in _covariances(views, _residuals(G, views, state)[1], scatter)]
+                weights = [
+                    np.asarray(np.linalg.inv(V)) for V in _covariances(views, _residuals(G, views, state)[1], scatter)
+                ]
             state = _solve(G, views, state, weights if weighed else by_points, n)
             e, jacobian, response = _linearise(G, views, state, n)
             newer = _scatter(views, e, jacobian, response, scatter)
@@ -113,7 +118,7 @@ def _statistics(
 
 
 def _distances(G: Array, points: Array, state: _State) -> Array:
-    return np.linalg.norm(frames.transform(G @ state.T_mount, points) - state.centre, axis=1) - state.radius
+    return np.asarray(np.linalg.norm(frames.transform(G @ state.T_mount, points) - state.centre, axis=1) - state.radius)
 
 
 def _residuals(G: Array, views: Sequence[SphereView], state: _State) -> tuple[list[Array], list[Array]]:
@@ -180,4 +185,5 @@ def _scatter(
     # Below a thousandth of the points' sigma a scatter is none.
     floor = np.log(1e-3 * np.median([v.sigma for v in views]))
     bounds = [(max(x - 2, floor), max(x + 2, floor + 1)) for x in start]
-    return np.exp(np.asarray(minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x))
+    found = minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x
+    return np.asarray(np.exp(found))

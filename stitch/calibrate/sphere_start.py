@@ -92,7 +92,7 @@ def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = N
     best: list[Start] = []
     for start in tried[:_REFINED]:
         for _ in range(6):
-            moved = _refine(G, views, start)
+            moved = refine_start(G, views, start)
             same = np.array_equal(moved.signs, start.signs)
             start = moved
             if same:
@@ -126,7 +126,7 @@ def choose_sides(G: Array, views: Sequence[SphereView], T_mount: Array, centre: 
     return np.where(said != 0, said, found)
 
 
-def _refine(G: Array, views: Sequence[SphereView], start: Start) -> Start:
+def refine_start(G: Array, views: Sequence[SphereView], start: Start) -> Start:
     """Hand-eye and centre together from the centres with the sides as they stand, then the sides anew."""
     q = centres(views, start.signs)
     soft = np.array([np.eye(3) - (1 - _trust(v)) * np.outer(v.normal, v.normal) for v in views])

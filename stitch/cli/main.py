@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 
 import typer
 
+from stitch.cli.calibrate import calibrate
 from stitch.cli.check import check
 from stitch.cli.run import run
 from stitch.errors import StitchError
@@ -23,6 +24,7 @@ def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app.command()(run)
     app.command()(check)
+    app.add_typer(calibrate, name="calibrate")
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app
