@@ -58,3 +58,19 @@ def build(seed, kind="line", turns=0.5, poses=12, pose_noise=0.05, noise=0.01, p
     shifts = rng.normal(0, pose_noise, (count, 3))
     clouds = [scan(q + X[:3, :3].T @ r.T @ d, rng, noise) for q, r, d in zip(seen, R, shifts, strict=True)]
     return SphereCell(X, centre, G, clouds)
+
+
+def write(cell, folder, mount="eye_in_hand", radius=RADIUS, extra=None):
+    """A session folder of the cell; `extra` is a column name and its values."""
+    (folder / "clouds").mkdir(parents=True)
+    (folder / "session.toml").write_text(
+        f'format = "stitch-session/1"\nname = "sphere"\nlength_unit = "mm"\nmount = "{mount}"\n[sphere]\nradius = {radius}\n'
+    )
+    T = cell.G if mount == "eye_in_hand" else frames.inverse(cell.G)
+    rows = ["view,cloud,x,y,z,qx,qy,qz,qw" + (f",{extra[0]}" if extra else "")]
+    for k, (pose, q, cloud) in enumerate(zip(T, frames.to_quaternion(T), cell.clouds, strict=True)):
+        np.savetxt(folder / "clouds" / f"v{k}.xyz", cloud, fmt="%.5f")
+        numbers = [f"{x:.12g}" for x in (*pose[:3, 3], *q)] + ([str(extra[1][k])] if extra else [])
+        rows.append(",".join([f"v{k}", f"clouds/v{k}.xyz", *numbers]))
+    (folder / "views.csv").write_text("\n".join(rows) + "\n")
+    return folder

@@ -34,14 +34,16 @@ def fit_ball(points: Array, radius: float | None = None) -> Ball:
     """
     thin = points[:: max(1, len(points) // _POINTS)]
     centre, found = _ransac(thin)
-    x = np.append(centre, radius or found) if radius is None else centre
-    scale = 0.02 * float(np.ptp(thin, axis=0).max())
-    for _ in range(3):
-        x = least_squares(_distances, x, args=(thin, radius), loss="soft_l1", f_scale=scale, x_scale="jac").x
-        scale = max(1.4826 * float(np.median(np.abs(_distances(x, thin, radius)))), 1e-9 * scale)
+    x = np.append(centre, found) if radius is None else centre
+    inside, scale = _distances(np.append(centre, found), thin, None), 0.02 * float(np.ptp(thin, axis=0).max())
+    gate = scale
+    for _ in range(4):
+        kept = thin[np.abs(inside) < gate]
+        x = least_squares(_distances, x, args=(kept, radius), loss="soft_l1", f_scale=scale, x_scale="jac").x
+        scale = max(1.4826 * float(np.median(np.abs(_distances(x, kept, radius)))), 1e-9 * scale)
+        inside, gate = _distances(x, thin, radius), _GATE * scale
     off = _distances(x, points, radius)
-    sigma = max(1.4826 * float(np.median(np.abs(off))), 1e-9 * scale)
-    k, keep = points.shape[1], np.abs(off) < _GATE * sigma
+    k, keep, sigma = points.shape[1], np.abs(off) < gate, scale
     outward = points[keep] - x[:k]
     rows = np.column_stack([outward / np.linalg.norm(outward, axis=1, keepdims=True), np.ones(len(outward))])
     covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
