@@ -52,7 +52,7 @@ def build(seed, kind="line", turns=0.5, poses=12, pose_noise=0.05, noise=0.01, p
     # Where the scanner is to see the centre; a line lies off the centre by a fifth to three fifths of the radius.
     seen = np.column_stack([rng.uniform(-15, 15, count), rng.uniform(0.2, 0.6, count) * RADIUS, rng.uniform(60, 90, count)])
     if kind == "area":
-        seen = rng.uniform(-15, 15, (count, 3)) + [0, 0, 100]
+        seen = rng.uniform(-15, 15, (count, 3)) + np.array([0, 0, 100])
     in_mount = seen @ X[:3, :3].T + X[:3, 3]
     G = frames.make(R, centre - (R @ in_mount[..., None])[..., 0])
     shifts = rng.normal(0, pose_noise, (count, 3))

@@ -36,7 +36,12 @@ class Refined:
 
 
 def refine_axzb(
-    A: Array, B: Array, sigma: tuple[float, float] | None = None, weights: Array | None = None, robust: bool = False
+    A: Array,
+    B: Array,
+    sigma: tuple[float, float] | None = None,
+    weights: Array | None = None,
+    robust: bool = False,
+    groups: Array | None = None,
 ) -> Refined:
     """X, Z of A·X = Z·B from Shah's start.
 
@@ -44,6 +49,8 @@ def refine_axzb(
         A, B: (V, 4, 4) poses.
         sigma: scatter of rotation (rad) and translation, if known; their ratio weighs the two.
         weights: (V,) on the squares of each view.
+        robust: Huber's loss, and scatters from medians.
+        groups: (V,) labels of views that may err together; the covariance then leaves out whole groups.
 
     Raises:
         NoResultError: poses that cannot show both; names the axis they share.
@@ -56,7 +63,7 @@ def refine_axzb(
         left, right = _inverse_jacobians(e)
         return e, np.concatenate([-left, right @ back], axis=2)
 
-    return _refine(linear, shah(A, B, weights), sigma, weights, robust)
+    return _refine(linear, shah(A, B, weights), sigma, weights, robust, groups)
 
 
 def refine_axxb(
@@ -88,7 +95,7 @@ def _inverse_jacobians(e: Array) -> tuple[Array, Array]:
 
 def _refine(
     linear: Callable[[tuple[Array, ...]], tuple[Array, Array]], start: tuple[Array, ...],
-    sigma: tuple[float, float] | None, weights: Array | None, robust: bool,
+    sigma: tuple[float, float] | None, weights: Array | None, robust: bool, groups: Array | None = None,
 ) -> Refined:  # fmt: skip
     """Gauss–Newton; every step whitens by the scatter of the residuals it starts from."""
     n, at = 6 * len(start), start
@@ -104,6 +111,9 @@ def _refine(
         at = _moved(at, xi)
     statistics = jackknife(information, gradient)
     heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(statistics.steps)])
+    if groups is not None:
+        member = groups == np.unique(groups)[:, None]
+        statistics = jackknife(np.tensordot(member, information, 1), member @ gradient)
     return Refined(at, statistics.covariance, statistics.inflation, e, heldout, (float(scatter[0]), float(scatter[1])))
 
 

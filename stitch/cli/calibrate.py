@@ -11,6 +11,8 @@ from rich.table import Table
 
 from stitch.calibrate.sphere import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
+from stitch.calibrate.tracker import calibrate_tracker
+from stitch.calibrate.tracker import document_of as tracker_document
 from stitch.session import load_session
 
 calibrate = typer.Typer(
@@ -41,6 +43,24 @@ def sphere(
             f"{document['rms']:.4f} {unit} rms, noise within a scan {document['point_sigma']:.4f}",
         ),
         ("start", document["start"]),
+    ]
+    show(document, facts)
+
+
+@calibrate.command()
+def tracker(session: _SESSION, as_json: _JSON = False) -> None:
+    """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board."""
+    loaded = load_session(session)
+    document = tracker_document(calibrate_tracker(loaded), loaded)
+    if as_json:
+        print(json.dumps(document, indent=1))
+        return
+    unit, other, heldout = document["length_unit"], document["other"], document["heldout_position_error"]
+    facts = [
+        (other["name"], f"{_row(np.array(other['transform'])[:3, 3])} ± {_row(other['sigma'][3:])} {unit}"),
+        ("views", f"{document['views']}, turned by up to {document['turned_deg']:.0f}°"),
+        ("position error", f"{heldout['mean']:.4g} {unit} mean of views left out, at most {heldout['max']:.4g}"),
+        ("rotation error", f"{document['heldout_rotation_error_deg']['mean']:.4f} ° mean of views left out"),
     ]
     show(document, facts)
 
