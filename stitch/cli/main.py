@@ -11,6 +11,7 @@ import typer
 
 from stitch.cli.calibrate import calibrate
 from stitch.cli.check import check
+from stitch.cli.import_file import import_command
 from stitch.cli.run import run
 from stitch.errors import StitchError
 
@@ -24,6 +25,7 @@ def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app.command()(run)
     app.command()(check)
+    app.command("import")(import_command)
     app.add_typer(calibrate, name="calibrate")
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
