@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from stitch.controllers.importer import import_file
+from stitch.errors import InputError
 
 
 def import_command(
@@ -28,6 +29,8 @@ def import_command(
     ] = None,
 ) -> None:
     """Write the points of a robot program or of a tracker as views.csv (frames.csv, points.csv)."""
+    if output is not None and output.exists():
+        raise InputError(f"{output}: exists already; name another file, or remove it")
     imported = import_file(file, unit, frame, tool)
     if output is None:
         print(imported.text, end="")

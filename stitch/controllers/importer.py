@@ -87,7 +87,8 @@ def _given(pose: Callable[[Array], Array], name: str, value: str | None) -> Arra
         return pose(numbers)
     except (ValueError, IndexError) as error:
         mend = f"write {'7' if pose is abb.pose else '6'} numbers with commas, as the controller shows the pose"
-        raise InputError(f"--{name} {value}: {error or mend}") from None
+        reason = f" ({error})" if str(error) else ""
+        raise InputError(f"--{name} {value}: {mend}{reason}") from None
 
 
 def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool: str | None) -> tuple[str, ...]:
