@@ -50,7 +50,9 @@ def build(seed, kind="line", turns=0.5, poses=12, pose_noise=0.05, noise=0.01, p
     count, scan = len(spins), line if kind == "line" else area
     R = (base * Rotation.from_rotvec(spins)).as_matrix()
     # Where the scanner is to see the centre; a line lies off the centre by a fifth to three fifths of the radius.
-    seen = np.column_stack([rng.uniform(-15, 15, count), rng.uniform(0.2, 0.6, count) * RADIUS, rng.uniform(60, 90, count)])
+    seen = np.column_stack(
+        [rng.uniform(-15, 15, count), rng.uniform(0.2, 0.6, count) * RADIUS, rng.uniform(60, 90, count)]
+    )
     if kind == "area":
         seen = rng.uniform(-15, 15, (count, 3)) + np.array([0, 0, 100])
     in_mount = seen @ X[:3, :3].T + X[:3, 3]

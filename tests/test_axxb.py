@@ -118,7 +118,9 @@ def test_hand_eye_that_is_itself_a_half_turn(name):
 
 def test_two_half_turns_that_fit_two_hand_eyes_are_refused():
     """Half turns about two lines that meet: turning the scanner about their common normal changes nothing."""
-    A = np.array([frames.exp(np.array([np.pi, 0, 0, 0, 0, 0.0])), frames.exp(np.array([0, np.pi * 0.6, np.pi * 0.8, 0, 0, 0]))])
+    A = np.array(
+        [frames.exp(np.array([np.pi, 0, 0, 0, 0, 0.0])), frames.exp(np.array([0, np.pi * 0.6, np.pi * 0.8, 0, 0, 0]))]
+    )
     with pytest.raises(NoResultError, match="half turns"):
         SOLVERS["Park-Martin"](A, A)
 

@@ -105,13 +105,19 @@ def rows(tmp_path, name, text, **options):
     views.write_text(imported.text)
     robot = None
     if "j1_deg" in imported.text:
-        robot = robot_from_dh("r", "standard", [{"a": 0, "alpha_deg": 90, "d": 100, "theta_deg": 0}] * 6, None, np.zeros(3), "mm")
+        robot = robot_from_dh(
+            "r", "standard", [{"a": 0, "alpha_deg": 90, "d": 100, "theta_deg": 0}] * 6, None, np.zeros(3), "mm"
+        )
     return {row.name: row for row in read_views(views, robot)}, imported
 
 
 def test_orientations_by_hand():
-    assert fixed_xyz(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(about("z", 30) @ about("y", 20) @ about("x", 10))
-    assert zyx(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(about("z", 10) @ about("y", 20) @ about("x", 30))
+    assert fixed_xyz(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(
+        about("z", 30) @ about("y", 20) @ about("x", 10)
+    )
+    assert zyx(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(
+        about("z", 10) @ about("y", 20) @ about("x", 30)
+    )
     half = np.sqrt(0.5)
     assert quaternion_w_first(np.array([0, 0, 0, half, 0, half, 0]))[:3, :3] == pytest.approx(about("y", 90))
     turn = rotation_vector(np.array([0.1, 0, 0, 0, 0, np.pi / 2]))
@@ -131,7 +137,9 @@ def test_fanuc(tmp_path):
 
 def test_frame_and_tool_lead_to_the_flange(tmp_path):
     views, imported = rows(tmp_path, "S.ls", FANUC, frame="1000,0,0,0,0,90", tool="0,0,150,0,0,0")
-    taught = frames.make(about("z", 20.366) @ about("y", -0.087) @ about("x", -179.111), np.array([-195.8, 1363.305, 524.812]))
+    taught = frames.make(
+        about("z", 20.366) @ about("y", -0.087) @ about("x", -179.111), np.array([-195.8, 1363.305, 524.812])
+    )
     frame, tool = frames.make(about("z", 90), np.array([1000.0, 0, 0])), frames.make(np.eye(3), np.array([0, 0, 150.0]))
     assert views["above"].T_base_flange == pytest.approx(frame @ taught @ np.linalg.inv(tool), abs=1e-5)
     assert imported.warnings == ()
@@ -153,7 +161,9 @@ def test_kuka(tmp_path):
 def test_abb(tmp_path):
     views, imported = rows(tmp_path, "Scan.mod", ABB, unit="mm")
     assert list(views) == ["p10", "p20", "home", "many_1", "many_2", "line10", "line11"]
-    assert views["p10"].T_base_flange == pytest.approx(frames.make(about("y", 90), np.array([600, -5.5, 800.0])), abs=1e-5)
+    assert views["p10"].T_base_flange == pytest.approx(
+        frames.make(about("y", 90), np.array([600, -5.5, 800.0])), abs=1e-5
+    )
     assert views["p20"].T_base_flange[:3, :3] == pytest.approx(about("x", 30), abs=1e-5)
     assert np.degrees(views["home"].joints) == pytest.approx([0, 10, -20, 30, -40, 50])
     assert np.degrees(views["line10"].joints) == pytest.approx([1, 2, 3, 4, 5, 6])
@@ -184,12 +194,14 @@ def test_ur_recording_in_metres(tmp_path):
 
 def test_tracker_probe_with_decimal_commas(tmp_path):
     file = tmp_path / "tmac.csv"
-    file.write_text('Name;X [m];Y [m];Z [m];Q0;Q1;Q2;Q3\nm1;1,5;-2,25;0,125;0,7071068;0;0,7071068;0\n')
+    file.write_text("Name;X [m];Y [m];Z [m];Q0;Q1;Q2;Q3\nm1;1,5;-2,25;0,125;0,7071068;0;0,7071068;0\n")
     imported = import_file(file)
     row = next(csv.DictReader(io.StringIO(imported.text)))
     assert imported.table == "frames.csv"
     assert [float(row[c]) for c in ("x", "y", "z")] == pytest.approx([1500, -2250, 125])
-    assert [float(row[c]) for c in ("qx", "qy", "qz", "qw")] == pytest.approx([0, np.sqrt(0.5), 0, np.sqrt(0.5)], abs=1e-7)
+    assert [float(row[c]) for c in ("qx", "qy", "qz", "qw")] == pytest.approx(
+        [0, np.sqrt(0.5), 0, np.sqrt(0.5)], abs=1e-7
+    )
 
 
 def test_tracker_angles_and_reflectors(tmp_path):

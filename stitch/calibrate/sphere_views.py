@@ -20,6 +20,8 @@ _FLAT = 1e-3
 # A circle may come out larger than the sphere by noise, not by this share.
 _TOO_LARGE = 0.05
 _FEWEST = 20
+# A surface whose own radius is this much off the sphere's is something else.
+_OTHER = 0.2
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
     _U, s, Vt = np.linalg.svd(points - middle, full_matrices=False)
     if s[2] > _FLAT * s[0]:
         return _area(name, points, radius)
-    circle = fit_ball((points - middle) @ Vt[:2].T)
+    circle = fit_ball((points - middle) @ Vt[:2].T, radius)
     if circle.radius > (1 + _TOO_LARGE) * radius:
         raise InputError(
             f"view {name}: the line is a circle of radius {circle.radius:.4g}, larger than the sphere's {radius:.4g}; "
@@ -68,9 +70,14 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
 
 def _area(name: str, points: Array, radius: float) -> SphereView:
     """The centre with the known radius starts the search; centre and radius, both free, are what is measured."""
-    known = fit_ball(points, radius)
+    known = fit_ball(points, radius, known=True)
     kept = points[known.keep]
-    free = fit_ball(kept)
+    free = fit_ball(kept, radius) if len(kept) >= _FEWEST else known
+    if len(kept) < _FEWEST or not 1 - _OTHER < free.radius / radius < 1 + _OTHER:
+        raise InputError(
+            f"view {name}: no sphere of radius {radius:.4g} among its points (the best has {free.radius:.4g}); check "
+            "sphere.radius in session.toml and cloud_unit, or leave the view out"
+        )
     return SphereView(
         name, kept, int((~known.keep).sum()), known.centre, np.zeros(3), 0.0, free.sigma, 0.0,
         np.eye(3), np.append(free.centre, free.radius), free.covariance,
