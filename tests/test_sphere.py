@@ -45,7 +45,7 @@ def test_real_laser_lines(shared_data):
 @pytest.mark.parametrize("kind", ["line", "area"])
 def test_error_is_that_of_the_covariance(kind, by_views):
     errors, predicted = [], []
-    for seed in range(16):
+    for seed in range(10):
         cell = build(seed, kind)
         fit = fit_sphere(cell.G, views_of(cell), cell.T_mount, RADIUS, by_views=by_views)
         errors.append(twist(cell, fit.T_mount))

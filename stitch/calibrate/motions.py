@@ -46,9 +46,14 @@ def require_motion(A: Array) -> None:
         )
 
 
+def roots(A: Array, weights: Array | None) -> Array:
+    """Square roots (M,) of the weights of the motions, ones without weights."""
+    return np.ones(len(A)) if weights is None else np.sqrt(np.asarray(weights, float))
+
+
 def translation(A: Array, B: Array, R: Array, weights: Array | None = None) -> Array:
     """t (3,) of X from (R_A − 1) t = R t_B − t_A, weighted least squares over all motions."""
-    root = np.ones((len(A), 1)) if weights is None else np.sqrt(weights)[:, None]
+    root = roots(A, weights)[:, None]
     left = (root[..., None] * (A[:, :3, :3] - np.eye(3))).reshape(-1, 3)
     right = (root * (B[:, :3, 3] @ R.T - A[:, :3, 3])).reshape(-1)
     return np.asarray(np.linalg.lstsq(left, right, rcond=None)[0])

@@ -14,10 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
 from stitch import frames
 from stitch.calibrate.jackknife import Jackknife, jackknife
+from stitch.calibrate.sphere_scatter import covariances, find_scatter
 from stitch.calibrate.sphere_views import SphereView
 from stitch.errors import NoResultError
 from stitch.frames import Array
@@ -87,16 +88,16 @@ def fit_sphere(
         for _ in range(_ROUNDS):
             if weighed:
                 weights = [
-                    np.asarray(np.linalg.inv(V)) for V in _covariances(views, _residuals(G, views, state)[1], scatter)
+                    np.asarray(np.linalg.inv(V)) for V in covariances(views, _residuals(G, views, state)[1], scatter)
                 ]
             state = _solve(G, views, state, weights if weighed else by_points, n)
             e, jacobian, response = _linearise(G, views, state, n)
-            newer = _scatter(views, e, jacobian, response, scatter)
+            newer = find_scatter(views, e, jacobian, response, scatter)
             change, scatter = float(np.abs(np.log(newer / scatter)).max()), newer
             if change < _SMALL:
                 break
     weights = weights if by_views else by_points
-    statistics = _statistics(e, jacobian, weights, _covariances(views, response, scatter))
+    statistics = _statistics(e, jacobian, weights, covariances(views, response, scatter))
     off = [_distances(G[v], view.points, state) for v, view in enumerate(views)]
     return SphereFit(
         state.T_mount, state.centre, state.radius, statistics.covariance, statistics.inflation, scatter,
@@ -137,16 +138,6 @@ def _residuals(G: Array, views: Sequence[SphereView], state: _State) -> tuple[li
     return out, response
 
 
-def _covariances(views: Sequence[SphereView], response: Sequence[Array], scatter: Array) -> list[Array]:
-    """Covariance of each view's circle or sphere: common error of the points, shift, apparent radius."""
-    out = []
-    for view, S in zip(views, response, strict=True):
-        covariance = view.covariance * (1 + (scatter[2] / view.sigma) ** 2) + scatter[0] ** 2 * S @ S.T
-        covariance[-1, -1] += scatter[1] ** 2
-        out.append(covariance)
-    return out
-
-
 def _solve(G: Array, views: Sequence[SphereView], state: _State, weights: Sequence[Array], n: int) -> _State:
     W = [np.linalg.cholesky(w).T for w in weights]
 
@@ -166,24 +157,3 @@ def _linearise(
         np.column_stack([(plus[v] - minus[v]) / (2 * _STEP) for plus, minus in sides]) for v in range(len(views))
     ]
     return e, jacobian, response
-
-
-def _scatter(
-    views: Sequence[SphereView], e: Sequence[Array], jacobian: Sequence[Array], response: Sequence[Array], last: Array
-) -> Array:
-    """(σ_p, σ_ρ, σ_c) of the largest restricted likelihood of the linear model."""
-
-    def cost(log_scatter: Array) -> float:
-        W = [np.linalg.inv(np.linalg.cholesky(V)) for V in _covariances(views, response, np.exp(log_scatter))]
-        J = np.concatenate([w @ j for w, j in zip(W, jacobian, strict=True)])
-        r = np.concatenate([w @ x for w, x in zip(W, e, strict=True)])
-        R, Q = np.linalg.qr(J)[::-1]
-        spread = -sum(np.log(np.diag(w)).sum() for w in W)
-        return float(2 * spread + 2 * np.log(np.abs(np.diag(R))).sum() + r @ r - np.sum((Q.T @ r) ** 2))
-
-    start = np.log(last)
-    # Below a thousandth of the points' sigma a scatter is none.
-    floor = np.log(1e-3 * np.median([v.sigma for v in views]))
-    bounds = [(max(x - 2, floor), max(x + 2, floor + 1)) for x in start]
-    found = minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x
-    return np.asarray(np.exp(found))

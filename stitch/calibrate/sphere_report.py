@@ -38,8 +38,9 @@ def notes_of(result: SphereCalibration, unit: str) -> list[str]:
         notes.append(f"Weak: {'; '.join(weak)}")
     if np.median(fit.view_rms) > _BEYOND_NOISE * fit.point_sigma:
         low, high = np.percentile(fit.view_rms, [10, 90])
+        noise = "profile noise" if any(v.normal.any() for v in result.views) else "the scanner's noise"
         notes.append(
-            f"{low:#.2g} to {high:#.2g} {unit} per pose (at most {fit.view_rms.max():#.2g}) cannot be profile noise "
+            f"{low:#.2g} to {high:#.2g} {unit} per pose (at most {fit.view_rms.max():#.2g}) cannot be {noise} "
             f"({fit.point_sigma:#.2g} {unit}): it comes once per pose, from the robot's poses or the scanner's "
             "calibration, and more points per scan will not reduce it"
         )

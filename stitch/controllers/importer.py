@@ -1,9 +1,7 @@
 """A controller's or tracker's file -> the text of views.csv, frames.csv or points.csv."""
 
-import csv
-import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -12,12 +10,12 @@ import numpy as np
 
 from stitch import frames
 from stitch.controllers import abb, fanuc, kuka, tracker_csv, universal
+from stitch.controllers.tables import POSE, csv_text, pose_cells, unique, view_rows
 from stitch.controllers.taught import Taught
 from stitch.controllers.tracker_csv import Measured
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _READERS: dict[str, ModuleType] = {
     ".ls": fanuc, ".dat": kuka, ".src": kuka, ".mod": abb, ".script": universal, ".csv": universal,
 }  # fmt: skip
@@ -67,8 +65,8 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
     T_base_frame, T_flange_tool = (
         _given(reader.pose, name, value) for name, value in (("frame", frame), ("tool", tool))
     )
-    rows = _view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _SCALE[unit])
-    return Imported("views.csv", _csv(rows), len(points), reader.CONVENTION, warnings)
+    rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _SCALE[unit])
+    return Imported("views.csv", csv_text(rows), len(points), reader.CONVENTION, warnings)
 
 
 def _recording(text: str) -> bool:
@@ -111,25 +109,6 @@ def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool:
     return ()
 
 
-def _view_rows(points: Sequence[Taught], T_base_frame: Array, T_tool_flange: Array, scale: float) -> list[list[str]]:
-    joints = max((len(p.joints) for p in points if p.joints is not None), default=0)
-    posed = any(p.T_frame_tool is not None for p in points)
-    rows = [["view", *(f"j{i + 1}_deg" for i in range(joints)), *(_POSE if posed else ())]]
-    for name, point in zip(_unique(p.name for p in points), points, strict=True):
-        row = [name]
-        if joints:
-            row += [""] * joints if point.joints is None else [f"{q:.9g}" for q in np.degrees(point.joints)]
-        if posed:
-            T = None if point.T_frame_tool is None else T_base_frame @ point.T_frame_tool @ T_tool_flange
-            row += [""] * len(_POSE) if T is None else _pose_cells(T, scale)
-        rows.append(row)
-    return rows
-
-
-def _pose_cells(T: Array, scale: float) -> list[str]:
-    return [*(f"{x * scale:.9g}" for x in T[:3, 3]), *(f"{q:.10f}" for q in frames.to_quaternion(T))]
-
-
 def _tracker(file: Path, text: str, unit: str) -> Imported:
     """frames.csv from 6D probes; points.csv from reflectors, a new view whenever a name comes again."""
     measured: list[Measured] = tracker_csv.read(file, text)
@@ -138,9 +117,9 @@ def _tracker(file: Path, text: str, unit: str) -> Imported:
     scale = _SCALE[unit]
     poses = [m.T_sensor_probe for m in measured if m.T_sensor_probe is not None]
     if poses:
-        rows = [["view", *_POSE]]
-        rows += [[n, *_pose_cells(T, scale)] for n, T in zip(_unique(m.name for m in measured), poses, strict=True)]
-        return Imported("frames.csv", _csv(rows), len(measured), tracker_csv.CONVENTION, ())
+        rows = [["view", *POSE]]
+        rows += [[n, *pose_cells(T, scale)] for n, T in zip(unique(m.name for m in measured), poses, strict=True)]
+        return Imported("frames.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, ())
     rows, seen = [["view", "target", "x", "y", "z"]], Counter[str]()
     for m in measured:
         seen[m.name] += 1
@@ -148,25 +127,4 @@ def _tracker(file: Path, text: str, unit: str) -> Imported:
     note = (
         "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
     )
-    return Imported("points.csv", _csv(rows), len(measured), tracker_csv.CONVENTION, (note,))
-
-
-def _unique(names: Iterable[str]) -> list[str]:
-    """The names, numbered from the second on where one stands again."""
-    out: list[str] = []
-    taken: set[str] = set()
-    for name in names:
-        plain, k = name.strip() or "view", 1
-        label = plain
-        while label in taken:
-            k += 1
-            label = f"{plain}_{k}"
-        taken.add(label)
-        out.append(label)
-    return out
-
-
-def _csv(rows: Sequence[Sequence[str]]) -> str:
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows(rows)
-    return stream.getvalue()
+    return Imported("points.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, (note,))
