@@ -62,17 +62,18 @@ def build(seed, kind="line", turns=0.5, poses=12, pose_noise=0.05, noise=0.01, p
     return SphereCell(X, centre, G, clouds)
 
 
-def write(cell, folder, mount="eye_in_hand", radius=RADIUS, extra=None):
+def write(cell, folder, mount="eye_in_hand", radius=RADIUS, extra=None, unit="mm"):
     """A session folder of the cell; `extra` is a column name and its values."""
     (folder / "clouds").mkdir(parents=True)
+    per = 1000.0 if unit == "m" else 1.0
     (folder / "session.toml").write_text(
-        f'format = "stitch-session/1"\nname = "sphere"\nlength_unit = "mm"\nmount = "{mount}"\n[sphere]\nradius = {radius}\n'
+        f'format = "stitch-session/1"\nname = "sphere"\nlength_unit = "{unit}"\nmount = "{mount}"\n[sphere]\nradius = {radius / per}\n'
     )
     T = cell.G if mount == "eye_in_hand" else frames.inverse(cell.G)
     rows = ["view,cloud,x,y,z,qx,qy,qz,qw" + (f",{extra[0]}" if extra else "")]
     for k, (pose, q, cloud) in enumerate(zip(T, frames.to_quaternion(T), cell.clouds, strict=True)):
-        np.savetxt(folder / "clouds" / f"v{k}.xyz", cloud, fmt="%.5f")
-        numbers = [f"{x:.12g}" for x in (*pose[:3, 3], *q)] + ([str(extra[1][k])] if extra else [])
+        np.savetxt(folder / "clouds" / f"v{k}.xyz", cloud / per, fmt="%.9g")
+        numbers = [f"{x:.12g}" for x in (*pose[:3, 3] / per, *q)] + ([str(extra[1][k])] if extra else [])
         rows.append(",".join([f"v{k}", f"clouds/v{k}.xyz", *numbers]))
     (folder / "views.csv").write_text("\n".join(rows) + "\n")
     return folder

@@ -73,8 +73,7 @@ def test_two_hundred_hand_eyes_no_worse_than_opencv():
     for seed in range(200):
         X, Z, A, B = cell(seed, noise=1.0)
         views.append(error(X, refine_axzb(A, B).transforms[0]))
-        if seed < 100:
-            pairs.append(error(X, refine_axxb(*motions_of(A, B)).transforms[0]))
+        pairs.append(error(X, refine_axxb(*motions_of(A, B)).transforms[0]))
         target = frames.inverse(B)
         for name in names:
             R, t = cv2.calibrateHandEye(
@@ -83,7 +82,7 @@ def test_two_hundred_hand_eyes_no_worse_than_opencv():
             )  # fmt: skip
             theirs[name].append(error(X, frames.make(R, t.ravel())))
     assert rms(views) <= min(rms(errors) for errors in theirs.values())
-    assert rms(pairs) <= 1.05 * min(rms(errors[:100]) for errors in theirs.values())
+    assert rms(pairs) <= min(rms(errors) for errors in theirs.values())
 
 
 @pytest.mark.parametrize("robust", [False, True])

@@ -116,6 +116,19 @@ def test_command_on_both_mounts(mount, tmp_path, capsys, monkeypatch):
     assert document["mount"] == mount and len(document["views"]) == len(cell.G)
 
 
+def test_metres_give_what_millimetres_give(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+    cell = build(6, "line", turns=0.6)
+    found = [calibrate_sphere(load_session(write(cell, tmp_path / unit, unit=unit))).fit for unit in ("mm", "m")]
+    scale = np.array([1.0] * 3 + [1000.0] * 6)
+    assert found[1].T_mount[:3, 3] * 1000 == pytest.approx(found[0].T_mount[:3, 3], abs=0.002)
+    sigma = [np.sqrt(np.diag(fit.covariance)) for fit in found]
+    assert sigma[1] * scale == pytest.approx(sigma[0], rel=0.05)
+    with pytest.raises(SystemExit):
+        cli.main(["calibrate", "sphere", str(tmp_path / "m")])
+    assert " m rms" in capsys.readouterr().err
+
+
 def test_sides_given_by_the_session_lead_to_the_decoupled_start(tmp_path):
     cell = build(8, "line", pause=4, turns=0.6)
     normal = np.array([arc_normal(cloud, np.array([0.0, 1, 0])) @ [0, 1, 0] for cloud in cell.clouds])

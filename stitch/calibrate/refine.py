@@ -71,6 +71,9 @@ def refine_axxb(
 ) -> Refined:
     """X of A·X = X·B from Park and Martin's start; arguments as in `refine_axzb`, motions for poses.
 
+    The covariance takes the motions as independent. Motions between all pairs of views are not: where the
+    views' own poses are known, `refine_axzb` uses each of them once.
+
     Raises:
         NoResultError: motions that cannot show X; names the axis they share.
     """

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from stitch import frames
+from stitch.calibrate.motions import axis_spread
 from stitch.calibrate.sphere import SphereCalibration
-from stitch.calibrate.weak import hardly_turned, weak_components
+from stitch.calibrate.weak import hardly_turned, turned, weak_components
 from stitch.session import Session
 
 # A view's points are off by more than their noise beyond this ratio.
@@ -86,7 +87,9 @@ def document_of(result: SphereCalibration, session: Session) -> dict[str, Any]:
                    "free_sigma": float(np.sqrt(free.covariance[9, 9])) if free else None},
         "rms": fit.rms, "point_sigma": fit.point_sigma,
         "scatter_of_views": dict(zip(("shift", "apparent_radius", "common"), fit.scatter.tolist(), strict=True)),
-        "start": result.start, "sides_from_consistency": result.sides_found,
+        "start": result.start, "turned_deg": float(np.degrees(turned(result.G))),
+        "axis_spread": axis_spread(frames.inverse(result.G[:1]) @ result.G[1:]).tolist(),
+        "sides_from_consistency": result.sides_found,
         "runner_up_ratio": result.runner_up if np.isfinite(result.runner_up) else None,
         "decoupled": None if result.T_decoupled is None else result.T_decoupled.tolist(),
         "weighed_by_views": {"hand_eye": result.by_views.T_mount.tolist(),

@@ -14,6 +14,7 @@ from scipy.cluster.vq import kmeans2
 from stitch import frames
 from stitch.calibrate.axxb import park_martin
 from stitch.calibrate.axzb import shah
+from stitch.calibrate.motions import axis_spread
 from stitch.calibrate.refine import Refined, refine_axzb
 from stitch.calibrate.weak import hardly_turned, turned, weak_components
 from stitch.errors import NoResultError
@@ -99,7 +100,9 @@ def document_of(result: TrackerCalibration, session: Session) -> dict[str, Any]:
         "heldout_position_error": _sizes(fit.heldout[:, 3:]),
         "heldout_rotation_error_deg": _sizes(np.degrees(fit.heldout[:, :3])),
         "scatter": {"rotation": fit.sigma[0], "translation": fit.sigma[1]},
-        "turned_deg": float(np.degrees(turned(result.A))), "closed_forms": closed_forms(result),
+        "turned_deg": float(np.degrees(turned(result.A))),
+        "axis_spread": axis_spread(frames.inverse(result.A[:1]) @ result.A[1:]).tolist(),
+        "closed_forms": closed_forms(result),
         "weak": _weak(result, session.length_unit), "notes": notes_of(result, session),
     }  # fmt: skip
 

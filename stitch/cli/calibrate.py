@@ -36,11 +36,11 @@ def sphere(
         return
     unit, radius = document["length_unit"], document["radius"]
     facts = [
-        ("sphere's centre", f"{_row(document['centre'])} ± {_row(document['centre_sigma'])} {unit}"),
-        ("radius", f"{radius['used']:.4f} {unit}"),
+        ("sphere's centre", f"{_row(document['centre'], unit)} ± {_row(document['centre_sigma'], unit)} {unit}"),
+        ("radius", f"{radius['used']:.6g} {unit}"),
         (
             "points from the sphere",
-            f"{document['rms']:.4f} {unit} rms, noise within a scan {document['point_sigma']:.4f}",
+            f"{document['rms']:#.3g} {unit} rms, noise within a scan {document['point_sigma']:#.3g}",
         ),
         ("start", document["start"]),
     ]
@@ -57,7 +57,7 @@ def tracker(session: _SESSION, as_json: _JSON = False) -> None:
         return
     unit, other, heldout = document["length_unit"], document["other"], document["heldout_position_error"]
     facts = [
-        (other["name"], f"{_row(np.array(other['transform'])[:3, 3])} ± {_row(other['sigma'][3:])} {unit}"),
+        (other["name"], f"{_row(np.array(other['transform'])[:3, 3], unit)} ± {_row(other['sigma'][3:], unit)} {unit}"),
         ("views", f"{document['views']}, turned by up to {document['turned_deg']:.0f}°"),
         ("position error", f"{heldout['mean']:.4g} {unit} mean of views left out, at most {heldout['max']:.4g}"),
         ("rotation error", f"{document['heldout_rotation_error_deg']['mean']:.4f} ° mean of views left out"),
@@ -82,12 +82,14 @@ def hand_eye_rows(document: dict[str, Any], unit: str) -> list[tuple[str, str]]:
     T = np.array(document["hand_eye"])
     sigma = np.array(document["hand_eye_sigma"])
     return [
-        ("translation", f"{_row(T[:3, 3])} ± {_row(document['translation_sigma_mount'])} {unit}"),
+        ("translation", f"{_row(T[:3, 3], unit)} ± {_row(document['translation_sigma_mount'], unit)} {unit}"),
         ("rotation", "\n".join(" ".join(f"{x:+.6f}" for x in row) for row in T[:3, :3])),
         ("sigma of rotation", f"{_row(np.degrees(sigma[:3]))} ° about scanner x, y, z"),
-        ("sigma of translation", f"{_row(sigma[3:])} {unit} along scanner x, y, z"),
+        ("sigma of translation", f"{_row(sigma[3:], unit)} {unit} along scanner x, y, z"),
     ]
 
 
-def _row(values: Any) -> str:
-    return ", ".join(f"{x:.3f}" for x in values)
+def _row(values: Any, unit: str = "mm") -> str:
+    """Numbers to a micrometre, or to a thousandth of a degree."""
+    digits = 6 if unit == "m" else 3
+    return ", ".join(f"{x:.{digits}f}" for x in values)
