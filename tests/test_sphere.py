@@ -129,6 +129,18 @@ def test_metres_give_what_millimetres_give(tmp_path, capsys, monkeypatch):
     assert " m rms" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", ["line", "area"])
+def test_a_wrong_pose_is_named_and_hardly_counts(kind, tmp_path):
+    for seed in range(3):
+        cell = build(seed, kind, turns=0.6)
+        cell.G[5, :3, 3] += [3.0, -4.0, 2.0]
+        result = calibrate_sphere(session := load_session(write(cell, tmp_path / f"s{seed}")))
+        notes = [note for note in document_of(result, session)["notes"] if note.startswith("View")]
+        assert [note.split()[1] for note in notes] == ["v5"] and "contradicts" in notes[0]
+        assert np.abs(twist(cell, result.fit.T_mount) / np.sqrt(np.diag(result.fit.covariance))[:6]).max() < 4
+        assert np.linalg.norm(twist(cell, result.fit.T_mount)[3:]) < 2.0
+
+
 def test_sides_given_by_the_session_lead_to_the_decoupled_start(tmp_path):
     cell = build(8, "line", pause=4, turns=0.6)
     normal = np.array([arc_normal(cloud, np.array([0.0, 1, 0])) @ [0, 1, 0] for cloud in cell.clouds])

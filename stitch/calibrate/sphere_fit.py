@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 from stitch import frames
 from stitch.calibrate.jackknife import Jackknife, jackknife
-from stitch.calibrate.sphere_scatter import covariances, find_scatter
+from stitch.calibrate.sphere_scatter import covariances, find_scatter, find_shares
 from stitch.calibrate.sphere_views import SphereView
 from stitch.errors import NoResultError
 from stitch.frames import Array
@@ -44,6 +44,7 @@ class SphereFit:
     rms: float  # of all points' distances from the one sphere
     view_rms: Array  # (V,) the same by view
     left_out: Array  # (V, 9 or 10) change of the parameters without each view
+    shares: Array  # (V,) how much each view counts: below 1 where it contradicts the others
 
 
 @dataclass(frozen=True)
@@ -81,28 +82,29 @@ def fit_sphere(
     by_points: list[Array] = [
         np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views
     ]
-    weights = by_points
+    weights, shares = by_points, np.ones(len(views))
     scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
     # The points' own sum has side minima for laser lines; the views' leads to the right one.
     for weighed in (True,) if by_views else (True, False):
         for _ in range(_ROUNDS):
-            if weighed:
-                weights = [
-                    np.asarray(np.linalg.inv(V)) for V in covariances(views, _residuals(G, views, state)[1], scatter)
-                ]
-            state = _solve(G, views, state, weights if weighed else by_points, n)
+            response = _residuals(G, views, state)[1]
+            weights = [np.asarray(np.linalg.inv(V)) for V in covariances(views, response, scatter, shares)]
+            if not weighed:
+                weights = [w * share for w, share in zip(by_points, shares, strict=True)]
+            state = _solve(G, views, state, weights, n)
             e, jacobian, response = _linearise(G, views, state, n)
-            newer = find_scatter(views, e, jacobian, response, scatter)
+            if weighed:
+                shares = find_shares(e, covariances(views, response, scatter, np.ones(len(views))))
+            newer = find_scatter(views, e, jacobian, response, scatter, shares)
             change, scatter = float(np.abs(np.log(newer / scatter)).max()), newer
             if change < _SMALL:
                 break
-    weights = weights if by_views else by_points
-    statistics = _statistics(e, jacobian, weights, covariances(views, response, scatter))
+    statistics = _statistics(e, jacobian, weights, covariances(views, response, scatter, shares))
     off = [_distances(G[v], view.points, state) for v, view in enumerate(views)]
     return SphereFit(
         state.T_mount, state.centre, state.radius, statistics.covariance, statistics.inflation, scatter,
         float(np.median([v.sigma for v in views])), float(np.sqrt(np.mean(np.concatenate(off) ** 2))),
-        np.array([np.sqrt(np.mean(d**2)) for d in off]), statistics.steps,
+        np.array([np.sqrt(np.mean(d**2)) for d in off]), statistics.steps, shares,
     )  # fmt: skip
 
 

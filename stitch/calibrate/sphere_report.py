@@ -13,6 +13,8 @@ from stitch.session import Session
 # A view's points are off by more than their noise beyond this ratio.
 _BEYOND_NOISE = 3.0
 _SURE = 3.0
+# A view that counts less than this is named.
+_DOUBTED = 0.5
 
 
 def weak_of(result: SphereCalibration, unit: str) -> list[str]:
@@ -47,8 +49,13 @@ def notes_of(result: SphereCalibration, unit: str) -> list[str]:
         )
     notes += _radius_note(result, unit)
     sigma = np.sqrt(np.diag(fit.covariance))
-    for view, step in zip(result.views, fit.left_out, strict=True):
-        if np.abs(step[:6] / sigma[:6]).max() > _SURE:
+    for view, step, share, rms in zip(result.views, fit.left_out, fit.shares, fit.view_rms, strict=True):
+        if share < _DOUBTED:
+            notes.append(
+                f"View {view.name} contradicts the others ({rms:#.2g} {unit} from the sphere) and counts {share:.2g}; "
+                "check its pose, or scan it again"
+            )
+        elif np.abs(step[:6] / sigma[:6]).max() > _SURE:
             notes.append(f"View {view.name} alone moves the answer by more than {_SURE:g} sigma; scan it again")
     return notes
 
