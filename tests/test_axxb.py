@@ -36,11 +36,11 @@ def test_exact_without_noise(name):
     [("Tsai-Lenz", "TSAI"), ("Park-Martin", "PARK"), ("Horaud-Dornaika", "HORAUD"), ("Andreff", "ANDREFF"),
      ("Daniilidis", "DANIILIDIS")],
 )  # fmt: skip
-def test_error_under_noise_is_that_of_opencv(name, flag):
-    """Not the same numbers (OpenCV pairs all views), but no worse than 1.5 times, over 40 cells."""
+def test_error_under_noise_is_no_worse_than_that_of_opencv(name, flag):
+    """Root mean square over 200 cells, all pairs of views on both sides."""
     cv2 = pytest.importorskip("cv2")
     ours, theirs = [], []
-    for seed in range(40):
+    for seed in range(200):
         X, flange, target, _, _ = motions(seed, noise=1.0)
         i, j = np.triu_indices(len(flange), 1)
         A, B = frames.inverse(flange[i]) @ flange[j], target[i] @ frames.inverse(target[j])
@@ -50,7 +50,7 @@ def test_error_under_noise_is_that_of_opencv(name, flag):
         )  # fmt: skip
         for T, errors in ((SOLVERS[name](A, B), ours), (frames.make(R, t.ravel()), theirs)):
             errors.append(np.linalg.norm(frames.log(frames.inverse(X) @ T) * [300, 300, 300, 1, 1, 1]))
-    assert np.median(ours) < 1.5 * np.median(theirs)
+    assert np.mean(np.square(ours)) <= np.mean(np.square(theirs))
 
 
 @pytest.mark.parametrize("name", SOLVERS)

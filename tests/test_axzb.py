@@ -40,7 +40,7 @@ def rms(values):
 
 def test_two_hundred_cells_no_worse_than_opencv():
     cv2 = pytest.importorskip("cv2")
-    ours, theirs = [], {"SHAH": [], "LI": []}
+    ours, theirs, closed = [], {"SHAH": [], "LI": []}, {"SHAH": [], "LI": []}
     for seed in range(200):
         X, Z, A, B = cell(seed, noise=1.0)
         x, z = refine_axzb(A, B).transforms
@@ -54,9 +54,11 @@ def test_two_hundred_cells_no_worse_than_opencv():
             )  # fmt: skip
             world_base, camera_gripper = frames.make(R1, t1.ravel()), frames.make(R2, t2.ravel())
             errors.append([error(X, frames.inverse(camera_gripper)), error(Z, frames.inverse(world_base))])
+            closed[name].append([error(T, t) for T, t in zip((X, Z), SOLVERS[name.capitalize()](A, B), strict=True)])
     for k in range(2):
         best = min(rms(np.array(e)[:, k]) for e in theirs.values())
         assert rms(np.array(ours)[:, k]) <= best
+        assert all(rms(np.array(closed[name])[:, k]) <= rms(np.array(theirs[name])[:, k]) for name in theirs)
 
 
 def motions_of(A, B):
