@@ -231,6 +231,7 @@ def test_tracker_angles_and_reflectors(tmp_path):
         ("a.csv", "a,b\n1,2\n", r"a.csv line 1: no columns x, y, z"),
         ("a.csv", "x,y,z\n1,2,oops\n", r"a.csv line 2: z is 'oops'"),
         ("a.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", r"a.csv line 2: the quaternion has length 1.4142"),
+        ("a.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0,1\n", r"a.csv line 1: rx, ry, rz may be degrees or a rotation vector"),
         ("a.txt", "x", r"unknown kind '.txt'"),
         ("a.ls", "", r"empty"),
     ],

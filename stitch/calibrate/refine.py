@@ -112,16 +112,22 @@ def _refine(
         if step == _STEPS or np.sqrt(xi @ information.sum(axis=0) @ xi) < _SMALL:
             break
         at = _moved(at, xi)
-    statistics = jackknife(information, gradient)
+    model = np.linalg.inv(information.sum(axis=0)) * (_student(e.size - n) if sigma is None else 1.0)
+    statistics = jackknife(information, gradient, model)
     heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(statistics.steps)])
     if groups is not None:
         member = groups == np.unique(groups)[:, None]
-        statistics = jackknife(np.tensordot(member, information, 1), member @ gradient)
+        statistics = jackknife(np.tensordot(member, information, 1), member @ gradient, model)
     return Refined(at, statistics.covariance, statistics.inflation, e, heldout, (float(scatter[0]), float(scatter[1])))
 
 
 def _moved(at: tuple[Array, ...], xi: Array) -> tuple[Array, ...]:
     return tuple(T @ frames.exp(xi[6 * k : 6 * k + 6]) for k, T in enumerate(at))
+
+
+def _student(free: int) -> float:
+    """Variance of Student's t where each of the two scatters is found from half of the free numbers; at most 3."""
+    return min(free / 2 / max(free / 2 - 2, 1e-9), 3.0)
 
 
 def _normal_equations(jacobian: Array, e: Array, robust: bool) -> tuple[Array, Array]:

@@ -15,6 +15,8 @@ from stitch.session import Session
 
 # Answers whose fits differ by less than this factor cannot be told apart.
 _CLEAR = 1.3
+# Fewer views do not show the radius beside the rest.
+_VIEWS_FOR_RADIUS = 6
 # Column of views.csv: the side of the laser plane, along the arc's normal, on which the centre lies.
 SIDE = "sphere_side"
 
@@ -57,7 +59,7 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
             f"give scanner.pose in session.toml or the column {SIDE} in views.csv, or turn the wrist more"
         )
     fit = fit_sphere(G, views, start.T_mount, radius, radius_free)
-    enough = 3 * len(views) >= 13
+    enough = len(views) >= _VIEWS_FOR_RADIUS
     free = fit if radius_free else (fit_sphere(G, views, start.T_mount, radius, True) if enough else None)
     return SphereCalibration(
         fit, free, fit_sphere(G, views, start.T_mount, radius, radius_free, by_views=True), views, G, start.signs,

@@ -24,6 +24,8 @@ from stitch.errors import NoResultError
 from stitch.frames import Array
 
 _ROUNDS = 20
+# Numbers that the views must leave over for their scatter.
+_FREE = 6
 # Relative change of the scatters that ends the search.
 _SMALL = 0.01
 # Step of the central differences (rad and lengths).
@@ -74,8 +76,10 @@ def fit_sphere(
         NoResultError: too few views.
     """
     n = 10 if radius_free else 9
-    if 3 * len(views) < n + 3:
-        raise NoResultError(f"{len(views)} views for {n} unknowns; scan the sphere from {n // 3 + 2} or more poses")
+    free = 3 * len(views) - n
+    if free < _FREE:
+        needed = -(-(n + _FREE) // 3)
+        raise NoResultError(f"{len(views)} views for {n} unknowns; scan the sphere from {needed} or more poses")
     feet = np.array([v.foot for v in views])
     state = _State(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
     # Distances from a circle of radius ρ are R/ρ times those from the sphere.
@@ -99,7 +103,7 @@ def fit_sphere(
             change, scatter = float(np.abs(np.log(newer / scatter)).max()), newer
             if change < _SMALL:
                 break
-    statistics = _statistics(e, jacobian, weights, covariances(views, response, scatter, shares))
+    statistics = _statistics(e, jacobian, weights, covariances(views, response, scatter, shares), free)
     off = [_distances(G[v], view.points, state) for v, view in enumerate(views)]
     return SphereFit(
         state.T_mount, state.centre, state.radius, statistics.covariance, statistics.inflation, scatter,
@@ -109,15 +113,18 @@ def fit_sphere(
 
 
 def _statistics(
-    e: Sequence[Array], jacobian: Sequence[Array], weights: Sequence[Array], covariances: Sequence[Array]
+    e: Sequence[Array], jacobian: Sequence[Array], weights: Sequence[Array], covariances: Sequence[Array], free: int
 ) -> Jackknife:
-    """Sandwich of the weights and of the covariances that the scatter gives, and the jackknife over it."""
+    """Sandwich of the weights and of the covariances that the scatter gives, and the jackknife over it.
+
+    A scatter found from `free` numbers is itself uncertain: the error over it is Student's, not normal.
+    """
     left = [J.T @ w for J, w in zip(jacobian, weights, strict=True)]
     information = np.array([a @ J for a, J in zip(left, jacobian, strict=True)])
     gradient = np.array([a @ r for a, r in zip(left, e, strict=True)])
     middle = np.sum([a @ V @ a.T for a, V in zip(left, covariances, strict=True)], axis=0)
     bread = np.linalg.inv(information.sum(axis=0))
-    return jackknife(information, gradient, bread @ middle @ bread)
+    return jackknife(information, gradient, bread @ middle @ bread * free / (free - 2))
 
 
 def _distances(G: Array, points: Array, state: _State) -> Array:

@@ -39,7 +39,8 @@ def columns(text: str) -> tuple[list[str], str]:
     """Names of the columns, lower case without units, and the separator."""
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((s for s in ";\t," if s in first), ",")
-    return [re.sub(r"[\[(].*|[\s_]", "", cell.strip().strip('"').lower()) for cell in first.split(separator)], separator
+    plain = [re.sub(r"[\[(].*|[\s_°]", "", cell.strip().strip('"').lower()) for cell in first.split(separator)]
+    return [name.removesuffix("deg") for name in plain], separator
 
 
 def read(file: Path, text: str) -> list[Measured]:
@@ -55,6 +56,11 @@ def read(file: Path, text: str) -> list[Measured]:
     scale = 1000.0 if re.search(r"x\s*[\[(]\s*m\s*[\])]", first) else 1.0
     quaternion = next((q for q in _QUATERNIONS if all(n in header for n in q)), None)
     angles = quaternion is None and all(n in header for n in _ANGLES)
+    if angles and not re.search(r"deg|°", first):
+        raise InputError(
+            f"{file} line 1: rx, ry, rz may be degrees or a rotation vector; write Rx (deg) … for a tracker's angles, "
+            "actual_TCP_pose_0 … for a UR's pose"
+        )
     out: list[Measured] = []
     reader = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
     rows = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]

@@ -20,8 +20,8 @@ pose = rotation_vector
 _LIST = r"(p?)\[([^\[\]]*)\]"
 _NAMED = re.compile(rf"\b(\w+)\s*=\s*{_LIST}")
 _MOVE = re.compile(rf"\bmove[jlpc]\s*\(\s*{_LIST}")
-_POSE = ([f"actual_TCP_pose_{i}" for i in range(6)], ["x", "y", "z", "rx", "ry", "rz"])
-_JOINTS = ([f"actual_q_{i}" for i in range(6)], [f"q{i}" for i in range(1, 7)])
+_POSE = tuple([f"{kind}_TCP_pose_{i}" for i in range(6)] for kind in ("actual", "target"))
+_JOINTS = tuple([f"{kind}_q_{i}" for i in range(6)] for kind in ("actual", "target"))
 
 
 def read(file: Path, text: str) -> list[Taught]:
