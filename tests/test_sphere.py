@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from sphere_cell import RADIUS, SphereCell, area, build, line, write
 
 from stitch import frames
 from stitch.calibrate.ball import fit_ball
@@ -15,7 +16,6 @@ from stitch.calibrate.sphere_views import arc_normal, centres, sphere_view
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.session import load_session
-from tests.sphere_cell import RADIUS, SphereCell, area, build, line, write
 
 
 def views_of(cell, side=0.0):

@@ -77,7 +77,10 @@ def _fitted(session: Session, k: int, radius: float) -> SphereView:
     side = view.covariates.get(SIDE, 0.0)
     if side not in (-1.0, 0.0, 1.0):
         raise InputError(f"{session.path / 'views.csv'}: view {view.name}: {SIDE} is {side:g}; use -1, 0 or +1")
-    return sphere_view(view.name, view.cloud.points, radius, side)
+    try:
+        return sphere_view(view.name, view.cloud.points, radius, side)
+    except InputError as error:
+        raise InputError(f"{session.path}: {error}") from None
 
 
 def open_sides(views: tuple[SphereView, ...]) -> Array:
