@@ -195,8 +195,8 @@ def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array
     """Estimates and covariance; parameters count in rad and mm, so the matrix is equilibrated first."""
     matrix = prior + np.sum([block[0] for block in blocks], axis=0)
     scale = 1 / np.sqrt(np.diag(matrix))
-    covariance = np.asarray(np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale, float)
-    return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0), float), covariance
+    covariance = np.multiply(np.linalg.inv(matrix * scale[:, None] * scale), np.outer(scale, scale), dtype=float)
+    return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0)), covariance
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:

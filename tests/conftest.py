@@ -1,5 +1,6 @@
 """Fixtures: the measured data beside the project, and small synthetic cells."""
 
+import os
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +18,7 @@ from stitch.threads import library_threads_off
 # As inside a run: the tests call the stages directly.
 library_threads_off()
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 
 
 @pytest.fixture(scope="session")

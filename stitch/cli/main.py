@@ -10,11 +10,13 @@ from importlib.metadata import entry_points
 import typer
 
 from stitch.cli.base import base
+from stitch.cli.calibrate import calibrate
 from stitch.cli.change import add, drop
 from stitch.cli.check import check
 from stitch.cli.diagnose import diagnose_run, next_measurement
 from stitch.cli.drill import drill
 from stitch.cli.effects import effects
+from stitch.cli.import_file import import_command
 from stitch.cli.run import run
 from stitch.errors import StitchError
 
@@ -35,6 +37,8 @@ def build() -> typer.Typer:
     app.command()(effects)
     app.command()(base)
     app.command()(drill)
+    app.command("import")(import_command)
+    app.add_typer(calibrate, name="calibrate")
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

@@ -1,0 +1,95 @@
+"""`stitch calibrate …`: hand-eyes from known objects and from trackers."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch.calibrate.sphere import calibrate_sphere
+from stitch.calibrate.sphere_report import document_of
+from stitch.calibrate.tracker import calibrate_tracker
+from stitch.calibrate.tracker import document_of as tracker_document
+from stitch.session import load_session
+
+calibrate = typer.Typer(
+    help="Find hand-eyes from known objects and from trackers.", no_args_is_help=True, rich_markup_mode=None
+)
+_SESSION = Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")]
+_JSON = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
+
+
+@calibrate.command()
+def sphere(
+    session: _SESSION,
+    radius_free: Annotated[bool, typer.Option("--radius-free", help="Fit the sphere's radius too.")] = False,
+    as_json: _JSON = False,
+) -> None:
+    """Hand-eye from laser-line or area scans of one sphere of known radius."""
+    loaded = load_session(session)
+    document = document_of(calibrate_sphere(loaded, radius_free), loaded)
+    if as_json:
+        print(json.dumps(document, indent=1))
+        return
+    unit, radius = document["length_unit"], document["radius"]
+    facts = [
+        ("sphere's centre", f"{_row(document['centre'], unit)} ± {_row(document['centre_sigma'], unit)} {unit}"),
+        ("radius", f"{radius['used']:.6g} {unit}"),
+        (
+            "points from the sphere",
+            f"{document['rms']:#.3g} {unit} rms, noise within a scan {document['point_sigma']:#.3g}",
+        ),
+        ("start", document["start"]),
+    ]
+    show(document, facts)
+
+
+@calibrate.command()
+def tracker(session: _SESSION, as_json: _JSON = False) -> None:
+    """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board."""
+    loaded = load_session(session)
+    document = tracker_document(calibrate_tracker(loaded), loaded)
+    if as_json:
+        print(json.dumps(document, indent=1))
+        return
+    unit, other, heldout = document["length_unit"], document["other"], document["heldout_position_error"]
+    facts = [
+        (other["name"], f"{_row(np.array(other['transform'])[:3, 3], unit)} ± {_row(other['sigma'][3:], unit)} {unit}"),
+        ("views", f"{document['views']}, turned by up to {document['turned_deg']:.0f}°"),
+        ("position error", f"{heldout['mean']:.4g} {unit} mean of views left out, at most {heldout['max']:.4g}"),
+        ("rotation error", f"{document['heldout_rotation_error_deg']['mean']:.4f} ° mean of views left out"),
+    ]
+    show(document, facts)
+
+
+def show(document: dict[str, Any], facts: list[tuple[str, str]]) -> None:
+    """The hand-eye with its sigmas, more facts, and the notes, for people."""
+    console, unit = Console(stderr=True), document["length_unit"]
+    mount = "flange" if document["mount"] == "eye_in_hand" else "base"
+    table = Table(title=f"{document['session']}: T_{mount}_scanner", title_justify="left", show_header=False)
+    for name, text in [*hand_eye_rows(document, unit), *facts]:
+        table.add_row(name, text)
+    console.print(table)
+    for note in document["notes"]:
+        console.print(f"{note}.", soft_wrap=True, highlight=False)
+
+
+def hand_eye_rows(document: dict[str, Any], unit: str) -> list[tuple[str, str]]:
+    """Translation in the mount's axes, rotation matrix, sigmas in both frames."""
+    T = np.array(document["hand_eye"])
+    sigma = np.array(document["hand_eye_sigma"])
+    return [
+        ("translation", f"{_row(T[:3, 3], unit)} ± {_row(document['translation_sigma_mount'], unit)} {unit}"),
+        ("rotation", "\n".join(" ".join(f"{x:+.6f}" for x in row) for row in T[:3, :3])),
+        ("sigma of rotation", f"{_row(np.degrees(sigma[:3]))} ° about scanner x, y, z"),
+        ("sigma of translation", f"{_row(sigma[3:], unit)} {unit} along scanner x, y, z"),
+    ]
+
+
+def _row(values: Any, unit: str = "mm") -> str:
+    """Numbers to a micrometre, or to a thousandth of a degree."""
+    digits = 6 if unit == "m" else 3
+    return ", ".join(f"{x:.{digits}f}" for x in values)

@@ -1,0 +1,42 @@
+"""`stitch import FILE`: the points of a robot program or of a tracker as a table of a session."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stitch.controllers.importer import import_file
+from stitch.errors import InputError
+
+
+def import_command(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="FANUC .ls, KUKA .dat/.src, ABB .mod, UR .script/.csv, tracker .csv."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="TABLE", help="views.csv to write; default standard output."),
+    ] = None,
+    unit: Annotated[str, typer.Option("--unit", help="mm or m: the session's length_unit.")] = "mm",
+    frame: Annotated[
+        str | None,
+        typer.Option("--frame", help="Frame of the points in the base, numbers as the controller shows them."),
+    ] = None,
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Tool in the flange, numbers as the controller shows them.")
+    ] = None,
+) -> None:
+    """Write the points of a robot program or of a tracker as views.csv (frames.csv, points.csv)."""
+    if output is not None and output.exists():
+        raise InputError(f"{output}: exists already; name another file, or remove it")
+    imported = import_file(file, unit, frame, tool)
+    if output is None:
+        print(imported.text, end="")
+    else:
+        output.write_text(imported.text, encoding="utf-8")
+    for warning in imported.warnings:
+        print(f"stitch: {file}: {warning}", file=sys.stderr)
+    where = output or "standard output"
+    print(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}", file=sys.stderr)

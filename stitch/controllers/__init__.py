@@ -1,0 +1,1 @@
+"""Taught points from the files of robot controllers and trackers."""

@@ -1,0 +1,62 @@
+"""ABB RAPID .mod: robtargets and jointtargets, declared or written into a move. Quaternions with w first."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stitch.controllers.taught import Taught, line_of, number, quaternion_w_first
+from stitch.errors import InputError
+
+CONVENTION = "quaternion q1, q2, q3, q4 with q1 = w; mm"
+pose = quaternion_w_first
+
+_DECLARED = re.compile(r"\b(robtarget|jointtarget)\s+(\w+)\s*(?:\{\s*\d+\s*\})?\s*:=\s*([^;]*);", re.I)
+_MOVE = re.compile(r"\bMove(L|J|AbsJ)\s+(\[[^;]*?\]\s*\])\s*(?:\\|,)", re.I)
+_TARGET = re.compile(r"\[((?:[^\[\]]*\[[^\[\]]*\]){2,4})[^\[\]]*\]")
+_LIST = re.compile(r"\[([^\[\]]*)\]")
+
+
+def read(file: Path, text: str) -> list[Taught]:
+    """Targets in the order of the file; arrays give one point per element.
+
+    Raises:
+        InputError: a target without numbers or with a quaternion that is none.
+    """
+    clean = _without_comments(text)
+    found: list[tuple[int, Taught]] = []
+    for match in _DECLARED.finditer(clean):
+        found += _targets(file, text, match.start(3), match[2], match[3], match[1].lower() == "jointtarget")
+    for match in _MOVE.finditer(clean):
+        name = f"line{line_of(text, match.start())}"
+        found += _targets(file, text, match.start(2), name, match[2], match[1].lower() == "absj")
+    return [point for _, point in sorted(found, key=lambda pair: pair[0])]
+
+
+def _without_comments(text: str) -> str:
+    """Comments run from an exclamation mark, outside strings, to the end of the line; lengths stay."""
+    return re.sub(r'"[^"\n]*"|![^\n]*', lambda m: m[0] if m[0].startswith('"') else " " * len(m[0]), text)
+
+
+def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool) -> list[tuple[int, Taught]]:
+    matches = list(_TARGET.finditer(value))
+    line = line_of(text, at)
+    if not matches:
+        raise InputError(f"{file} line {line}: {name} is not written as [[…],[…],…]; write its numbers out")
+    names = [name] if len(matches) == 1 else [f"{name}_{k + 1}" for k in range(len(matches))]
+    return [
+        (at + m.start(), _point(file, line_of(text, at + m.start()), label, m[1], joint))
+        for m, label in zip(matches, names, strict=True)
+    ]
+
+
+def _point(file: Path, line: int, name: str, body: str, joint: bool) -> Taught:
+    lists = [[number(file, line, name, cell) for cell in part.split(",")] for part in _LIST.findall(body)]
+    if joint and len(lists[0]) == 6:
+        return Taught(name, line, None, np.radians(lists[0]))
+    if not joint and len(lists[0]) == 3 and len(lists[1]) == 4:
+        try:
+            return Taught(name, line, quaternion_w_first(np.array(lists[0] + lists[1])), None)
+        except ValueError as error:
+            raise InputError(f"{file} line {line}: {name}: {error}") from None
+    raise InputError(f"{file} line {line}: {name} is neither [[x,y,z],[q1,q2,q3,q4],…] nor [[j1 … j6],…]")

@@ -1,0 +1,51 @@
+"""FANUC .ls listings: the /POS section, GP1 of every P[n]. W, P, R are fixed XYZ angles.
+
+J3 is written as the controller shows it, measured from the horizontal and not from the lower arm: the
+DH joint 3 of most published tables is J2 + J3.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stitch.controllers.taught import Taught, fixed_xyz, line_of, number
+from stitch.errors import InputError
+
+CONVENTION = "W, P, R in degrees about fixed x, y, z: Rz(R)·Ry(P)·Rx(W); mm"
+pose = fixed_xyz
+
+_POINT = re.compile(r"P\[(\d+)(?:\s*:\s*\"([^\"]*)\")?\]\s*\{(.*?)\}\s*;", re.S)
+_GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d+\s*:|\Z)", re.S)
+_FRAME = re.compile(r"UF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
+# Numbers, or the stars of a point that was never taught.
+_FIELD = re.compile(r"\b([XYZWPR]|J\d)\s*=\s*([-+.\deE*]+)")
+
+
+def read(file: Path, text: str) -> list[Taught]:
+    """Points of one listing.
+
+    Raises:
+        InputError: no /POS section, a point without numbers.
+    """
+    start = text.find("/POS")
+    if start < 0:
+        raise InputError(f"{file}: no /POS section; save the program as an .LS listing with its positions")
+    return [_point(file, text, match) for match in _POINT.finditer(text, start)]
+
+
+def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
+    index, comment, body = match.groups()
+    line, name = line_of(text, match.start()), comment or f"P{index}"
+    group = _GROUP.search(body)
+    if group is None:
+        raise InputError(f"{file} line {line}: P[{index}] has no GP1; the arm's own group is read")
+    fields = {key: number(file, line, f"P[{index}] {key}", value) for key, value in _FIELD.findall(group[1])}
+    taught_in = _FRAME.search(group[1])
+    frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
+    if all(key in fields for key in "XYZWPR"):
+        return Taught(name, line, fixed_xyz(np.array([fields[key] for key in "XYZWPR"])), None, frame)
+    joints = [fields[f"J{i}"] for i in range(1, 10) if f"J{i}" in fields]
+    if len(joints) < 4:
+        raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; teach it again")
+    return Taught(name, line, None, np.radians(joints), frame)

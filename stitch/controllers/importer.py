@@ -1,0 +1,130 @@
+"""A controller's or tracker's file -> the text of views.csv, frames.csv or points.csv."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from stitch import frames
+from stitch.controllers import abb, fanuc, kuka, tracker_csv, universal
+from stitch.controllers.tables import POSE, csv_text, pose_cells, unique, view_rows
+from stitch.controllers.taught import Taught
+from stitch.controllers.tracker_csv import Measured
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+
+_READERS: dict[str, ModuleType] = {
+    ".ls": fanuc, ".dat": kuka, ".src": kuka, ".mod": abb, ".script": universal, ".csv": universal,
+}  # fmt: skip
+# Programs are in mm; views.csv is in the session's length_unit.
+_SCALE = {"mm": 1.0, "m": 1e-3}
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A table of a session."""
+
+    table: str  # "views.csv", "frames.csv" or "points.csv"
+    text: str
+    rows: int
+    convention: str  # how the file writes orientations
+    warnings: tuple[str, ...]
+
+
+def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: str | None = None) -> Imported:
+    """Read a program or an export of a tracker.
+
+    Args:
+        unit: "mm" or "m", the session's length_unit.
+        frame: T_base_frame in which the points were taught, numbers as the controller writes a pose.
+        tool: T_flange_tool in force when they were taught, likewise. T_base_flange = frame · point · tool⁻¹.
+
+    Raises:
+        InputError: unknown or broken file, points of different frames; names the line and the mend.
+        NoResultError: no points in the file.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}: no such file")
+    if unit not in _SCALE:
+        raise InputError(f"--unit {unit}: use mm or m")
+    reader = _READERS.get(file.suffix.lower())
+    if reader is None:
+        raise InputError(f"{file}: unknown kind {file.suffix!r}; known are {', '.join(_READERS)}")
+    text = file.read_text(encoding="utf-8-sig", errors="replace")
+    if not text.strip():
+        raise InputError(f"{file}: empty; export it again")
+    if reader is universal and file.suffix.lower() == ".csv" and not _recording(text):
+        return _tracker(file, text, unit)
+    points: Sequence[Taught] = reader.read(file, text)
+    if not points:
+        raise NoResultError(f"{file}: no taught points found; export the program with its positions")
+    warnings = _check_frames(file, points, frame, tool)
+    T_base_frame, T_flange_tool = (
+        _given(reader.pose, name, value) for name, value in (("frame", frame), ("tool", tool))
+    )
+    rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _SCALE[unit])
+    return Imported("views.csv", csv_text(rows), len(points), reader.CONVENTION, warnings)
+
+
+def _recording(text: str) -> bool:
+    first = text.lstrip().splitlines()[0]
+    separator = next((s for s in ",;\t" if s in first), " ")
+    return universal.is_recording([cell.strip() for cell in first.split(separator)])
+
+
+def _given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
+    if value is None:
+        return np.eye(4)
+    try:
+        numbers = np.array([float(cell) for cell in value.split(",")])
+        if not len(numbers) == (7 if pose is abb.pose else 6):
+            raise ValueError
+        return pose(numbers)
+    except (ValueError, IndexError) as error:
+        mend = f"write {'7' if pose is abb.pose else '6'} numbers with commas, as the controller shows the pose"
+        reason = f" ({error})" if str(error) else ""
+        raise InputError(f"--{name} {value}: {mend}{reason}") from None
+
+
+def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool: str | None) -> tuple[str, ...]:
+    """Points of one frame and tool, or a refusal; a warning where poses need them and none was given."""
+    posed = [point for point in points if point.T_frame_tool is not None]
+    if not posed:
+        return ()
+    other = next((point for point in posed if point.frame != posed[0].frame), None)
+    if other is not None:
+        raise InputError(
+            f"{file} line {other.line}: {other.name} is taught in {other.frame}, {posed[0].name} in {posed[0].frame}; "
+            "import points of one frame and tool at a time"
+        )
+    if (frame is None or tool is None) and posed[0].frame != "UF 0, UT 0":
+        known = f" ({posed[0].frame})" if posed[0].frame else ""
+        return (
+            f"poses are those of the tool in the frame in which they were taught{known}; give --frame and --tool "
+            "unless both were zero, else they are not the flange in the base",
+        )
+    return ()
+
+
+def _tracker(file: Path, text: str, unit: str) -> Imported:
+    """frames.csv from 6D probes; points.csv from reflectors, a new view whenever a name comes again."""
+    measured: list[Measured] = tracker_csv.read(file, text)
+    if not measured:
+        raise NoResultError(f"{file}: no measurements; export them again")
+    scale = _SCALE[unit]
+    poses = [m.T_sensor_probe for m in measured if m.T_sensor_probe is not None]
+    if poses:
+        rows = [["view", *POSE]]
+        rows += [[n, *pose_cells(T, scale)] for n, T in zip(unique(m.name for m in measured), poses, strict=True)]
+        return Imported("frames.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, ())
+    rows, seen = [["view", "target", "x", "y", "z"]], Counter[str]()
+    for m in measured:
+        seen[m.name] += 1
+        rows.append([f"v{seen[m.name]}", m.name, *(f"{x * scale:.9g}" for x in m.position)])
+    note = (
+        "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
+    )
+    return Imported("points.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, (note,))

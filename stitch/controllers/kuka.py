@@ -1,0 +1,69 @@
+"""KUKA .dat and .src: E6POS, POS, FRAME, E6AXIS and AXIS. A, B, C turn about z, then y, then x.
+
+A .src gives the points in the order of its motions; names in it are looked up in the .dat beside it.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stitch.controllers.taught import Taught, line_of, number, zyx
+from stitch.errors import InputError
+
+CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"
+pose = zyx
+
+_DECLARED = re.compile(
+    r"^[ \t]*(?:GLOBAL\s+)?(?:DECL\s+)?(?:GLOBAL\s+)?(?:E6POS|POS|FRAME|E6AXIS|AXIS)\s+(\w+)\s*=\s*\{(.*?)\}",
+    re.M | re.I | re.S,
+)
+_MOTION = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+(?:(\w+)|\{(.*?)\})", re.M | re.I)
+_FIELD = re.compile(r"\b([XYZABC]|A\d)\s+([^,}\s]+)", re.I)
+
+
+def read(file: Path, text: str) -> list[Taught]:
+    """Points of a .dat (as declared) or a .src (as moved to).
+
+    Raises:
+        InputError: a point without numbers, a name that is declared nowhere.
+    """
+    if file.suffix.lower() == ".dat":
+        return list(_declared(file, text).values())
+    known = _declared(file, text)
+    beside = next((p for p in (file.with_suffix(".dat"), file.with_suffix(".DAT")) if p.is_file()), None)
+    if beside is not None:
+        known |= _declared(beside, beside.read_text(encoding="utf-8", errors="replace"))
+    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(_without_comments(text))]
+
+
+def _without_comments(text: str) -> str:
+    """Comments run from a semicolon to the end of the line; lengths stay."""
+    return re.sub(r";[^\n]*", lambda match: " " * len(match[0]), text)
+
+
+def _declared(file: Path, text: str) -> dict[str, Taught]:
+    clean = _without_comments(text)
+    found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2])) for m in _DECLARED.finditer(clean)]
+    return {name.upper(): point for name, point in found}
+
+
+def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taught]) -> Taught:
+    line = line_of(text, match.start(1) if match[1] else match.start(2))
+    if "_REL" in match[0].upper():
+        raise InputError(f"{file} line {line}: a relative motion has no pose of its own; give the point as E6POS")
+    if match[2]:
+        return _point(file, f"line{line}", line, match[2])
+    if match[1].upper() not in known:
+        raise InputError(f"{file} line {line}: {match[1]} is declared nowhere; put {file.stem}.dat beside the .src")
+    return known[match[1].upper()]
+
+
+def _point(file: Path, name: str, line: int, body: str) -> Taught:
+    fields = {key.upper(): number(file, line, f"{name} {key}", value) for key, value in _FIELD.findall(body)}
+    if all(key in fields for key in "XYZABC"):
+        return Taught(name, line, zyx(np.array([fields[key] for key in "XYZABC"])), None)
+    joints = [fields[f"A{i}"] for i in range(1, 10) if f"A{i}" in fields]
+    if len(joints) < 4:
+        raise InputError(f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; write all of them")
+    return Taught(name, line, None, np.radians(joints))

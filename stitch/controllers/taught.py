@@ -1,0 +1,71 @@
+"""A taught point, and how each controller writes an orientation. Lengths in mm, angles in rad."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.errors import InputError
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class Taught:
+    """One point of a program: a pose, joint angles, or both."""
+
+    name: str
+    line: int
+    T_frame_tool: Array | None  # (4, 4) of the tool in the frame in which it was taught
+    joints: Array | None  # (n,) rad
+    frame: str = ""  # frame and tool in force, in the controller's words; empty where the file does not say
+
+
+def fixed_xyz(numbers: Array) -> Array:
+    """FANUC x, y, z, W, P, R (mm, deg): turn by W about the fixed x, by P about y, by R about z: Rz(R)·Ry(P)·Rx(W)."""
+    return frames.make(Rotation.from_euler("xyz", numbers[3:6], degrees=True).as_matrix(), numbers[:3])
+
+
+def zyx(numbers: Array) -> Array:
+    """KUKA X, Y, Z, A, B, C (mm, deg): turn by A about z, B about the new y, C about the new x: Rz(A)·Ry(B)·Rx(C)."""
+    return frames.make(Rotation.from_euler("ZYX", numbers[3:6], degrees=True).as_matrix(), numbers[:3])
+
+
+def quaternion_w_first(numbers: Array) -> Array:
+    """ABB x, y, z, q1, q2, q3, q4 (mm): q1 is w.
+
+    Raises:
+        ValueError: not a unit quaternion.
+    """
+    q = np.asarray(numbers[3:7], float)
+    norm = float(np.linalg.norm(q))
+    if abs(norm - 1) > 1e-3:
+        raise ValueError(f"quaternion of length {norm:.4f}, not a rotation; write q1 … q4 of length 1, w first")
+    return frames.from_quaternion(np.asarray(numbers[:3], float), np.array([q[1], q[2], q[3], q[0]]) / norm)
+
+
+def rotation_vector(numbers: Array) -> Array:
+    """UR x, y, z, rx, ry, rz (m, rad): turn by the vector's length about its direction."""
+    numbers = np.asarray(numbers, float)
+    return frames.make(Rotation.from_rotvec(numbers[3:6]).as_matrix(), numbers[:3] * 1000)
+
+
+def number(file: Path, line: int, what: str, cell: str) -> float:
+    """A finite number.
+
+    Raises:
+        InputError: names file, line and the mend.
+    """
+    try:
+        value = float(cell)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"{file} line {line}: {what} is {cell.strip()!r}, not a number; teach the point or remove it")
+    return value
+
+
+def line_of(text: str, position: int) -> int:
+    """Line number, from 1, of a position in a text."""
+    return text.count("\n", 0, position) + 1

@@ -1,0 +1,88 @@
+"""Universal Robots: .script programs and .csv recordings (RTDE). Rotation vectors; m and rad.
+
+In a script, points are written into movej, movel, movep or movec, or into variables; PolyScript writes a
+waypoint as NAME_p (pose) and NAME_q (joints), which become one point. Poses are those of the TCP.
+"""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stitch.controllers.taught import Taught, line_of, number, rotation_vector
+from stitch.errors import InputError
+from stitch.frames import Array
+
+CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
+pose = rotation_vector
+
+_LIST = r"(p?)\[([^\[\]]*)\]"
+_NAMED = re.compile(rf"\b(\w+)\s*=\s*{_LIST}")
+_MOVE = re.compile(rf"\bmove[jlpc]\s*\(\s*{_LIST}")
+_POSE = tuple([f"{kind}_TCP_pose_{i}" for i in range(6)] for kind in ("actual", "target"))
+_JOINTS = tuple([f"{kind}_q_{i}" for i in range(6)] for kind in ("actual", "target"))
+
+
+def read(file: Path, text: str) -> list[Taught]:
+    """Points of a .script, or one per row of a .csv.
+
+    Raises:
+        InputError: names the line and the mend.
+    """
+    return _table(file, text) if file.suffix.lower() == ".csv" else _script(file, text)
+
+
+def _script(file: Path, text: str) -> list[Taught]:
+    clean = re.sub(r"#[^\n]*", lambda match: " " * len(match[0]), text)
+    found = [(m.start(), m[1], m[2], m[3]) for m in _NAMED.finditer(clean)]
+    found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m[2]) for m in _MOVE.finditer(clean)]
+    points: dict[str, Taught] = {}
+    for position, name, kind, body in sorted(found):
+        cells = body.split(",")
+        if len(cells) != 6:
+            continue  # A list of something else: a payload, a vector, an I/O pattern.
+        line = line_of(text, position)
+        if not all(_is_number(cell) for cell in cells):
+            if name != f"line{line}":
+                continue  # Computed while the program runs: no taught point.
+            raise InputError(f"{file} line {line}: the target is computed while the program runs; write its numbers")
+        values = np.array([float(cell) for cell in cells])
+        base = re.sub(r"_[pq]$", "", name)
+        before = points.get(base, Taught(base, line, None, None))
+        pose = rotation_vector(values) if kind else before.T_frame_tool
+        points[base] = Taught(base, before.line, pose, before.joints if kind else values)
+    return list(points.values())
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def is_recording(header: list[str]) -> bool:
+    """True for the header of a robot's recording: a pose or joints under one of the known names."""
+    return any(all(name in header for name in names) for names in (*_POSE, *_JOINTS))
+
+
+def _table(file: Path, text: str) -> list[Taught]:
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    separator = next((s for s in ",;\t" if s in lines[0][1]), " ")
+    rows = list(csv.reader([line for _, line in lines], delimiter=separator, skipinitialspace=True))
+    header = [name.strip() for name in rows[0]]
+    pose, joints = (next((c for c in choice if all(n in header for n in c)), None) for choice in (_POSE, _JOINTS))
+    out = []
+    for (line, _), row in zip(lines[1:], rows[1:], strict=True):
+        if len(row) < len(header):
+            raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
+        cells = dict(zip(header, row, strict=False))
+        T = None if pose is None else rotation_vector(_values(file, line, cells, pose))
+        out.append(Taught(f"row{line}", line, T, None if joints is None else _values(file, line, cells, joints)))
+    return out
+
+
+def _values(file: Path, line: int, cells: dict[str, str], names: list[str]) -> Array:
+    return np.array([number(file, line, name, cells[name]) for name in names])
