@@ -8,19 +8,21 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from data_synth.commands import make, truth_path
+from data_synth.commands import make, reveal, truth_path
 from data_synth.write import write_session, write_truth
 from stitch.errors import InputError
 
 # What the demo may hide: each is visible on a blade that is turned and tilted in front of a scanner.
-HIDDEN = ("joint_compliance", "joint_offset", "mount_warmup", "backlash", "range_scale", "lens_distortion")
+HIDDEN = ("joint_compliance", "joint_offset", "backlash", "range_scale", "lens_distortion", "part_slip")
 
 
 def demo(
     folder: Annotated[Path, typer.Argument(help="Where session and run are written.")] = Path("runs/demo"),
     seed: Annotated[int, typer.Option(help="Another seed, another cell and another hidden effect.")] = 0,
 ) -> None:
-    """Scan a synthetic blade in a cell with a hidden effect, stitch it, and compare with the truth."""
+    """Scan a blade in a cell with a hidden effect, stitch it, find the effect, add it, and watch the error fall."""
+    from stitch.cli.change import add
+    from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run import run
 
     session = folder / "blade"
@@ -29,7 +31,20 @@ def demo(
     shutil.rmtree(folder, ignore_errors=True)
     hidden = str(np.random.default_rng(seed).choice(HIDDEN))
     measured = make("blade", {hidden: 2.0}, seed)
-    print(f"Scanning a blade from {len(measured.clouds)} poses, with one effect hidden → {session}", file=sys.stderr)
+    _say(f"Scanned a blade from {len(measured.clouds)} poses, with one effect hidden → {session}")
     write_session(session, measured, "blade")
     write_truth(truth_path(session), measured, seed)
+    _say("\nstitch run: correct the hand-eye, register, fuse")
     run([session], output=folder / "run", recording=False)
+    _say("\nstitch diagnose: what is missing?")
+    diagnose_run(folder / "run")
+    _say("\nstitch add --suggested: add it, fit everything anew, ask again")
+    add(folder / "run", suggested=True)
+    _say("\nstitch reveal: what was hidden")
+    reveal(folder / "run", truth_path(session))
+    for name in ("stitched.ply", "recording.rrd", "report.html"):
+        _say(f"  {folder / 'run' / name}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

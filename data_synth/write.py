@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -60,13 +61,14 @@ def _document(name: str, measured: Measured) -> dict[str, object]:
         },
     }  # fmt: skip
     if not scene.rail:
-        document["robot"] = _robot(scene.arm)
+        document["robot"] = robot_table(scene.arm)
     if scene.part.shape == "sphere":
         document["sphere"] = {"radius": float(scene.part.parameters.get("radius", 30.0))}
     return document
 
 
-def _robot(arm: Arm) -> dict[str, object]:
+def robot_table(arm: Arm) -> dict[str, Any]:
+    """The [robot] table of an arm."""
     rows = [
         {
             "a": float(arm.a[i]), "alpha_deg": float(np.degrees(arm.alpha[i])), "d": float(arm.d[i]),
@@ -74,7 +76,7 @@ def _robot(arm: Arm) -> dict[str, object]:
         }
         for i in range(arm.joints)
     ]  # fmt: skip
-    robot: dict[str, object] = {"name": arm.name, "dh": "standard", "gravity": GRAVITY.tolist(), "joints": rows}
+    robot: dict[str, Any] = {"name": arm.name, "dh": "standard", "gravity": GRAVITY.tolist(), "joints": rows}
     if arm.payload_mass:
         robot["payload"] = {"mass": float(arm.payload_mass), "com": [float(x) for x in arm.payload_com]}
     return robot

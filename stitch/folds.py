@@ -3,6 +3,8 @@
 Leaving out random views would leave their neighbours in, which share their error.
 """
 
+import warnings
+
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
@@ -26,7 +28,10 @@ def grouped_folds(T_reference_mount: Array, lever: float) -> list[Indices]:
         return [np.array([v]) for v in range(count)]
     by_time = np.array_split(np.arange(count), _GROUPS)
     twists = frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
-    _, label = kmeans2(twists, _GROUPS, minit="++", seed=0)
+    with warnings.catch_warnings():
+        # An empty group is no harm: it is left out below.
+        warnings.simplefilter("ignore", UserWarning)
+        _, label = kmeans2(twists, _GROUPS, minit="++", seed=0)
     regions = [np.flatnonzero(label == k) for k in range(_GROUPS)]
     # A region that holds most views would leave too little to fit.
     return [f for f in [*by_time, *regions] if 0 < len(f) <= count // 2]

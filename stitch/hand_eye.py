@@ -188,14 +188,14 @@ def _information(evidence: _Evidence, scatter: Repeatability, twists: Array) -> 
     channel = evidence.channel()
     X = np.column_stack([channel.hand_eye, channel.left @ evidence.extra])
     weighted = np.linalg.solve(covariance_of(channel, scatter), X).T
-    return weighted @ X, weighted @ channel.left @ twists
+    return np.asarray(weighted @ X), np.asarray(weighted @ channel.left @ twists)
 
 
 def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
     """Estimates and covariance; parameters count in rad and mm, so the matrix is equilibrated first."""
     matrix = prior + np.sum([block[0] for block in blocks], axis=0)
     scale = 1 / np.sqrt(np.diag(matrix))
-    covariance = np.multiply(np.linalg.inv(matrix * scale[:, None] * scale), np.outer(scale, scale), dtype=float)
+    covariance: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0)), covariance
 
 

@@ -68,11 +68,14 @@ def show(found: Diagnosis, length_unit: str) -> None:
     console, to_um = Console(stderr=True), MICROMETRES[length_unit]
     console.print(found.sentence, soft_wrap=True, highlight=False, style="bold")
     table = Table(title="Suspects", title_justify="left")
-    for heading in ("effect", "p", "posterior", "amplitude", "left (µm)", "held-out (µm)", "looks like"):
-        table.add_column(heading, justify="left" if heading in ("effect", "amplitude", "looks like") else "right")
+    for heading in ("effect", "p", "post.", "left µm", "held-out µm", "looks like"):
+        table.add_column(heading, justify="left" if heading in ("effect", "looks like") else "right", no_wrap=True)
     for s in found.suspects[:_SHOWN]:
         table.add_row(*_row(found, s, to_um))
     console.print(table)
+    for s in found.suspects[:3]:
+        if s.ranked.score.observable:
+            console.print(f"  {s.name}: {amounts_of(s.ranked)}", soft_wrap=True, highlight=False)
     unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
     if unseen:
         console.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True, highlight=False)
@@ -86,9 +89,9 @@ def show(found: Diagnosis, length_unit: str) -> None:
 
 def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:
     if not s.ranked.score.observable:
-        return [s.name, "–", "–", "not observable", "–", "–", ""]
+        return [s.name, "–", "–", "–", "–", "not observable"]
     left = ["–", "–"]
     if s.left is not None:
         left = [f"{found.residual_rms * to_um * x**0.5:.1f}" for x in (s.left.inside, s.left.heldout)]
-    alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
-    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", amounts_of(s.ranked, 2), *left, alike]
+    alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:1])
+    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left, alike]

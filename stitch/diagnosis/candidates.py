@@ -44,7 +44,7 @@ def candidates_of(evidence: PoseEvidence) -> tuple[list[Candidate], PointGram | 
     chain = evidence.chain
     used = {term.effect.name for term in evidence.terms}
     library = [e for e in EFFECTS.values() if e.name not in used]
-    missing = {e.name: chain.offers(e) for e in library if chain.offers(e)}
+    missing = {e.name: chain.lacks(e) for e in library if chain.lacks(e)}
     effects = [e for e in library if e.name not in missing] + empirical_effects(chain.views)
     terms, owner = [], []
     for k, effect in enumerate(effects):

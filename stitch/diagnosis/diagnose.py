@@ -9,7 +9,7 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.heldout import Left, left_by
 from stitch.diagnosis.next_view import Proposal, propose
 from stitch.diagnosis.pose_evidence import PoseEvidence
-from stitch.diagnosis.select import Ranked, Selection, select
+from stitch.diagnosis.select import Ranked, Selection, implausible, select
 from stitch.diagnosis.start import evidence_of_state
 from stitch.diagnosis.unknown import Dependence, dependences
 from stitch.diagnosis.words import sentence_of
@@ -21,6 +21,7 @@ from stitch.threads import library_threads_off
 _PREDICTED = 8
 # An effect must not vanish when one view is left out.
 _STEADY = 0.25
+_BEYOND_CHANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def diagnose(state: State) -> Diagnosis:
             clear = ranked.score.observable and k < _PREDICTED and np.isfinite(ranked.score.sigmas).all()
             left = left_by(evidence, ranked.score, points) if clear else None
             suspects.append(Suspect(ranked, tuple(aliases_of(k, matrix, scores)), left))
-        selection, notes = checked(selection, suspects)
+        selection, notes = checked(selection, suspects, implausible(evidence, state.session.length_unit))
         depends = dependences(evidence, selection.empirical)
         rotation, translation = np.sqrt(evidence.null.variances[:2])
         found = Diagnosis(
@@ -84,19 +85,25 @@ def diagnose(state: State) -> Diagnosis:
         return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
 
 
-def checked(selection: Selection, suspects: list[Suspect]) -> tuple[Selection, tuple[str, ...]]:
-    """An effect that one view carries, or that does not help on views left out, is not named."""
+def checked(selection: Selection, suspects: list[Suspect], implausible: bool) -> tuple[Selection, tuple[str, ...]]:
+    """An effect that does not help on views left out, or that one view carries, is not named.
+
+    What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
+    beyond chance.
+    """
     if selection.verdict != "missing_effect":
         return selection, ()
-    name = selection.named[0].name
-    left = next((s.left for s in suspects if s.name == name), None)
+    first = selection.named[0]
+    left = next((s.left for s in suspects if s.name == first.name), None)
     if left is None:
         return selection, ()
     if left.steadiness < _STEADY:
-        note = f"{name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
+        note = f"{first.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
+        verdict = "unknown_effect" if implausible or first.adjusted < _BEYOND_CHANCE else "adequate"
     elif left.heldout > 1 - left.heldout_sigma:
         share = f"{left.heldout:.2f} ± {left.heldout_sigma:.2f}"
-        note = f"{name} would not help on views left out (mean square {share} of now)"
+        note = f"{first.name} would not help on views left out (mean square {share} of now)"
+        verdict = "unknown_effect" if implausible else "adequate"
     else:
         return selection, ()
-    return Selection("unknown_effect", (), selection.ranked, selection.empirical), (note,)
+    return Selection(verdict, (), selection.ranked, selection.empirical), (note,)

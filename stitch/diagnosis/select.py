@@ -18,6 +18,8 @@ _NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
 ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
 # A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name.
 _ODDS = float(np.log(20.0))
+# Log evidence over "nothing is missing" that a name needs: 12 to 1.
+_GAIN = 2.5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
@@ -61,7 +63,7 @@ def select(evidence: PoseEvidence, candidates: Sequence[Candidate], length_unit:
     """Name what is missing, or abstain."""
     ranked, empirical = rank(score_all(evidence, candidates))
     best = next((r for r in ranked if _nameable(r)), None)
-    stray = empirical[0] if empirical and empirical[0].adjusted < ALPHA_UNKNOWN else None
+    stray = next((r for r in empirical[:1] if r.adjusted < ALPHA_UNKNOWN and r.score.gain > _GAIN), None)
     if best is None and stray is None:
         verdict = "unknown_effect" if implausible(evidence, length_unit) else "adequate"
         return Selection(verdict, (), ranked, empirical)
@@ -103,10 +105,15 @@ def implausible(evidence: PoseEvidence, length_unit: str) -> bool:
 
 
 def _nameable(r: Ranked) -> bool:
-    """Significant, seen, and of a size that somebody would believe."""
+    """Significant, more likely than chance, seen, and of a size that somebody would believe.
+
+    Both are asked for: a p-value forgets how little a small effect of many parameters explains, the evidence
+    does not know how many were tried.
+    """
     kept = [p for p, k in zip(r.score.candidate.parameters, r.score.form.keep, strict=True) if k]
     believable = all(abs(v) < p.limit for v, p in zip(r.score.values, kept, strict=True))
-    return r.physical and r.score.observable and r.adjusted < ALPHA_NAME and believable
+    likely = r.adjusted < ALPHA_NAME and r.score.gain > _GAIN
+    return r.physical and r.score.observable and likely and believable
 
 
 def _pair(evidence: PoseEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:

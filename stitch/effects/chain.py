@@ -15,7 +15,7 @@ from pykdtree.kdtree import KDTree
 from stitch import frames
 from stitch import robot as kinematics
 from stitch.capture import Capture
-from stitch.effects.contract import Effect, Parameter
+from stitch.effects.contract import EVERY_VIEW, Effect, Parameter
 from stitch.effects.robot import Links
 from stitch.effects.views import ScanView, Views, views_of
 from stitch.frames import Array, Indices
@@ -46,13 +46,15 @@ class Chain:
 
     def _grid(self, parameter: Parameter) -> tuple[float, ...]:
         # An event can come before any view but the first two and the last: one view alone shows no event.
-        return tuple(float(v) for v in range(2, self.views.count - 1)) if parameter.grid == (-1.0,) else parameter.grid
+        return (
+            tuple(float(v) for v in range(2, self.views.count - 1)) if parameter.grid == EVERY_VIEW else parameter.grid
+        )
 
     def arguments(self, effect: Effect, values: Array) -> dict[str, float | Array]:
         """Keyword arguments of the effect's function."""
         return effect.arguments(values, self.views.joints.shape[1], len(self.views.torques.names))
 
-    def offers(self, effect: Effect) -> tuple[str, ...]:
+    def lacks(self, effect: Effect) -> tuple[str, ...]:
         """What an effect needs and this session has not."""
         return tuple(need for need in effect.needs if not (self.has_intensity if need == "intensity"
                                                            else self.views.has(need)))  # fmt: skip
@@ -179,6 +181,9 @@ def twists(chain: Chain, terms: Sequence[Term], term: Term, T_mount: Array, cent
     to_centre = frames.make(np.eye(3), -centre)
     out = []
     for i, parameter in enumerate(chain.parameters(term.effect)):
+        if parameter.discrete:
+            out.append(np.zeros((chain.views.count, 6)))
+            continue
         step = 0.1 * parameter.typical * np.eye(len(term.values))[i]
         both = []
         for sign in (1, -1):

@@ -26,6 +26,8 @@ PLACES = {
     "part": "(views: Views, parameters) → twists (V, 6): the part sits displaced by exp(twist), reference frame",
     "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
 }
+# Stands for all views of the session in a grid.
+EVERY_VIEW = (-1.0,)
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Units are written for millimetres; a session in metres has the same unit with m.
 _PER_MM = {"mm": 1.0, "m": 1e-3}
@@ -40,6 +42,11 @@ class Parameter:
     typical: float  # the size a real cell may well have; the prior's sigma
     limit: float  # beyond this nobody would believe it
     grid: tuple[float, ...] = ()  # values tried one by one: time constants, the view of an event
+
+    @property
+    def discrete(self) -> bool:
+        """True for the view of an event: it is tried, never fitted."""
+        return self.unit == "view"
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,11 @@ class Spec:
 def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
     """One number."""
     return Spec("number", unit, typical, limit, tuple(grid))
+
+
+def event() -> Spec:
+    """The view from which on something is different; every view that can show it is tried."""
+    return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
 
 
 def per_joint(unit: str, typical: float, limit: float) -> Spec:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stitch.effects.contract import Effect, Spec, number, twist
+from stitch.effects.contract import Effect, Spec, event, number, twist
 from stitch.effects.views import ScanView, Views
 from stitch.frames import Array
 
@@ -28,7 +28,7 @@ def empirical_effects(views: Views) -> list[Effect]:
         if np.ptp(course) > 0 and len(np.unique(course)) > 2:
             out += [_bias(name, course, 1), _bias(name, course, 2), _mount(name, course, 1), _mount(name, course, 2)]
     out.append(_effect("an event", "knock_of_mount", "mount", _step,
-                       xi=twist("", 6e-4, 0.2), v=number("view", 1.0, 1e9, grid=(-1.0,))))  # fmt: skip
+                       xi=twist("", 6e-4, 0.2), v=event()))  # fmt: skip
     return out
 
 

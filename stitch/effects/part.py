@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.effects.contract import effect, number, twist
+from stitch.effects.contract import effect, event, number, twist
 from stitch.effects.robot import warmer
 from stitch.effects.views import ScanView, Views
 from stitch.frames import Array
@@ -14,7 +14,7 @@ def fixture_drift(views: Views, xi: Array) -> Array:
     return np.outer(views.hours, xi)
 
 
-@effect("part", xi=twist("", 6e-4, 0.2), v=number("view", typical=1.0, limit=1e9, grid=(-1.0,)))
+@effect("part", xi=twist("", 6e-4, 0.2), v=event())
 def part_slip(views: Views, xi: Array, v: float) -> Array:
     """from view v on (counted from 0), the part sits displaced by ξ"""
     return np.outer(np.arange(views.count) >= v, xi)

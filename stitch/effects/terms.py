@@ -28,7 +28,7 @@ def require(chain: Chain, effect: Effect) -> None:
     Raises:
         InputError: names what is missing.
     """
-    missing = chain.offers(effect)
+    missing = chain.lacks(effect)
     if missing:
         words = [_MENDS.get(need, f"a column {need} in views.csv") for need in missing]
         raise InputError(f"effect {effect.name} needs {' and '.join(words)}, which this session does not have")
