@@ -204,7 +204,9 @@ def test_write_truth_holds_every_number_a_judge_needs(small, tmp_path):
     measured = make(small, {"backlash": 1.0}, 3)
     write_truth(tmp_path / "t.json", measured, 3)
     truth = json.loads((tmp_path / "t.json").read_text())
-    assert np.allclose(truth["hand_eye"], measured.T_mount) and np.allclose(truth["poses"], measured.T_reference_scanner)
+    assert np.allclose(truth["hand_eye"], measured.T_mount) and np.allclose(
+        truth["poses"], measured.T_reference_scanner
+    )
     assert truth["hidden"]["backlash"] and truth["targets"] == {"ball1": [0.0, 0.0, 0.0]}
     # The stated hand-eye is off by what the scene says: 0.3° and 2 mm.
     difference = np.linalg.inv(measured.T_mount) @ measured.T_coarse
@@ -231,7 +233,12 @@ def judged(tmp_path, hidden=HIDDEN, diagnosis=None, fitted=None, unit="mm", off=
     stated[:3, 3] *= scale
     run = tmp_path / "run"
     run.mkdir(exist_ok=True)
-    result = {"length_unit": unit, "hand_eye": stated.tolist(), "hand_eye_coarse": stated.tolist(), "effects": fitted or {}}
+    result = {
+        "length_unit": unit,
+        "hand_eye": stated.tolist(),
+        "hand_eye_coarse": stated.tolist(),
+        "effects": fitted or {},
+    }
     (run / "result.json").write_text(json.dumps(result))
     (run / "diagnosis.json").unlink(missing_ok=True)
     if diagnosis:
