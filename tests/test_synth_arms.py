@@ -117,7 +117,7 @@ def test_inverse_kinematics_respects_limits():
     free = ARMS["ABB IRB 120"]
     locked = replace(free, lower=np.where(np.arange(6) == 0, free.home - 0.05, free.lower),
                      upper=np.where(np.arange(6) == 0, free.home + 0.05, free.upper))  # fmt: skip
-    T = kinematics.flange(free, free.home + [0.8, 0, 0, 0, 0, 0])
+    T = kinematics.flange(free, free.home + 0.8 * (np.arange(6) == 0))
     found = kinematics.inverse(locked, T, free.home)
     assert found is None or abs(found[0] - free.home[0]) < 0.05
 

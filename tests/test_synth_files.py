@@ -180,7 +180,8 @@ def test_one_view_is_too_few(small, tmp_path):
         synth(str(small), tmp_path / "s", [], 0, 1)
 
 
-def test_a_part_out_of_reach_says_so_and_writes_nothing(small, tmp_path):
+def test_a_part_out_of_reach_says_so_and_writes_nothing(small, tmp_path, monkeypatch):
+    monkeypatch.setattr("data_synth.planning._ATTEMPTS", 3)
     small.write_text(SMALL_SCENE.replace("xyz = [1450.0, 650.0, 900.0]", "xyz = [9000.0, 650.0, 900.0]"))
     with pytest.raises(NoResultError, match="view 0 cannot be reached"):
         synth(str(small), tmp_path / "s")
