@@ -45,10 +45,15 @@ class Cloud:
     time: Array | None = None  # s after the view's time, line scanners only
 
 
+def half_field(scanner: Scanner) -> Array:
+    """(2,) largest x/z and y/z that the scanner sees."""
+    y = scanner.field_of_view_y or scanner.field_of_view
+    return np.asarray(np.tan(np.radians([scanner.field_of_view / 2, y / 2])))
+
+
 def rays(scanner: Scanner) -> Array:
     """(rows·columns, 3) directions with z = 1, row by row."""
-    half_x = np.tan(np.radians(scanner.field_of_view / 2))
-    half_y = np.tan(np.radians((scanner.field_of_view_y or scanner.field_of_view) / 2))
+    half_x, half_y = half_field(scanner)
     y = np.linspace(-half_y, half_y, scanner.rows) if scanner.kind == "area" else np.zeros(1)
     a, b = np.meshgrid(np.linspace(-half_x, half_x, scanner.columns), y)
     return np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1)
@@ -155,8 +160,7 @@ def _field(directions: Array, scanner: Scanner, weights: Array) -> Array:
     """Smooth error along the ray at directions (N, 3) with z = 1."""
     if not scanner.field_error:
         return np.zeros(len(directions))
-    half = np.tan(np.radians(scanner.field_of_view / 2))
-    u, v = (np.pi * (directions[:, i] / half + 1) / 2 for i in (0, 1))
+    u, v = (np.pi * (directions[:, :2] / half_field(scanner) + 1) / 2).T
     return np.asarray(
         np.einsum("ij,in,jn->n", weights, np.cos(np.outer(np.arange(3), u)), np.cos(np.outer(np.arange(3), v)))
     )
