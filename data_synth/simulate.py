@@ -10,7 +10,7 @@ from data_synth import kinematics, nature
 from data_synth.labelled import targets_of
 from data_synth.moment import Moment, Plan
 from data_synth.planning import plan_views
-from data_synth.scanner import Cloud, field_map, half_field, scan
+from data_synth.scanner import Cloud, field_map, half_field, profile_times, scan
 from data_synth.scene import Scene
 from data_synth.shapes import build_shape, load_mesh
 from stitch import frames
@@ -131,9 +131,7 @@ def _labelled(
 
 def _sweep(scene: Scene, moment: Moment) -> Array:
     """(K, n) joint angles of the profiles less those of the view."""
-    profiles = scene.scanner.rows
-    time = (np.arange(profiles) - (profiles - 1) / 2) * scene.scanner.sweep / profiles / scene.scanner.speed
-    return np.asarray(time[:, None] * moment.velocity)
+    return np.asarray(profile_times(scene.scanner)[:, None] * moment.velocity)
 
 
 def _assemble(scene: Scene, moment: Moment, along: Array, rail: float, T_mount: Array, cloud: Cloud) -> Cloud:
