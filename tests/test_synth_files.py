@@ -15,6 +15,7 @@ from data_synth import nature, scene
 from data_synth.commands import hidden_of, judge, make, synth, truth_path
 from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
+from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.session import load_session
 
@@ -186,6 +187,31 @@ def test_a_part_out_of_reach_says_so_and_writes_nothing(small, tmp_path, monkeyp
     with pytest.raises(NoResultError, match="view 0 cannot be reached"):
         synth(str(small), tmp_path / "s")
     assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["synth", "nowhere", "OUT"], "nowhere: no such scene; there are blade"),
+        (["synth", "blade", "OUT", "--hide", "warp"], "--hide warp: nature knows range_scale"),
+        (["synth", "blade", "OUT", "--seed", "-1"], "--seed -1"),
+        (["reveal", "OUT", "truth.json"], "truth.json: not found"),
+    ],
+)
+def test_command_line_ends_in_one_line_and_exit_code_2(arguments, says, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "out") if a == "OUT" else a for a in arguments])
+    assert ended.value.code == 2 and list(tmp_path.iterdir()) == []
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and says in lines[0]
+
+
+def test_reveal_prints_json_alone(tmp_path, capsys):
+    judged(tmp_path, diagnosis=NAMED)
+    with pytest.raises(SystemExit) as ended:
+        main(["reveal", str(tmp_path / "run"), str(tmp_path / "truth.json"), "--json"])
+    assert ended.value.code == 0
+    assert json.loads(capsys.readouterr().out)["judgement"] == "right"
 
 
 def test_truth_must_be_a_json_file(small, tmp_path):
