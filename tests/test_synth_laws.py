@@ -292,3 +292,36 @@ def test_nothing_hidden_leaves_noise_alone(scene):
     error = 1.36 / np.sqrt(len(z))  # standard error of a normal sample's quartile
     assert np.abs(quartiles - [-0.6745, 0.0, 0.6745]).max() < 5 * error
     assert np.abs(z).max() < 6
+
+
+@pytest.mark.parametrize(
+    "name", ["range_scale", "part_growth", "part_sag", "part_slip", "fixture_drift", "mount_drift"]
+)
+def test_labelled_points_follow_the_laws_too(name):
+    """Centres of spheres move with the part and are reported through the scanner, as the cloud is."""
+    scene = clean("spheres", rays=24, noise=0.0)
+    scene = replace(scene, part=replace(scene.part, sigma=0.0))
+    measured = simulated(scene, {name: 3.0}, 1, 3)
+    p = measured.hidden[name]
+    down = scene.T_reference_part[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    compared = 0
+    for target, seen in measured.labelled.items():
+        for v, T in enumerate(measured.T_reference_scanner):
+            place = frames.transform(frames.inverse(scene.T_reference_part), measured.targets[target][None])[0]
+            T_part, factor = scene.T_reference_part, 1.0
+            if name == "part_growth":
+                course = measured.covariates["part_temperature_c"]
+                place = place * (1 + p["g"] * (course[v] - course[0]))
+            elif name == "part_sag":
+                place = place + p["kappa"] * place[2] ** 2 * down
+            elif name == "part_slip" and v >= p["v"]:
+                T_part = twist(p) @ T_part
+            elif name == "fixture_drift":
+                T_part = twist(p, measured.times[v] / HOUR) @ T_part
+            elif name == "range_scale":
+                factor = 1 + p["s"]
+            expected = factor * frames.transform(frames.inverse(T) @ T_part, place[None])[0]
+            if np.isfinite(seen[v]).all():
+                compared += 1
+                assert seen[v] == pytest.approx(expected, abs=1e-9)
+    assert compared > 8
