@@ -33,12 +33,17 @@ def synth(
         raise InputError(f"{out}: exists already; name another folder")
     if views is not None and views < 2:
         raise InputError(f"--views {views}: stitching needs at least 2")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: use 0 or more")
+    target = truth or truth_path(out)
+    if target.suffix != ".json":
+        # The part's mesh lies beside it under the same name.
+        raise InputError(f"--truth {target}: name a file that ends in .json")
     measured = make(scene, hidden_of(hide or []), seed, views)
     scratch = out.with_name(f".{out.name}.writing")
     shutil.rmtree(scratch, ignore_errors=True)
     write_session(scratch, measured, out.name)
     scratch.rename(out)
-    target = truth or truth_path(out)
     write_truth(target, measured, seed)
     Console(stderr=True).print(
         f"{len(measured.clouds)} views, {sum(len(c.points) for c in measured.clouds):,} points → {out}\n"
@@ -68,7 +73,9 @@ def hidden_of(options: list[str]) -> dict[str, float]:
         try:
             hidden[name] = float(size) if size else 1.0
         except ValueError:
-            raise InputError(f"--hide {option}: {size!r} is not a number") from None
+            hidden[name] = np.nan
+        if not np.isfinite(hidden[name]):
+            raise InputError(f"--hide {option}: {size!r} is not a number")
     return hidden
 
 
@@ -97,9 +104,10 @@ def judge(run: Path, truth: Path) -> dict[str, Any]:
     """Hidden, named and fitted effects, and the hand-eye's true error (mm at 400 mm before the scanner).
 
     Raises:
-        InputError: a file is missing or not JSON.
+        InputError: a file is missing, not JSON or without what belongs there.
     """
-    told, result = _read(truth), _read(run / "result.json")
+    told = _read(truth, "hidden", "hand_eye")
+    result = _read(run / "result.json", "length_unit", "hand_eye", "hand_eye_coarse")
     diagnosis = _read(run / "diagnosis.json") if (run / "diagnosis.json").is_file() else {}
     hidden, fitted = told["hidden"], result.get("effects", {})
     place = np.array([[0.0, 0.0, 400.0]])
@@ -143,11 +151,14 @@ def _judgement(hidden: set[str], verdict: str | None, named: set[str], fitted: s
     return "wrong name"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, *needed: str) -> dict[str, Any]:
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: not found") from None
     except (json.JSONDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
         raise InputError(f"{path}: not a JSON file: {error}") from None
+    for key in needed:
+        if not isinstance(document, dict) or key not in document:
+            raise InputError(f"{path}: {key} is missing; is it the right file?")
     return document

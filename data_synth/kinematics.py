@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s², base frame
 _ANGLE_STEP = 1e-5  # rad, for the slope of potential energy
 _LEVER = 300.0  # mm: a radian of orientation error counts as much as this in position
+_CLOSE = 1e-6  # mm: a pose is reached
+_NEWTON_STEPS = 8
 
 
 def links(arm: Arm, q: Array) -> Array:
@@ -65,19 +67,30 @@ def inverse(arm: Arm, T_base_flange: Array, near: Array) -> Array | None:
         found = least_squares(
             _off, np.clip(start, lower, upper), args=(arm, T_base_flange), bounds=(lower, upper), max_nfev=40
         )
-        if np.abs(found.fun).max() < 1e-6:
-            return np.asarray(found.x)
+        q = found.x
+        # With a joint to spare the search above creeps along its valley; short Newton steps end it.
+        for _ in range(_NEWTON_STEPS):
+            off = _off(q, arm, T_base_flange)
+            if np.abs(off).max() < _CLOSE:
+                return np.asarray(q)
+            q = np.clip(q - np.linalg.lstsq(_slope(q, arm, T_base_flange), off, rcond=None)[0], lower, upper)
     return None
 
 
 def velocity(arm: Arm, q: Array, v: Array) -> Array:
     """Smallest joint velocities (n,) rad/s at q that move the flange by v (3,) mm/s in its own frame, unturned."""
     here = flange(arm, q)
+    wanted = np.append(np.zeros(3), here[:3, :3] @ v)
+    return np.asarray(np.linalg.lstsq(_slope(q, arm, here), wanted, rcond=None)[0])
+
+
+def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
+    """(6, n) change of `_off` a radian of every joint; central differences."""
     step = 1e-6
-    columns = [_off(q + e, arm, here) / step for e in np.eye(arm.joints) * step]
-    return np.asarray(
-        np.linalg.lstsq(np.column_stack(columns), np.append(np.zeros(3), here[:3, :3] @ v), rcond=None)[0]
-    )
+    columns = [
+        (_off(q + e, arm, wanted) - _off(q - e, arm, wanted)) / (2 * step) for e in np.eye(arm.joints) * step
+    ]  # fmt: skip
+    return np.column_stack(columns)
 
 
 def _off(q: Array, arm: Arm, wanted: Array) -> Array:

@@ -91,5 +91,8 @@ def draw(
         if name not in LAWS:
             raise ValueError(f"nature knows no {name!r}; it knows {', '.join(LAWS)}")
     told = {name: LAWS[name].draw(size, plan, rng) for name, size in hidden.items()}
-    quiet = [(name, LAWS[name].draw(size * small, plan, rng)) for name, size in SMALL.items() if small]
+    # A hidden law takes the place of its quiet one: what the truth tells of it is then all there is.
+    quiet = [
+        (name, LAWS[name].draw(size * small, plan, rng)) for name, size in SMALL.items() if small and name not in told
+    ]
     return Nature((*told.items(), *quiet)), told

@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_BLOCK = 1 << 18  # rays cast at a time
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,16 @@ class Cloud:
     time: Array | None = None  # s after the view's time, line scanners only
 
 
-def rays(scanner: Scanner) -> Array:
-    """(rows·columns, 3) directions with z = 1, row by row."""
-    half_x = np.tan(np.radians(scanner.field_of_view / 2))
-    half_y = np.tan(np.radians((scanner.field_of_view_y or scanner.field_of_view) / 2))
-    y = np.linspace(-half_y, half_y, scanner.rows) if scanner.kind == "area" else np.zeros(1)
+def half_field(scanner: Scanner) -> Array:
+    """(2,) largest x/z and y/z that the scanner sees."""
+    y = scanner.field_of_view_y or scanner.field_of_view
+    return np.asarray(np.tan(np.radians([scanner.field_of_view / 2, y / 2])))
+
+
+def rays(scanner: Scanner, rows: slice = slice(None)) -> Array:
+    """(rows·columns, 3) directions with z = 1, row by row; all rows or some of them."""
+    half_x, half_y = half_field(scanner)
+    y = np.linspace(-half_y, half_y, scanner.rows)[rows] if scanner.kind == "area" else np.zeros(1)
     a, b = np.meshgrid(np.linspace(-half_x, half_x, scanner.columns), y)
     return np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1)
 
@@ -92,27 +98,49 @@ def scan(
 
     Points of a line scanner are given in the frame of their own profile.
     """
-    directions = rays(scanner)
-    time = None
-    if scanner.kind == "line":
-        profiles = len(T_part_scanner)
-        time = np.repeat((np.arange(profiles) - (profiles - 1) / 2) * scanner.sweep / profiles / scanner.speed,
-                         len(directions))  # fmt: skip
-        T_part_scanner = np.repeat(T_part_scanner, len(directions), axis=0)
-        directions = np.tile(directions, (profiles, 1))
-    _, distance, cosine = cast(mesh, T_part_scanner, directions)
-    albedo = _albedo(distance, directions, T_part_scanner)
-    distance = _mixed(distance.reshape(scanner.rows, scanner.columns), scanner, rng).ravel()
-    seen = _returned(distance, cosine, albedo, directions, scanner, rng)
-    d, r, cos = directions[seen], distance[seen], cosine[seen]
+    # Block by block: a hundred numbers a ray would fill the memory where a view has millions.
+    blocks = _blocks(scanner)
+    distance, cosine, albedo = np.empty((3, scanner.rows, scanner.columns))
+    for rows in blocks:
+        directions, poses = _aim(scanner, T_part_scanner, rows)
+        _, far, cos = cast(mesh, poses, directions)
+        shape = (-1, scanner.columns)
+        distance[rows], cosine[rows] = far.reshape(shape), cos.reshape(shape)
+        albedo[rows] = _albedo(far, directions, poses).reshape(shape)
+    _mix(distance, scanner, rng, blocks)
+    seen = np.concatenate([_returned(distance, cosine, albedo, scanner, rows, rng) for rows in blocks])
+    d = np.concatenate([_aim(scanner, T_part_scanner, rows)[0][seen[rows].ravel()] for rows in blocks])
+    r, cos, bright = distance[seen], cosine[seen], albedo[seen]
     sigma = scanner.noise * (r / scanner.standoff) ** 2
     r = r + sigma * rng.standard_normal(len(r)) + _field(d, scanner, field_weights)
     if scanner.quantisation:
         r = np.round(r / scanner.quantisation) * scanner.quantisation
-    intensity = albedo[seen] * cos * (scanner.standoff / r) ** 2
+    intensity = bright * cos * (scanner.standoff / r) ** 2
     intensity *= 1 + scanner.intensity_noise * rng.standard_normal(len(r))
     points = d * (r / np.linalg.norm(d, axis=1))[:, None]
-    return Cloud(points, intensity, cos, None if time is None else time[seen])
+    return Cloud(
+        points, intensity, cos, profile_times(scanner)[np.nonzero(seen)[0]] if scanner.kind == "line" else None
+    )
+
+
+def profile_times(scanner: Scanner) -> Array:
+    """(rows,) s from the middle of a line scanner's sweep to each profile."""
+    middle = (scanner.rows - 1) / 2
+    return np.asarray((np.arange(scanner.rows) - middle) * scanner.sweep / scanner.rows / scanner.speed)
+
+
+def _blocks(scanner: Scanner) -> list[slice]:
+    rows = max(1, _BLOCK // scanner.columns)
+    return [slice(first, min(first + rows, scanner.rows)) for first in range(0, scanner.rows, rows)]
+
+
+def _aim(scanner: Scanner, T_part_scanner: Array, rows: slice) -> tuple[Array, Array]:
+    """Directions of some rows, and the pose that they share (4, 4) or one for each."""
+    directions = rays(scanner, rows)
+    if scanner.kind == "area":
+        return directions, T_part_scanner
+    poses = T_part_scanner[rows]
+    return np.tile(directions, (len(poses), 1)), np.repeat(poses, len(directions), axis=0)
 
 
 def _albedo(distance: Array, directions: Array, T_part_scanner: Array) -> Array:
@@ -125,38 +153,48 @@ def _albedo(distance: Array, directions: Array, T_part_scanner: Array) -> Array:
     return np.asarray(0.625 + 0.125 * waves)
 
 
-def _mixed(image: Array, scanner: Scanner, rng: np.random.Generator) -> Array:
-    """Pixels on an edge see front and back at once and report something between."""
+def _mix(image: Array, scanner: Scanner, rng: np.random.Generator, blocks: list[slice]) -> None:
+    """Pixels on an edge see front and back at once and report something between; changes the ranges in place."""
     if not scanner.mixed_pixels:
-        return image
-    beside = np.full_like(image, np.inf)
-    beside[:, 1:] = image[:, :-1]
+        return
+    chosen = [_edges(image[rows], scanner) & (rng.random(image[rows].shape) < scanner.mixed_pixels) for rows in blocks]
+    for rows, edge in zip(blocks, chosen, strict=True):
+        share = rng.random(edge.shape)[edge]
+        here = image[rows]
+        beside = np.roll(here, 1, axis=1)[edge]
+        here[edge] += share * (beside - here[edge])
+
+
+def _edges(image: Array, scanner: Scanner) -> NDArray[np.bool_]:
+    """Pixels that stand far before or behind their left neighbour."""
     pixel = 2 * np.tan(np.radians(scanner.field_of_view / 2)) / scanner.columns
+    edge = np.zeros(image.shape, bool)
     with np.errstate(invalid="ignore"):
-        step = beside - image
+        step = image[:, :-1] - image[:, 1:]
         # Steeper than 80° between neighbours is a jump, not a surface.
-        edge = np.isfinite(step) & (np.abs(step) > 6 * pixel * image)
-    chosen = edge & (rng.random(image.shape) < scanner.mixed_pixels)
-    return np.where(chosen, image + rng.random(image.shape) * np.where(edge, step, 0.0), image)
+        edge[:, 1:] = np.isfinite(step) & (np.abs(step) > 6 * pixel * image[:, 1:])
+    return edge
 
 
 def _returned(
-    distance: Array, cosine: Array, albedo: Array, directions: Array, scanner: Scanner, rng: np.random.Generator
+    distance: Array, cosine: Array, albedo: Array, scanner: Scanner, rows: slice, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    depth = distance / np.linalg.norm(directions, axis=1)
+    """Which rays of some rows come back; all images are (rows, columns)."""
+    distance, cosine, albedo = distance[rows], cosine[rows], albedo[rows]
+    slant = np.linalg.norm(rays(scanner, rows), axis=1).reshape(-1, scanner.columns)
+    depth = distance / slant
     seen = np.isfinite(distance) & (np.abs(depth - scanner.standoff) < scanner.depth_of_field / 2)
     limit = np.cos(np.radians(scanner.grazing))
     fading = np.clip((cosine - limit) / (0.5 * limit), 0.0, 1.0)
     dark = 1.0 - scanner.dropout * np.clip((0.5 - albedo) / 0.25, 0.0, 1.0)
-    return seen & (rng.random(len(distance)) < fading * dark)
+    return np.asarray(seen & (rng.random(distance.shape) < fading * dark))
 
 
 def _field(directions: Array, scanner: Scanner, weights: Array) -> Array:
     """Smooth error along the ray at directions (N, 3) with z = 1."""
     if not scanner.field_error:
         return np.zeros(len(directions))
-    half = np.tan(np.radians(scanner.field_of_view / 2))
-    u, v = (np.pi * (directions[:, i] / half + 1) / 2 for i in (0, 1))
+    u, v = (np.pi * (directions[:, :2] / half_field(scanner) + 1) / 2).T
     return np.asarray(
         np.einsum("ij,in,jn->n", weights, np.cos(np.outer(np.arange(3), u)), np.cos(np.outer(np.arange(3), v)))
     )

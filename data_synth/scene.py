@@ -16,6 +16,7 @@ from stitch.errors import InputError
 
 Array = NDArray[np.float64]
 SCENES = Path(__file__).parent / "scenes"
+_KINDS = {"scanner": ("area", "line"), "plan": ("turntable", "orbit", "raster", "sweep")}
 
 
 @dataclass(frozen=True)
@@ -113,12 +114,17 @@ def names() -> list[str]:
 
 
 def _scene(path: Path, document: dict[str, Any]) -> Scene:
+    for key in ("mount", "robot", "scanner"):
+        if key not in document:
+            raise ValueError(f"{key} is missing")
     robot, scanner = dict(document.pop("robot")), dict(document.pop("scanner"))
     payload = robot.pop("payload", {"mass": 0.0, "com": [0.0, 0.0, 0.0]})
     if robot.get("arm") not in ARMS:
         raise ValueError(f"robot.arm is {robot.get('arm')!r}; there are {', '.join(ARMS)}")
+    if not isinstance(payload, dict) or set(payload) != {"mass", "com"}:
+        raise ValueError("robot.payload is { mass = kg, com = [x, y, z] }")
     arm = with_payload(ARMS[robot.pop("arm")], payload["mass"], tuple(payload["com"]))
-    T_mount = _mount(scanner.pop("xyz"), scanner.pop("looks"), scanner.pop("x_axis"))
+    T_mount = _mount(*(_vector(scanner, key) for key in ("xyz", "looks", "x_axis")))
     table = {
         "part": _read(PartPlace, "part", document.pop("part", {})),
         "plan": _read(ViewPlan, "plan", document.pop("plan", {})),
@@ -134,16 +140,48 @@ def _scene(path: Path, document: dict[str, Any]) -> Scene:
                               "folder": path.parent})  # fmt: skip
     if scene.mount not in ("eye_to_hand", "eye_in_hand"):
         raise ValueError(f"mount is {scene.mount!r}; use 'eye_to_hand' or 'eye_in_hand'")
+    for where, kinds in _KINDS.items():
+        if (kind := getattr(scene, where).kind) not in kinds:
+            raise ValueError(f"{where}.kind is {kind!r}; use {', '.join(kinds)}")
+    if scene.plan.views < 2:
+        raise ValueError(f"plan.views is {scene.plan.views}; stitching needs at least 2")
+    if not scene.useful or not set(scene.useful) <= set(range(arm.joints)):
+        raise ValueError(f"robot.useful names joints from 1 to {arm.joints}")
     return scene  # type: ignore[no-any-return]
 
 
 def _read(kind: type[Any], where: str, table: dict[str, Any]) -> Any:
-    """A dataclass from a table; lists become tuples, unknown keys are refused."""
-    known = {f.name for f in fields(kind)}
-    for key in table:
+    """A dataclass from a table; lists become tuples, unknown keys and values of another kind are refused."""
+    known = {f.name: f.default for f in fields(kind)}
+    for key, value in table.items():
+        name = f"{where}.{key}" if where else key
         if key not in known:
-            raise ValueError(f"unknown key {where + '.' if where else ''}{key}; known are {', '.join(sorted(known))}")
+            raise ValueError(f"unknown key {name}; known are {', '.join(sorted(known))}")
+        if not _like(value, known[key]):
+            raise ValueError(f"{name} is {value!r}; write something like {known[key]!r}")
     return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
+
+
+def _like(value: Any, default: Any) -> bool:
+    """True if the value may stand where the default does."""
+    if isinstance(default, tuple):
+        return isinstance(value, (list, tuple)) and all(_like(x, default[0]) for x in value) and (
+            len(value) == len(default) or isinstance(default[0], int)
+        )  # fmt: skip
+    if isinstance(default, (bool, str)):
+        return isinstance(value, type(default))
+    if isinstance(default, int):
+        return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    if isinstance(default, float):
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return True
+
+
+def _vector(table: dict[str, Any], key: str) -> list[float]:
+    value = table.pop(key, None)
+    if not isinstance(value, list) or len(value) != 3 or not all(_like(x, 0.0) for x in value):
+        raise ValueError(f"scanner.{key} is {value!r}; write three numbers")
+    return value
 
 
 def _mount(xyz: list[float], looks: list[float], x_axis: list[float]) -> Array:

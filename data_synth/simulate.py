@@ -10,7 +10,7 @@ from data_synth import kinematics, nature
 from data_synth.labelled import targets_of
 from data_synth.moment import Moment, Plan
 from data_synth.planning import plan_views
-from data_synth.scanner import Cloud, field_map, scan
+from data_synth.scanner import Cloud, field_map, half_field, profile_times, scan
 from data_synth.scene import Scene
 from data_synth.shapes import build_shape, load_mesh
 from stitch import frames
@@ -124,16 +124,14 @@ def _labelled(
     seen = frames.transform(T, places)
     ideal = Cloud(seen, np.full(len(seen), 0.5), np.ones(len(seen)))
     points = laws.act("points", moment, ideal).points + scene.part.sigma * rng.standard_normal(seen.shape)
-    half = np.tan(np.radians(scene.scanner.field_of_view / 2))
-    inside = (np.abs(seen[:, :2]) < half * seen[:, 2:]).all(axis=1)
+    inside = (np.abs(seen[:, :2]) < half_field(scene.scanner) * seen[:, 2:]).all(axis=1)
+    inside &= np.abs(seen[:, 2] - scene.scanner.standoff) < scene.scanner.depth_of_field / 2
     return np.where(inside[:, None], points, np.nan)
 
 
 def _sweep(scene: Scene, moment: Moment) -> Array:
     """(K, n) joint angles of the profiles less those of the view."""
-    profiles = scene.scanner.rows
-    time = (np.arange(profiles) - (profiles - 1) / 2) * scene.scanner.sweep / profiles / scene.scanner.speed
-    return np.asarray(time[:, None] * moment.velocity)
+    return np.asarray(profile_times(scene.scanner)[:, None] * moment.velocity)
 
 
 def _assemble(scene: Scene, moment: Moment, along: Array, rail: float, T_mount: Array, cloud: Cloud) -> Cloud:

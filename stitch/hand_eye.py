@@ -37,7 +37,7 @@ class HandEye:
 
     T_mount: Array  # (4, 4) T_mount_scanner
     covariance: Array  # (6, 6)
-    inflation: float  # factor on the covariance that the left-out views asked for, ≥ 1
+    inflation: float  # factor on the covariance that few views and the left-out ones ask for, ≥ 1
     repeatability: tuple[Repeatability, ...]  # per capture
     heldout_ratio: float  # rms of left-out views over rms of the fit, same correspondences
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
@@ -78,7 +78,7 @@ def fit_hand_eye(
         for fold in e.folds():
             fewer = _without(blocks, k, e, s, t, fold, prior)
             outside += e.squares(fold, (fewer[:, 0], x[:, 0]))
-    inflation = _jackknife_inflation(np.array(left_out), covariance)
+    inflation = _jackknife_inflation(np.array(left_out), covariance) * _student(len(left_out))
     ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
     return HandEye(
         T_mount @ frames.exp(x[:6, 0]), covariance[:6, :6] * inflation, inflation, tuple(scatter), ratio,
@@ -197,6 +197,11 @@ def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array
     scale = 1 / np.sqrt(np.diag(matrix))
     covariance: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0)), covariance
+
+
+def _student(views: int) -> float:
+    """Variance of Student's t: the scatter that all sigmas rest on is itself known from so many views only."""
+    return (views - 1) / (views - 3) if views > 4 else 3.0
 
 
 def _jackknife_inflation(left_out: Array, covariance: Array) -> float:

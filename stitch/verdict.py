@@ -50,9 +50,9 @@ def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
             f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}): "
             "give scanner.pose, or add views with other orientations."
         )
-    if inflation > 2:
+    if inflation > 2.5:
         notes.append(
-            f"Leaving views out moves the hand-eye {np.sqrt(inflation):.1f} times more than independent pose "
-            "errors would; its sigma was widened by that factor."
+            f"Few views, or views that leave the hand-eye {np.sqrt(inflation):.1f} times less certain than independent "
+            "pose errors would: its sigma was widened by that factor."
         )
     return tuple(notes)

@@ -1,0 +1,110 @@
+"""Speed and memory of the simulator, and the size of its laws: writes the tables of docs/synth.md.
+
+Run: python bench/synth.py [--pixels N] [--views N]
+"""
+
+import argparse
+import os
+import resource
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from data_synth.nature import LAWS
+from data_synth.scanner import Scanner
+from data_synth.scene import Scene, load_scene
+from data_synth.simulate import Measured, simulate
+from data_synth.write import write_session
+from stitch import frames
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "synth.md"
+SEEDS = range(4)
+
+
+def megabytes() -> float:
+    """Peak memory of this process so far; Linux counts in kilobytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+
+
+def speed_table(pixels: int, views: int) -> list[str]:
+    scene = load_scene("blade")
+    scene = replace(scene, scanner=replace(scene.scanner, columns=pixels, rows=pixels))
+    start = time.perf_counter()
+    measured = simulate(scene, {"joint_compliance": 1.0}, 0, views)
+    simulated = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        write_session(Path(folder) / "s", measured, "s")
+        size = sum(path.stat().st_size for path in (Path(folder) / "s" / "clouds").iterdir())
+    written = time.perf_counter()
+    points = sum(len(cloud.points) for cloud in measured.clouds) / views
+    return [
+        f"Blade, {views} views of {pixels} x {pixels} rays, {os.cpu_count()} cores:", "",
+        "| points a view | rays | simulate / s | write / s | on disk / MB | peak memory / MB |",
+        "|---:|---:|---:|---:|---:|---:|",
+        f"| {points:,.0f} | {views * pixels**2:,} | {simulated - start:.1f} | {written - simulated:.1f} | "
+        f"{size / 1e6:.0f} | {megabytes():.0f} |",
+    ]  # fmt: skip
+
+
+def quiet(name: str) -> Scene:
+    """A scene without noise, scatter or small effects: what is left is the law."""
+    scene = load_scene(name)
+    tool: Scanner = replace(
+        scene.scanner, columns=60, rows=60, noise=0.0, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0
+    )
+    return replace(scene, scanner=tool, small=0.0, repeatability=(0.0, 0.0))
+
+
+def misfit(measured: Measured) -> tuple[float, float]:
+    """µm from the part under the reported poses and the true hand-eye: rms and largest view's rms."""
+    import open3d as o3d
+
+    scene, mesh = measured.scene, measured.mesh
+    surface = o3d.t.geometry.RaycastingScene()
+    surface.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    T = measured.T_base_flange
+    T_reference_scanner = (frames.inverse(T) if scene.mount == "eye_to_hand" else T) @ measured.T_mount
+    T_part_scanner = frames.inverse(scene.T_reference_part) @ T_reference_scanner
+    squares = []
+    for cloud, pose in zip(measured.clouds, T_part_scanner, strict=True):
+        y = frames.transform(pose, cloud.points)
+        face = surface.compute_closest_points(y.astype(np.float32))["primitive_ids"].numpy()
+        off = np.einsum("ij,ij->i", y - mesh.triangles[face, 0], mesh.face_normals[face])
+        squares.append(np.mean(off**2))
+    return 1e3 * float(np.sqrt(np.mean(squares))), 1e3 * float(np.sqrt(np.max(squares)))
+
+
+def law_table() -> list[str]:
+    lines = ["| law | parameters drawn at amplitude 1, seed 0 | rms / µm | worst view / µm |", "|---|---|---:|---:|"]
+    for name in LAWS:
+        scene = quiet("line-sweep" if name == "latency" else "blade")
+        runs = [simulate(scene, {name: 1.0}, seed, 12) for seed in SEEDS]
+        found = np.array([misfit(run) for run in runs])
+        parameters = ", ".join(f"{k} = {v:.2g}" for k, v in runs[0].hidden[name].items())
+        rms, worst = np.sqrt((found**2).mean(axis=0))
+        lines.append(f"| {name} | {parameters} | {rms:.0f} | {worst:.0f} |")
+    return lines
+
+
+def write(name: str, lines: list[str]) -> None:
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    page = PAGE.read_text(encoding="utf-8")
+    text = "\n".join([begin, *lines, end])
+    PAGE.write_text(page.split(begin)[0] + text + page.split(end)[1], encoding="utf-8")
+    print("\n".join(lines))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pixels", type=int, default=2300)
+    parser.add_argument("--views", type=int, default=18)
+    options = parser.parse_args()
+    write("speed", speed_table(options.pixels, options.views))
+    write("laws", law_table())
+
+
+if __name__ == "__main__":
+    main()
