@@ -5,7 +5,7 @@ the error. Matching anew until nothing moves removes that pull. Directions that 
 see (a sphere turned in itself) stay where the robot put them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,11 @@ class FreePoses:
     twists: Array  # (V, 6) about the centre of `overlaps.gram`: from the model's poses to these
     overlaps: Overlaps  # at `poses`
 
+    def seen_from(self, model_poses: Array) -> "FreePoses":
+        """The same views against another model, (V, 4, 4): where they are freed to does not depend on it."""
+        to_centre = frames.make(np.eye(3), -self.overlaps.gram.centre)
+        return replace(self, twists=frames.log(to_centre @ self.poses @ frames.inverse(to_centre @ model_poses)))
+
 
 def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
     """Move all views until their overlaps agree, without regard to the robot.
@@ -55,9 +60,7 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
         overlaps = collect(capture, poses, gate, picked)
         if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * overlaps.gram.scale:
             break
-    to_centre = frames.make(np.eye(3), -overlaps.gram.centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ model_poses))
-    return FreePoses(poses, twists, overlaps)
+    return FreePoses(poses, np.zeros((len(poses), 6)), overlaps).seen_from(model_poses)
 
 
 def visible_directions(g: Gram) -> tuple[Array, Array, Array]:

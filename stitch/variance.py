@@ -17,6 +17,9 @@ from stitch.frames import Array
 # A gamma(2, 0) prior on σ_r and σ_t keeps the maximum off the boundary at zero, where every sigma after it
 # would be too small, by about one standard error (Chung et al. 2013, Psychometrika 78:685).
 _OFF_BOUNDARY = np.array([1.0, 1.0, 0.0])
+# The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
+# A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
+_USUAL_FACTOR, _FACTOR_SPREAD = float(np.log(2.0)), 1.5
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 
 
@@ -142,4 +145,6 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     square = float(np.einsum("bi,bi->", rest, Wr)) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
-    return logdet + square - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
+    off = (log_variances[2] - _USUAL_FACTOR) / _FACTOR_SPREAD
+    slope[2] += 2 * off / _FACTOR_SPREAD
+    return logdet + square + off**2 - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY

@@ -101,7 +101,10 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
     T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 2, recorder)
     freed = tuple(free_poses(c, c.poses(T_mount), o.gate) for c, o in zip(captures, overlaps, strict=True))
-    hand_eye = fit_hand_eye(captures, freed, T_mount)
+    first = fit_hand_eye(captures, freed, T_mount)
+    # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
+    freed = tuple(f.seen_from(c.poses(first.T_mount)) for c, f in zip(captures, freed, strict=True))
+    hand_eye = fit_hand_eye(captures, freed, first.T_mount)
     final = tuple(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)
