@@ -8,6 +8,7 @@ from stitch.diagnosis.start import start_values
 from stitch.effects.chain import Chain, Term, chain_of, corrected
 from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.errors import InputError
+from stitch.frames import Array
 from stitch.match import sample
 from stitch.model import Model, in_unit
 from stitch.overlaps import collect
@@ -89,7 +90,8 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         clock.lap()
         refined = refine([chain], terms, state.T_mount, [state.gate])
         place = _Place(start, refined.as_correction(), state.ledger, state.effects_file)
-        return _finish(state.session, chain, 0, place, before, recorder, clock.lap())
+        poses_before = corrected(chain, state.terms, state.T_mount).poses(state.T_mount)
+        return _finish(state.session, chain, 0, place, before, recorder, clock.lap(), poses_before)
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,12 @@ def _begin(chain: Chain, start: Coarse, seconds: float, recorder: Recorder) -> S
 
 
 def _finish(
-    session: Session, chain: Chain, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float
-) -> Run:
+    session: Session, chain: Chain, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float,
+    poses_before: Array | None = None,
+) -> Run:  # fmt: skip
     result = finish(session, chain, index, place.start, place.correction, before, recorder, seconds)
     step = Step(tuple(result.effects), result.residual_rms, result.heldout_rms, result.noise_floor, result.T_mount)
-    result = replace(result, ledger=(*place.ledger, step), effects_file=place.effects_file)
+    result = replace(result, ledger=(*place.ledger, step), effects_file=place.effects_file, poses_before=poses_before)
     recorder.finish(result)
     return result
 

@@ -75,6 +75,7 @@ class Run:
     sigmas: tuple[Array, ...] = ()  # per term (P,); NaN where the views cannot see a parameter
     ledger: tuple[Step, ...] = ()
     effects_file: str | None = None
+    poses_before: Array | None = None  # (V, 4, 4) poses_model before the last change of the model
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
 

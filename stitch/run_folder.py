@@ -65,8 +65,9 @@ def _umask() -> int:
 
 def take_over(scratch: Path, path: Path) -> None:
     """Move every file of `scratch` into the run folder; a diagnosis of the old model goes."""
-    for stale in ("diagnosis.json", "mesh.ply"):
+    for stale in ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply"):
         (path / stale).unlink(missing_ok=True)
+    shutil.rmtree(path / "pictures", ignore_errors=True)
     for file in sorted(scratch.iterdir()):
         file.replace(path / file.name)
     scratch.rmdir()

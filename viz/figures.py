@@ -46,14 +46,24 @@ def per_view(run: Run) -> Figure:
 
 
 def residual_maps(run: Run) -> Figure:
-    """Signed steps between the views before and after register, seen along the part's thinnest axis."""
+    """Signed steps between the views before and after register."""
+    return _maps(run, (run.poses_model, run.poses), ("under the model", "after register"))
+
+
+def change_maps(run: Run) -> Figure:
+    """Signed steps between the views under the model before its last change and under the present one."""
+    before = run.poses_model if run.poses_before is None else run.poses_before
+    return _maps(run, (before, run.poses_model), ("before the change", "after the change"))
+
+
+def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figure:
+    """Two maps side by side with one scale, seen along the part's thinnest axis."""
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     um = to_micrometres(run.session.length_unit)
-    states = [_steps(run, run.poses_model), _steps(run, run.poses)]
+    states = [_steps(run, p) for p in poses]
     frame = np.linalg.svd(states[1][0] - states[1][0].mean(axis=0), full_matrices=False)[2]
     limit = robust_limit(states[0][1]) * um
-    titles = ("one hand-eye", "after register")
     for axes, (points, values), title in zip(panels, states, titles, strict=True):
         flat = (points - states[1][0].mean(axis=0)) @ frame.T
         order = np.argsort(flat[:, 2])

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch.result import Run
 from viz import figures
+from viz.diagnosis_figures import waterfall
 from viz.recording import view_shifts
 from viz.units import to_micrometres, to_millimetres
 
@@ -33,14 +34,37 @@ def _content(run: Run) -> dict[str, object]:
     ]  # fmt: skip
     return {
         "run": run, "um": um, "views": rows, "hand_eye": _hand_eye(run),
+        "effects": _effects(run), "history": _history(run),
         "largest": max((row["shift"] for row in rows), default=1.0) or 1.0,
         "pictures": [
-            ("Steps between the views", _png(figures.residual_maps(run), 130)),
-            ("Convergence", _svg(figures.convergence(run))),
-            ("Views", _svg(figures.per_view(run))),
+            ("Steps between the views", png(figures.residual_maps(run), 130)),
+            ("Convergence", svg(figures.convergence(run))),
+            ("Views", svg(figures.per_view(run))),
         ],
         "version": version("stitch"),
     }  # fmt: skip
+
+
+def _effects(run: Run) -> list[dict[str, str]]:
+    """Fitted parameters that the views can see."""
+    rows = []
+    for term, sigmas in zip(run.terms, run.sigmas, strict=True):
+        for p, value, sigma in zip(run.chain.parameters(term.effect), term.values, sigmas, strict=True):
+            if np.isfinite(sigma) or p.grid:
+                told = f"{sigma:.1g}" if np.isfinite(sigma) else "–"
+                rows.append({"effect": term.effect.name, "name": p.name, "value": f"{value:.4g}", "sigma": told,
+                             "unit": p.unit})  # fmt: skip
+    return rows
+
+
+def _history(run: Run) -> list[tuple[str, str]]:
+    """How the error fell as the model grew."""
+    if len(run.ledger) < 2:
+        return []
+    out = [("The error over the history of the model", svg(waterfall(run.ledger, run.session.length_unit)))]
+    if run.poses_before is not None:
+        out.append(("Steps between the views before and after the last change", png(figures.change_maps(run), 130)))
+    return out
 
 
 def _hand_eye(run: Run) -> list[dict[str, object]]:
@@ -58,13 +82,15 @@ def _hand_eye(run: Run) -> list[dict[str, object]]:
     ]
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
+    """A figure as a data address."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     return _uri("svg+xml", buffer.getvalue().encode())
 
 
-def _png(figure: Figure, dpi: int) -> str:
+def png(figure: Figure, dpi: int) -> str:
+    """A figure as a data address."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return _uri("png", buffer.getvalue())

@@ -18,7 +18,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
 
 
 def open_recording(run: Path) -> None:
-    """Show RUN/recording.rrd.
+    """Show RUN/recording.rrd, and RUN/diagnosis.rrd where there is one.
 
     Raises:
         InputError: the run has no recording.
@@ -28,5 +28,6 @@ def open_recording(run: Path) -> None:
     if not path.is_file():
         raise InputError(f"{path}: no recording; run `stitch run` without --no-recording")
     viewer = shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
-    if subprocess.run([viewer, str(path)], env=os.environ | {"RERUN_ANALYTICS": "off"}, check=False).returncode:
+    files = [str(p) for p in (path, path.with_name("diagnosis.rrd")) if p.is_file()]
+    if subprocess.run([viewer, *files], env=os.environ | {"RERUN_ANALYTICS": "off"}, check=False).returncode:
         raise NoResultError(f"the viewer could not open {path}; is there a screen?")

@@ -1,7 +1,8 @@
 """`stitch add RUN EFFECT…`, `stitch drop RUN EFFECT…`: change the model, refit, print the ledger."""
 
 import json
-from importlib.metadata import entry_points
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,15 +12,18 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch import run_folder
+from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.progress import MICROMETRES
 from stitch.cli.run import recorder_for
 from stitch.diagnosis.suggest import suggest
 from stitch.effects.terms import known, require
 from stitch.errors import InputError
 from stitch.pipeline import change
+from stitch.recorder import Recorder
 from stitch.result import Run
-from stitch.state import State, load_state
+from stitch.state import State, load_state, state_of
 
+_SCRATCH = ".new"
 _EffectsFile = Annotated[
     Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
 ]
@@ -39,19 +43,27 @@ def add(
         raise InputError("name the effects to add, or let the diagnosis choose with --suggested (one of the two)")
     state = load_state(run, effects_file)
     if suggested:
-        result, lines = suggest(state, at_most)
-        if result is None:
-            Console(stderr=True).print("\n".join(lines), soft_wrap=True, highlight=False)
-            return
-    else:
-        names = [*(t.effect.name for t in state.terms), *(effects or [])]
-        for name in effects or []:
-            require(state.chain, known(name))
-            if names.count(name) > 1:
-                raise InputError(f"{name} is in the model of {run} already")
-        result, lines = None, []
-        result = _changed(state, names, run, recording)
-    _finish(run, result, lines, recording=recording and suggested, as_json=as_json)
+        _suggested(run, state, at_most, recording, as_json)
+        return
+    used = [t.effect.name for t in state.terms]
+    for name in effects or []:
+        require(state.chain, known(name))
+        if name in used:
+            raise InputError(f"{name} is in the model of {run} already")
+    _finish(run, change(state, [*used, *(effects or [])], _recorder(run, recording)), as_json)
+
+
+def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: bool) -> None:
+    """Diagnose and add; what was tried on the way leaves no recording, the end does."""
+    result, lines, found = suggest(state, at_most)
+    for line in lines:
+        Console(stderr=True).print(line, soft_wrap=True, highlight=False)
+    if result is not None:
+        if recording:
+            again = change(state_of(result), list(result.effects), _recorder(run, recording))
+            result = replace(again, ledger=result.ledger, poses_before=result.poses_before)
+        _finish(run, result, as_json)
+    write_diagnosis(found, state if result is None else state_of(result), run)
 
 
 def drop(
@@ -65,34 +77,28 @@ def drop(
     for name in effects:
         if name not in used:
             raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
-    result = _changed(state, [name for name in used if name not in effects], run, recording)
-    _finish(run, result, [], recording=False, as_json=as_json)
+    kept = [name for name in used if name not in effects]
+    _finish(run, change(state, kept, _recorder(run, recording)), as_json)
 
 
-def _changed(state: State, names: list[str], run: Path, recording: bool) -> Run:
-    """The recording is written while the fit runs, into a file that takes its place at the end."""
-    scratch = run / ".new"
+def _recorder(run: Path, recording: bool) -> Recorder:
+    """Records into a folder of its own, whose files take their place in the run at the end."""
+    scratch = run / _SCRATCH
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    return recorder_for(scratch, recording)
+
+
+def _finish(run: Path, result: Run, as_json: bool) -> None:
+    scratch = run / _SCRATCH
     scratch.mkdir(exist_ok=True)
-    return change(state, names, recorder_for(scratch, recording))
-
-
-def _finish(run: Path, result: Run, lines: list[str], recording: bool, as_json: bool) -> None:
-    scratch = run / ".new"
-    scratch.mkdir(exist_ok=True)
-    if recording:
-        from stitch.state import state_of
-
-        result = change(state_of(result), list(result.effects), recorder_for(scratch, True))
     run_folder.write_run(result, scratch)
-    for entry in entry_points(group="stitch.reports"):
-        entry.load()(result, scratch / "report.html")
+    run_folder.extend("stitch.reports", result, scratch / "report.html")
     run_folder.take_over(scratch, run)
     if as_json:
         print(json.dumps(run_folder.result_document(result), indent=1))
-        return
-    for line in lines:
-        Console(stderr=True).print(line, soft_wrap=True, highlight=False)
-    show_ledger(result)
+    else:
+        show_ledger(result)
 
 
 def show_ledger(result: Run) -> None:

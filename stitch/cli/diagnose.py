@@ -13,7 +13,7 @@ from stitch.diagnosis.diagnose import Diagnosis, Suspect, diagnose
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.words import amounts_of
 from stitch.run_folder import extend, write_json
-from stitch.state import load_state
+from stitch.state import State, load_state
 
 _SHOWN = 6
 
@@ -57,10 +57,15 @@ def next_measurement(
 def _diagnosed(run: Path, effects_file: Path | None) -> tuple[Diagnosis, dict[str, object], str]:
     state = load_state(run, effects_file)
     found = diagnose(state)
+    return found, write_diagnosis(found, state, run), state.session.length_unit
+
+
+def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, object]:
+    """diagnosis.json and what other packages make of it."""
     document = diagnosis_document(found)
     write_json(document, run / "diagnosis.json")
     extend("stitch.diagnosis_reports", found, state, run)
-    return found, document, state.session.length_unit
+    return document
 
 
 def show(found: Diagnosis, length_unit: str) -> None:
@@ -68,14 +73,16 @@ def show(found: Diagnosis, length_unit: str) -> None:
     console, to_um = Console(stderr=True), MICROMETRES[length_unit]
     console.print(found.sentence, soft_wrap=True, highlight=False, style="bold")
     table = Table(title="Suspects", title_justify="left")
-    for heading in ("effect", "p", "post.", "left µm", "held-out µm", "looks like"):
-        table.add_column(heading, justify="left" if heading in ("effect", "looks like") else "right", no_wrap=True)
+    for heading in ("effect", "p", "posterior", "left (µm)", "held-out (µm)"):
+        table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
     for s in found.suspects[:_SHOWN]:
         table.add_row(*_row(found, s, to_um))
     console.print(table)
     for s in found.suspects[:3]:
         if s.ranked.score.observable:
-            console.print(f"  {s.name}: {amounts_of(s.ranked)}", soft_wrap=True, highlight=False)
+            alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
+            told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; looks like {alike}" if alike else "")
+            console.print(told, soft_wrap=True, highlight=False)
     unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
     if unseen:
         console.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True, highlight=False)
@@ -89,9 +96,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
 
 def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:
     if not s.ranked.score.observable:
-        return [s.name, "–", "–", "–", "–", "not observable"]
+        return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
     if s.left is not None:
         left = [f"{found.residual_rms * to_um * x**0.5:.1f}" for x in (s.left.inside, s.left.heldout)]
-    alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:1])
-    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left, alike]
+    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

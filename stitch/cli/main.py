@@ -13,6 +13,7 @@ from stitch.cli.base import base
 from stitch.cli.calibrate import calibrate
 from stitch.cli.change import add, drop
 from stitch.cli.check import check
+from stitch.cli.compare import compare_run
 from stitch.cli.diagnose import diagnose_run, next_measurement
 from stitch.cli.drill import drill
 from stitch.cli.effects import effects
@@ -30,6 +31,7 @@ def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app.command()(run)
     app.command()(check)
+    app.command("compare")(compare_run)
     app.command("diagnose")(diagnose_run)
     app.command()(add)
     app.command()(drop)

@@ -1,20 +1,22 @@
 """Diagnose, add, and again, until nothing is left to add."""
 
-from stitch.diagnosis.diagnose import diagnose
+from stitch.diagnosis.diagnose import Diagnosis, diagnose
 from stitch.pipeline import change
 from stitch.result import Run
 from stitch.state import State, state_of
 
 
-def suggest(state: State, at_most: int) -> tuple[Run | None, list[str]]:
-    """The run with everything that the diagnosis names; None where it names nothing. Lines tell the way.
+def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
+    """The run with everything that the diagnosis names, the way in lines, and the last diagnosis.
+
+    The run is None where nothing is named.
 
     An effect stays only while the held-out residual falls.
     """
     lines: list[str] = []
     result: Run | None = None
+    found = diagnose(state)
     for _ in range(at_most):
-        found = diagnose(state)
         lines.append(found.sentence)
         if found.verdict != "missing_effect":
             break
@@ -25,9 +27,10 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str]]:
             )
             break
         result, state = tried, state_of(tried)
+        found = diagnose(state)
     else:
         lines.append(f"Stopped after {at_most} effects; run it again to go on.")
-    return result, lines
+    return result, lines, found
 
 
 def _earned(state: State, tried: Run) -> bool:

@@ -1,0 +1,68 @@
+"""`stitch compare RUN`: where model and measurement differ."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table as Printed
+
+from stitch.cli.progress import MICROMETRES
+from stitch.diagnosis.compare import Table, compare, comparison_document
+from stitch.run_folder import extend, write_json
+from stitch.state import load_state
+
+_WORST = 5
+_SHOWN = 4
+
+
+def compare_run(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print all tables as JSON.")] = False,
+) -> None:
+    """Show the residual by view, pair, joint, range, incidence, field, time, covariate and place on the part."""
+    state = load_state(run)
+    found = compare(state)
+    write_json(comparison_document(found), run / "compare.json")
+    extend("stitch.comparison_reports", found, state, run)
+    if as_json:
+        print(json.dumps(comparison_document(found), indent=1))
+        return
+    to_um = MICROMETRES[state.session.length_unit]
+    console = Console(stderr=True)
+    console.print(f"{found.rms * to_um:.1f} µm rms between the views under the model.", highlight=False)
+    for name in ("view", "pair", "place on the part"):
+        _worst(console, found.table(name), to_um)
+    for table in found.places[:_SHOWN]:
+        _one(console, table, to_um)
+    rest = ", ".join(f"{t.name} ({t.clearest:.1f})" for t in found.places[_SHOWN:])
+    console.print(f"Less clear (largest mean over its sigma): {rest}.", soft_wrap=True, highlight=False)
+    for file in ("compare.json", "pictures/compare.png"):
+        if (run / file).exists():
+            console.print(f"  {run / file}", highlight=False)
+
+
+def _worst(console: Console, table: Table, to_um: float) -> None:
+    order = [i for i in np.argsort(-np.nan_to_num(table.rms)) if table.count[i] > 50][:_WORST]
+    told = ", ".join(
+        f"{table.label[i]} {table.rms[i] * to_um:.1f}"
+        + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
+        for i in order
+    )
+    console.print(f"Worst by {table.name} (µm rms): {told}", soft_wrap=True, highlight=False)
+
+
+def _one(console: Console, table: Table, to_um: float) -> None:
+    unit = f" ({table.unit})" if table.unit else ""
+    printed = Printed(title=f"{table.name}{unit}: clearest mean {table.clearest:.1f} sigma", title_justify="left")
+    for heading in ("from", "to", "mean (µm)", "± ", "rms (µm)", "count", "views"):
+        printed.add_column(heading, justify="right")
+    for i in range(len(table.count)):
+        printed.add_row(
+            f"{table.low[i]:.4g}", f"{table.high[i]:.4g}", f"{table.mean[i] * to_um:+.1f}",
+            f"{table.mean_sigma[i] * to_um:.1f}", f"{table.rms[i] * to_um:.1f}", str(int(table.count[i])),
+            str(int(table.views[i])),
+        )  # fmt: skip
+    console.print(printed)

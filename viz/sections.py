@@ -1,0 +1,93 @@
+"""What comparison and diagnosis add to a run folder: sections of the page, pictures, a recording of their own."""
+
+import re
+from pathlib import Path
+
+import rerun as rr
+from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib.figure import Figure
+
+from stitch.diagnosis.compare import Comparison
+from stitch.diagnosis.diagnose import Diagnosis
+from stitch.diagnosis.words import amounts_of
+from stitch.state import State
+from viz import diagnosis_figures as draw
+from viz.report import svg
+from viz.units import to_micrometres
+
+
+def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
+    """Section of report.html, pictures/*.svg and *.png, diagnosis.rrd."""
+    unit = state.session.length_unit
+    um = to_micrometres(unit)
+    pictures = {
+        "budget": ("Where the error comes from", draw.budget(found, unit)),
+        "suspects": ("How likely each suspect is", draw.suspects(found)),
+        "added_variable": ("What the views show against what the first suspects predict", draw.added_variable(found)),
+        "shape": ("What the unexplained displacement follows", draw.shape(found, unit)),
+        "aliases": ("Which suspects look alike in these views", draw.alias_picture(found)),
+        "views": ("Displacement of every view from the model", draw.view_arrows(found, unit)),
+    }
+    rows = [
+        {"name": s.name, "p": f"{s.ranked.adjusted:.1g}", "posterior": f"{s.ranked.posterior:.2f}",
+         "amounts": amounts_of(s.ranked),
+         "left": "–" if s.left is None else f"{found.residual_rms * um * s.left.inside**0.5:.1f}",
+         "heldout": "–" if s.left is None else f"{found.residual_rms * um * s.left.heldout**0.5:.1f}",
+         "alike": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])}
+        for s in found.suspects if s.ranked.score.observable
+    ][:8]  # fmt: skip
+    unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
+    _save(folder / "pictures", {name: figure for name, (_, figure) in pictures.items()})
+    shown = [(title, svg(figure)) for title, figure in pictures.values()]
+    _insert(folder / "report.html", "diagnosis", _render("diagnosis.html.j2", found=found, rows=rows, unseen=unseen,
+                                                         pictures=shown))  # fmt: skip
+    _record(found, folder)
+
+
+def write_comparison(found: Comparison, state: State, folder: Path) -> None:
+    """Section of report.html and pictures/compare.*."""
+    figure = draw.comparison(found, state.session.length_unit)
+    _save(folder / "pictures", {"compare": figure})
+    um = to_micrometres(state.session.length_unit)
+    worst = []
+    for name in ("view", "pair", "place on the part"):
+        table = found.table(name)
+        order = sorted(range(len(table.count)), key=lambda i: -table.rms[i] if table.count[i] > 50 else 0.0)[:5]
+        worst.append((name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in order)))
+    html = _render("comparison.html.j2", picture=svg(figure), worst=worst, rms=found.rms * um)
+    _insert(folder / "report.html", "comparison", html)
+
+
+def _render(name: str, **content: object) -> str:
+    environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
+    return environment.get_template(name).render(**content)
+
+
+def _insert(page: Path, name: str, html: str) -> None:
+    """Put a section between its marks; a page from elsewhere without marks stays as it is."""
+    if not page.is_file():
+        return
+    begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
+    text = page.read_text(encoding="utf-8")
+    new = re.sub(f"{begin}.*?{end}", lambda _: begin + html + end, text, flags=re.S)
+    scratch = page.with_name(f".{page.name}.new")
+    scratch.write_text(new, encoding="utf-8")
+    scratch.replace(page)
+
+
+def _save(folder: Path, figures: dict[str, Figure]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        figure.savefig(folder / f"{name}.png", dpi=120)
+
+
+def _record(found: Diagnosis, folder: Path) -> None:
+    """The verdict and its pictures; `stitch view` opens it beside the recording of the run."""
+    recording = rr.RecordingStream("stitch_diagnosis")
+    recording.save(str(folder / "diagnosis.rrd"))
+    text = f"# {found.verdict}\n\n{found.sentence}"
+    recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
+    for picture in sorted((folder / "pictures").glob("*.png")):
+        recording.log(f"diagnosis/{picture.stem}", rr.EncodedImage(path=picture), static=True)
+    recording.disconnect()
