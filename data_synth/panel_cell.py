@@ -31,8 +31,8 @@ class Sizes:
     leg: float = 0.004  # mm, repeatability of one leg
     tracker: tuple[float, float] = (0.010, 5e-6)
     laid: tuple[float, float] = (4.0, 0.12)  # mm, deg: the panel as it is laid on the clamps
-    spring_in: float = 5.0  # mm at the panel's long edges, against the CAD
-    twist: float = 2.0  # mm at the corners
+    spring_in: float = 9.0  # mm at the panel's long edges, against the CAD
+    twist: float = 3.0  # mm at the corners
     bow: float = 1.0  # mm at the ends
     pad: tuple[float, float] = (250.0, 400.0)  # N/mm of one suction pad along and across its axis
     force_control: float = 20.0  # N/mm and, times 300² mm², N·mm/rad, left by force control
@@ -51,7 +51,8 @@ class PanelCell:
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
-        self.target = frames.make(Rotation.from_euler("ZYX", [2, 1.5, 181], degrees=True).as_matrix(), [150, 80, 1400.0])
+        upside_down = Rotation.from_euler("ZYX", [2.0, 1.5, 181.0], degrees=True).as_matrix()
+        self.target = frames.make(upside_down, [150.0, 80.0, 1400.0])
         triangle = np.array([[-120.0, -180.0, 160.0], [-120.0, 180.0, 160.0], [240.0, 0.0, 160.0]])
         clamps = frames.exp(self._scatter(*self.sizes.clamp, 6))
         self.reflectors = frames.transform(clamps, triangle)  # (6, 3, 3) flange frame

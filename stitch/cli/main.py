@@ -12,6 +12,7 @@ import typer
 from stitch.cli.base import base
 from stitch.cli.check import check
 from stitch.cli.drill import drill
+from stitch.cli.panel import panel
 from stitch.cli.run import run
 from stitch.errors import StitchError
 
@@ -27,6 +28,7 @@ def build() -> typer.Typer:
     app.command()(check)
     app.command()(base)
     app.command()(drill)
+    app.command()(panel)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

@@ -22,7 +22,7 @@ class Layout:
     clamp_height: float  # H: from a clamp's base to its third pad
     edge: float  # D_E: from the panel's end to the pads next to it
     length: float  # L of the panel along its axis
-    columns: int = 3  # clamps side by side; there are two rows
+    columns: int  # clamps side by side; there are two rows
 
 
 @dataclass(frozen=True)

@@ -25,20 +25,21 @@ class RigidFit:
 def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
     """The motion that takes nominal points (N, 3) onto measured ones (N, 3), each with its sigma (N,).
 
-    Weighted Kabsch/Wahba solution (Horn 1987); the covariance follows from the weights.
+    Kabsch/Wahba solution (Horn 1987). All points count alike: a body that is millimetres out of shape would move by
+    more than its targets' noise if the targets near the tracker counted for more. The sigmas make the covariance.
 
     Raises:
         NoResultError: fewer than three points, or all on one line.
     """
-    nominal, measured, weight = np.asarray(nominal, float), np.asarray(measured, float), 1 / np.asarray(sigma) ** 2
+    nominal, measured = np.asarray(nominal, float), np.asarray(measured, float)
     if len(nominal) < 3:
         raise NoResultError(f"{len(nominal)} points fix no pose; measure at least three that are not on a line")
-    c_nominal, c_measured = (np.average(p, axis=0, weights=weight) for p in (nominal, measured))
+    c_nominal, c_measured = nominal.mean(axis=0), measured.mean(axis=0)
     spread = np.linalg.svd(nominal - c_nominal, compute_uv=False)
     if spread[1] < _FLAT * max(spread[0], 1e-12):
         raise NoResultError("all points lie on one line: the turn about it is open; measure a point off the line")
-    R = Rotation.align_vectors(measured - c_measured, nominal - c_nominal, weights=weight)[0].as_matrix()
+    R = Rotation.align_vectors(measured - c_measured, nominal - c_nominal)[0].as_matrix()
     T = frames.make(R, c_measured - R @ c_nominal)
     design = np.concatenate([-frames.skew(nominal - c_nominal), np.tile(np.eye(3), (len(nominal), 1, 1))], axis=-1)
-    information = np.einsum("nki,n,nkj->ij", design, weight, design)
-    return RigidFit(T, np.linalg.inv(information), measured - frames.transform(T, nominal))
+    gain = np.linalg.pinv(design.reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
+    return RigidFit(T, gain @ gain.T, measured - frames.transform(T, nominal))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 
 # Of a contact frame's twist (rotation first): the panel is shaped by its z and by turns about x and y; the other axes
 # give way to force control, because the panel is stiff in its plane.
@@ -22,7 +22,7 @@ class ShapeStep:
 
 
 def shape_step(
-    points: Array, targets: Array, clamp: Array, T_panel_contact: Array, T_base_flange: Array,
+    points: Array, targets: Array, clamp: Indices, T_panel_contact: Array, T_base_flange: Array,
     T_flange_contact: Array, axes: Array = SHAPING,
 ) -> ShapeStep:  # fmt: skip
     """Move every clamp as its own control points need it.
@@ -56,7 +56,7 @@ def shape_step(
     return ShapeStep(T_contact @ frames.inverse(T_flange_contact), twists, deviations)
 
 
-def largest(deviations: Array, clamp: Array, T_panel_contact: Array) -> Array:
+def largest(deviations: Array, clamp: Indices, T_panel_contact: Array) -> Array:
     """(N,) largest deviation across the panel's surface (along a contact frame's z) at each clamp, mm."""
     across = np.einsum("ki,ki->k", deviations, T_panel_contact[clamp][:, :3, 2])
     return np.array([np.abs(across[clamp == i]).max(initial=0.0) for i in range(len(T_panel_contact))])
