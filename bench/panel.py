@@ -50,15 +50,9 @@ def read(cell: PanelCell, tracker: Tracker) -> list[Readings]:
 
 def ready(seed: int, **settings) -> Ready:
     """Calibrate, pre-position, lay the panel on."""
-    cell = PanelCell(seed, **settings)
-    tracker = Tracker(cell.tracker)
-    readings = read(cell, tracker)
-    stage = Stage([calibrate(r) for r in readings], MASTER, tracker, cell.target)
-    base, contact = (np.array([getattr(m, n) for m in stage.models]) for n in ("T_world_base", "T_flange_contact"))
-    start = preposition(base, cell.target, contacts(LAYOUT).T_panel_contact, contact)
-    cell.drive(start)
-    cell.lay()
-    return Ready(cell, stage, readings, start)
+    r = ready_without_panel(seed, **settings)
+    r.cell.lay()
+    return r
 
 
 def pose_error(cell: PanelCell) -> np.ndarray:
@@ -79,7 +73,8 @@ def pose_table(draws: int) -> list[str]:
         forces.append(np.linalg.norm(r.cell.state()[2][:, 3:], axis=1).max())
     b, a = np.abs(before), np.abs(after)
     lines = [f"Pose after one adjustment, {draws} cells; absolute errors against the truth.", "",
-             "| | x / mm | y / mm | z / mm | about x / ° | about y / ° | about z / ° |", "|---|---|---|---|---|---|---|"]  # fmt: skip
+             "| | x / mm | y / mm | z / mm | about x / ° | about y / ° | about z / ° |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
     order = [3, 4, 5, 0, 1, 2]
     rows = (("before, largest", b.max(0), "{:.2f}"), ("after, rms", np.sqrt((a**2).mean(0)), "{:.4f}"),
             ("after, largest", a.max(0), "{:.4f}"))  # fmt: skip
@@ -93,7 +88,8 @@ def pose_table(draws: int) -> list[str]:
 def shape_table(draws: int) -> list[str]:
     lines = [f"Shape until all control points are within {TOLERANCE} mm, {draws} cells each.", "",
              "| driven axes | before, largest / mm | after 1 / mm | after 2 / mm | corrections needed | "
-             "largest force at the end / N | largest force in the plane / N |", "|---|---|---|---|---|---|---|"]  # fmt: skip
+             "largest force at the end / N | largest force in the plane / N |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
     for name, compliant, axes in (("z and about x, y; the rest gives way", True, SHAPING),
                                   ("z and about x, y; the rest is held", False, SHAPING),
                                   ("all six", False, np.ones(6, bool))):  # fmt: skip
@@ -148,14 +144,15 @@ def _base_errors(cell, reading, model, offset) -> tuple[float, float]:
     if offset.found:
         real = true_flanges(LEGS, reading.T_base_flange, [(offset.leg, offset.offset)])
         better = calibrate(replace(reading, T_base_flange=real))
-    return tuple(float(np.linalg.norm((frames.inverse(cell.T_world_base[2]) @ m.T_world_base)[:3, 3])) for m in (model, better))  # fmt: skip
+    off = [(frames.inverse(cell.T_world_base[2]) @ m.T_world_base)[:3, 3] for m in (model, better)]
+    return tuple(float(np.linalg.norm(v)) for v in off)
 
 
 def drift_table() -> list[str]:
     """Expected and true error of the farthest slave after the source's two motions."""
     lines = ["Slaves against the master after the source's motions: rms over 200 draws of the model against what 20 "
              "simulated cells do, worst slave and axis.", "",
-             "| motion | legs repeat within / µm | expected / mm | in the cells / mm | expected / ° | in the cells / ° |",
+             "| motion | legs repeat / µm | expected / mm | in the cells / mm | expected / ° | in the cells / ° |",
              "|---|---|---|---|---|---|"]  # fmt: skip
     for name, turn, step, leg in (("100 mm", False, 100.0, 0.0), ("2°", True, np.radians(2.0), 0.0),
                                   ("100 mm", False, 100.0, 0.004), ("2°", True, np.radians(2.0), 0.004)):  # fmt: skip
@@ -183,13 +180,14 @@ def drift_table() -> list[str]:
                 r.cell.drive(r.T_base_flange)
             real.append(change)
         rms = np.sqrt((np.array(real) ** 2).mean(0))
-        worst = np.linalg.norm(rms[..., 3:], axis=-1).max(), np.degrees(np.linalg.norm(rms[..., :3], axis=-1).max())
-        lines.append(f"| {name} | {leg * 1e3:g} | {expected[0]:.3f} | {worst[0]:.3f} | {expected[1]:.4f} | {worst[1]:.4f} |")
+        worst = [np.linalg.norm(part, axis=-1).max() for part in (rms[..., 3:], np.degrees(rms[..., :3]))]
+        numbers = f"{expected[0]:.3f} | {worst[0]:.3f} | {expected[1]:.4f} | {worst[1]:.4f}"
+        lines.append(f"| {name} | {leg * 1e3:g} | {numbers} |")
     return lines
 
 
-def ready_without_panel(seed: int) -> Ready:
-    cell = PanelCell(seed)
+def ready_without_panel(seed: int, **settings) -> Ready:
+    cell = PanelCell(seed, **settings)
     tracker = Tracker(cell.tracker)
     readings = read(cell, tracker)
     stage = Stage([calibrate(r) for r in readings], MASTER, tracker, cell.target)

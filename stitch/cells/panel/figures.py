@@ -33,7 +33,8 @@ def _lines(
     for i, name in enumerate(names):
         if i != master:
             axis.plot(steps, values[:, :, i].max(axis=0), label=name)
-    axis.set(xlabel=across, ylabel=up, ylim=(0, None))
+    # An error of zero shall look like zero, not like magnified rounding.
+    axis.set(xlabel=across, ylabel=up, ylim=(0, max(0.05, 1.05 * values.max())))
     axis.grid(alpha=0.3)
 
 
