@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from manifold3d import CrossSection
 from numpy.typing import NDArray
 
 from data_synth.scanner import Scanner, scan
-from data_synth.shapes.car_door import CarDoor, Pane, outer_surface, window_outline
+from data_synth.shapes.car_door import CarDoor, Pane, door_outline, outer_surface, window_outline
 from stitch import frames
 
 Array = NDArray[np.float64]
@@ -49,8 +50,8 @@ def looking_at(target: Array, towards: Array, up: Array, distance: float) -> Arr
 
 
 def scan_outside(
-    mesh: trimesh.Trimesh, T_base_part: Array, noise: float, seed: int, views: tuple[int, int] = (3, 2), rays: int = 150,
-    distance: float = 800.0,
+    mesh: trimesh.Trimesh, T_base_part: Array, noise: float, seed: int, views: tuple[int, int] = (3, 2),
+    rays: int = 150, distance: float = 800.0,
 ) -> tuple[list[Array], Array]:  # fmt: skip
     """Scans (N, 3) each and T_base_scanner (V, 4, 4) from a grid of views along x and z over the outer side."""
     rng = np.random.default_rng(seed)
@@ -71,14 +72,17 @@ def scan_outside(
 
 def stations(pane: Pane) -> tuple[Array, Array, Array]:
     """Eight places of the seam: middle of the nominal gap (8, 3), across from pane to body, outwards; part frame."""
-    outline = window_outline(pane)
-    contour = max(outline.offset(-pane.gap / 2, circular_segments=96).to_polygons(), key=len)
-    loop = np.asarray(contour, float)
+    return along_loop(pane, window_outline(pane).offset(-pane.gap / 2, circular_segments=96), 8)
+
+
+def along_loop(door: CarDoor, outline: CrossSection, count: int) -> tuple[Array, Array, Array]:
+    """Places on the outer surface along an outline (count, 3), out of the loop and out of the surface; part frame."""
+    loop = np.asarray(max(outline.to_polygons(), key=len), float)
     steps = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
     at = np.concatenate([[0], np.cumsum(steps)])
     closed = np.vstack([loop, loop[:1]])
     # Straight runs only: the corners' stations would mix two edges.
-    places = _straight(closed, at, 8)
+    places = _straight(closed, at, count)
     middle, across, outwards = [], [], []
     centre = loop.mean(axis=0)
     for s in places:
@@ -86,10 +90,10 @@ def stations(pane: Pane) -> tuple[Array, Array, Array]:
         along = (ahead - p) / np.linalg.norm(ahead - p)
         out = np.array([along[1], -along[0]])
         out *= np.sign(out @ (p - centre))
-        n = _normal(pane, p)
+        n = _normal(door, p)
         t = np.array([out[0], 0.0, out[1]])
         t -= (t @ n) * n
-        middle.append([p[0], float(outer_surface(pane, *np.asarray(p))), p[1]])
+        middle.append([p[0], float(outer_surface(door, *np.asarray(p))), p[1]])
         across.append(t / np.linalg.norm(t))
         outwards.append(n)
     return np.array(middle), np.array(across), np.array(outwards)
@@ -113,9 +117,29 @@ def _normal(door: CarDoor, p: Array) -> Array:
     return n / np.linalg.norm(n)
 
 
+def scan_edges(
+    mesh: trimesh.Trimesh, T_base_part: Array, door: CarDoor, kind: str, noise: float, seed: int, count: int = 10,
+    rays: int = 110,
+) -> tuple[list[Array], Array]:  # fmt: skip
+    """Close scans along the edges of a "door" (outline and window) or a "pane", leaned so that flanks are seen."""
+    rng = np.random.default_rng(seed)
+    if kind == "pane":
+        loops = [(window_outline(door).offset(-16.0, circular_segments=96), 1.0)]
+    else:
+        loops = [(door_outline(door), 1.0), (window_outline(door), -1.0)]
+    scanner = Scanner("area", rays, rays, 10.0, 10.0, 400.0, 200.0, noise)
+    clouds, poses = [], []
+    for outline, facing in loops:
+        for m, t, n in zip(*along_loop(door, outline, count), strict=True):
+            T = looking_at(m, -np.cos(0.75) * n - np.sin(0.75) * facing * t, np.cross(n, t), 400.0)
+            clouds.append(scan(mesh, T, scanner, NO_FIELD, rng).points)
+            poses.append(T_base_part @ T)
+    return clouds, np.array(poses)
+
+
 def scan_seam(
     meshes: list[trimesh.Trimesh], T_base_part: Array, middle: Array, across: Array, outwards: Array, noise: float,
-    seed: int, tilt: float = 35.0, rays: int = 90,
+    seed: int, tilt: float = 35.0, rays: int = 130,
 ) -> tuple[list[Array], Array]:  # fmt: skip
     """Two scans at each station, leaned to either side so that both edges' flanks are seen."""
     rng = np.random.default_rng(seed)

@@ -108,7 +108,9 @@ def test_global_model_is_within_its_sigmas():
 
 def test_leg_jacobian_against_differences():
     T = pose(3, -4, 5, 20, -30, 780)
-    columns = [(hexapod.lengths(T @ frames.exp(d)) - hexapod.lengths(T @ frames.exp(-d))) / 2e-5 for d in 1e-5 * np.eye(6)]
+    columns = [
+        (hexapod.lengths(T @ frames.exp(d)) - hexapod.lengths(T @ frames.exp(-d))) / 2e-5 for d in 1e-5 * np.eye(6)
+    ]
     assert np.allclose(leg_jacobian(LEGS, T[None])[0], np.array(columns).T, atol=1e-5)
 
 

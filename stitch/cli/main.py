@@ -12,8 +12,10 @@ import typer
 from stitch.cli.base import base
 from stitch.cli.check import check
 from stitch.cli.drill import drill
+from stitch.cli.fit import fit
 from stitch.cli.panel import panel
 from stitch.cli.run import run
+from stitch.cli.seam import seam
 from stitch.errors import StitchError
 
 app = typer.Typer(
@@ -29,6 +31,8 @@ def build() -> typer.Typer:
     app.command()(base)
     app.command()(drill)
     app.command()(panel)
+    app.command()(fit)
+    app.command()(seam)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

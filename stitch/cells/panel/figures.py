@@ -27,9 +27,7 @@ def draw_errors(
         figure.savefig(file, dpi=110)
 
 
-def _lines(
-    axis: Axes, steps: Array, values: Array, names: Sequence[str], master: int, across: str, up: str
-) -> None:
+def _lines(axis: Axes, steps: Array, values: Array, names: Sequence[str], master: int, across: str, up: str) -> None:
     for i, name in enumerate(names):
         if i != master:
             axis.plot(steps, values[:, :, i].max(axis=0), label=name)

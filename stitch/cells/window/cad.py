@@ -70,7 +70,8 @@ def surface(mesh: Any) -> Surface:
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
     tree = KDTree(np.hstack([samples, reach * normals]))
-    return Surface(mesh, scene, centre, size, float(np.sqrt(mesh.area / count)), np.asarray(samples), normals, tree, reach)
+    spacing = float(np.sqrt(mesh.area / count))
+    return Surface(mesh, scene, centre, size, spacing, np.asarray(samples), normals, tree, reach)
 
 
 def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
@@ -81,7 +82,7 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     """
     import open3d
 
-    found = cad.scene.compute_closest_points(open3d.core.Tensor(np.float32(points - cad.centre)))
+    found = cad.scene.compute_closest_points(open3d.core.Tensor((points - cad.centre).astype(np.float32)))
     face = found["primitive_ids"].numpy().astype(np.int64)
     # The scene works in single precision and only says which triangle; the place is computed in double.
     place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)

@@ -1,4 +1,4 @@
-"""Scan onto CAD: point to plane, every point by its area and its robust weight."""
+"""Scan onto CAD: point to plane, robustly weighted, on points that look all ways."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,12 @@ from stitch.cells.window.cad import Nearest, Surface, nearest
 from stitch.cells.window.regions import Regions
 from stitch.cells.window.scans import Joined
 from stitch.errors import NoResultError
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 
 _POINTS = 20_000
-_ROUNDS = 40
+_ROUNDS = 60
+# Normals are sorted into cells of a quarter of their unit length: about 15°.
+_DIRECTIONS = 4
 # Tukey's biweight: 95 % efficient on normal noise, and no pull at all beyond 4.685 scales (Huber & Ronchetti 2009).
 _TUKEY = 4.685
 _MAD = 1.4826
@@ -42,17 +44,13 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
     """Refine a coarse T_base_part (4, 4) until it stands still.
 
     The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
-    beyond 4.7 scales has no say. Points count by the surface they stand for, so that dense strips do not lead.
+    beyond 4.7 scales has no say. The points are drawn evenly over the directions they look to (normal-space sampling,
+    Rusinkiewicz & Levoy 2001): on a large smooth sheet the few points of its flanks alone hold it in its plane.
 
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction open.
     """
-    index = np.flatnonzero(scan.usable)
-    index = index[np.linspace(0, len(index) - 1, min(_POINTS, len(index))).astype(int)] if len(index) else index
-    scan = scan.take(index)
-    area = scan.area / np.median(scan.area) if len(index) else scan.area
-    # A few points in wide gaps must not lead either.
-    area = np.minimum(area, 3.0)
+    scan = scan.take(_all_ways(scan, T_base_part))
     scale, step = cad.size / 100, np.full(6, np.inf)
     for _ in range(_ROUNDS):
         local, found, allowed = _look(scan, cad, T_base_part, regions)
@@ -62,7 +60,7 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
         spread = _MAD * float(np.median(np.abs(found.distance[used])))
         scale = max(spread, 0.5 * scale, scan.noise if np.isfinite(scan.noise) else 0.0)
-        weight = area * used * _biweight(found.distance / (_TUKEY * scale))
+        weight = used * _biweight(found.distance / (_TUKEY * scale))
         step, normal_matrix, design = _step(local, found, weight, cad)
         shift = frames.make(np.eye(3), cad.centre)
         T_base_part = T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift))
@@ -73,7 +71,30 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
     meat = np.einsum("ni,n,nj->ij", design, (weight * scale) ** 2, design)
     distance = found.distance[used]
     inliers = float(np.mean(np.abs(distance) < 0.54 * _TUKEY * scale))
-    return CadFit(T_base_part, inverse @ meat @ inverse, scale, float(np.sqrt((distance**2).mean())), inliers, int(used.sum()))
+    rms = float(np.sqrt((distance**2).mean()))
+    return CadFit(T_base_part, inverse @ meat @ inverse, scale, rms, inliers, int(used.sum()))
+
+
+def _all_ways(scan: Joined, T_base_part: Array) -> Indices:
+    """Indices of at most _POINTS usable points, as many of each direction as there are to share out."""
+    usable = np.flatnonzero(scan.usable)
+    directions = np.round(frames.rotate(frames.inverse(T_base_part), scan.normals[usable]) * _DIRECTIONS)
+    _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
+    quota, bucket = _quota(counts), bucket.ravel()
+    order = np.argsort(bucket, kind="stable")
+    first = np.cumsum(counts) - counts
+    picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]
+    chosen: Indices = usable[np.sort(np.concatenate(picked))] if picked else usable
+    return chosen
+
+
+def _quota(counts: Indices) -> int:
+    """The largest share per direction that keeps the sum within _POINTS."""
+    low, high = 1, _POINTS
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _POINTS else (low, middle - 1)
+    return low
 
 
 def _look(

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import COLUMNS, from_columns
 from stitch.clouds import read_cloud
 from stitch.errors import InputError
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.scan import Scan, prepare_view
 
 # Fewer points have no neighbourhoods from which normals could be taken.
@@ -24,12 +25,12 @@ class Joined:
 
     points: Array  # (N, 3)
     normals: Array  # (N, 3) unit, towards the scanner
-    usable: Array  # (N,) bool: neither edge nor crease nor grazing
+    usable: NDArray[np.bool_]  # (N,) neither edge nor crease nor grazing
     area: Array  # (N,) surface per point
     spacing: float
     noise: float  # 1-sigma across the surface, from the scans themselves
 
-    def take(self, keep: Array) -> "Joined":
+    def take(self, keep: NDArray[np.bool_] | Indices) -> "Joined":
         """The points of a mask or of indices."""
         return Joined(
             self.points[keep], self.normals[keep], self.usable[keep], self.area[keep], self.spacing, self.noise
@@ -42,7 +43,7 @@ def join(scans: Sequence[Scan], T_base_scanner: Array) -> Joined:
     return Joined(
         np.vstack([frames.transform(T, scan.points) for scan, T in pairs]),
         np.vstack([frames.rotate(T, scan.normals) for scan, T in pairs]),
-        np.concatenate([scan.usable for scan in scans]),
+        np.concatenate([scan.usable for scan in scans]).astype(bool),
         np.concatenate([scan.area for scan in scans]),
         float(np.median([scan.spacing for scan in scans])),
         float(np.median([scan.noise for scan in scans])),

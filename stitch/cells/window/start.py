@@ -18,6 +18,8 @@ _REFINE = 25  # steps of a candidate's refinement
 _FEATURE_RUNS = 3
 # A start of which less than a third of the scan meets the CAD is none.
 _LEAST_SHARE = 1 / 3
+# A pose that so much of the scan agrees with needs no second opinion.
+_CERTAIN = 0.95
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Start:
 
 
 def find_start(scan: Joined, cad: Surface) -> Start:
-    """Try the 24 ways to lay principal axes on principal axes and some feature matches; refine and score.
+    """Try the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets; refine.
 
     Features are FPFH with RANSAC (Rusu et al. 2009, through Open3D): they serve where the scan shows only a piece of
     the part, principal axes where it is too smooth for features.
@@ -40,12 +42,13 @@ def find_start(scan: Joined, cad: Surface) -> Start:
     """
     index = _spread(scan)
     points, normals = scan.points[index], scan.normals[index]
-    candidates = [*_by_axes(points, cad), *_by_features(points, normals, cad)]
-    gate = cad.size / 25
-    ranked = sorted(candidates, key=lambda T: -_share(T, points, normals, cad, gate))
+    gate, fine = cad.size / 25, cad.size / 250
+    ranked = sorted(_by_axes(points, cad), key=lambda T: -_share(T, points, normals, cad, gate))
     refined = [_refine(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
-    fine = cad.size / 250
     shares = [_share(T, points, normals, cad, fine) for T in refined]
+    if max(shares) < _CERTAIN:
+        refined += [_refine(T, points, normals, cad, gate) for T in _by_features(points, normals, cad)]
+        shares = [_share(T, points, normals, cad, fine) for T in refined]
     best = int(np.argmax(shares))
     elsewhere = [s for T, s in zip(refined, shares, strict=True) if _apart(T, refined[best], cad) > cad.size / 50]
     if shares[best] < _LEAST_SHARE:
@@ -68,7 +71,8 @@ def _spread(scan: Joined) -> Indices:
 
 def _by_axes(points: Array, cad: Surface) -> list[Array]:
     """The 24 turns that lay the scan's principal axes onto the CAD's."""
-    scan_axes, cad_axes = (np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in (points, cad.samples[::20]))
+    clouds = (points, cad.samples[::20])
+    scan_axes, cad_axes = (np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in clouds)
     turns = [np.eye(3)[list(p)] * signs for p in permutations(range(3)) for signs in product((1, -1), repeat=3)]
     found = []
     for turn in turns:
