@@ -153,3 +153,15 @@ def scan_seam(
             clouds.append(scan(both, T, scanner, NO_FIELD, rng).points)
             poses.append(T_base_part @ T)
     return clouds, np.array(poses)
+
+
+def true_seam(pane: trimesh.Trimesh, door: trimesh.Trimesh, T_part_station: Array) -> tuple[float, float]:
+    """Flush and gap of the meshes, mm: cut at the station, take the outer corner on each side."""
+    corners = []
+    for mesh, side in ((pane, -1.0), (door, 1.0)):
+        cut = mesh.section(plane_origin=T_part_station[:3, 3], plane_normal=T_part_station[:3, 1])
+        local = frames.transform(frames.inverse(T_part_station), np.asarray(cut.vertices))
+        own = local[(side * local[:, 0] > 0) & (np.abs(local[:, 0]) < 30)]
+        # The corner is the furthest vertex up and towards the gap.
+        corners.append(own[np.argmax(own[:, 2] - side * own[:, 0])])
+    return float(corners[0][2] - corners[1][2]), float(corners[1][0] - corners[0][0])

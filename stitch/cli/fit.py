@@ -40,15 +40,16 @@ def _print(console: Console, number: int, part: Part) -> None:
     )
     if part.start.runner_up > 0.9 * part.start.share:
         console.print(
-            f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part is "
-            "nearly symmetric, or too little of it was scanned."
+            f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part "
+            "is nearly symmetric, or too little of it was scanned."
         )
     bad = part.deviations.outside
     if bad.any():
         worst = int(np.argmax(np.abs(cells.mean)))
         at = " ".join(f"{value:.0f}" for value in cells.middle[worst])
         console.print(
-            f"  {bad.sum()} of {len(bad)} cells beyond {part.deviations.tolerance:g}; worst {cells.mean[worst]:+.2f} at {at}."
+            f"  {bad.sum()} of {len(bad)} cells beyond {part.deviations.tolerance:g}; worst "
+            f"{cells.mean[worst]:+.2f} at {at}."
         )
     else:
         console.print(f"  All {len(bad)} cells within {part.deviations.tolerance:g}.")

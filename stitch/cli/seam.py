@@ -35,10 +35,8 @@ def seam(
 
 
 def _print(seams: list[Seam], limits: Limits) -> None:
-    table = Table(
-        title=f"Flush {limits.flush:g} ± {limits.flush_tolerance:g} mm, gap {limits.gap:g} ± {limits.gap_tolerance:g} mm",
-        title_justify="left",
-    )
+    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
+    table = Table(title=f"Flush {flush} mm, gap {gap} mm", title_justify="left")
     for heading in ("station", "flush / mm", "gap / mm", "verdict"):
         table.add_column(heading)
     for s in seams:

@@ -82,7 +82,8 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     """
     import open3d
 
-    found = cad.scene.compute_closest_points(open3d.core.Tensor((points - cad.centre).astype(np.float32)))
+    query: Any = (points - cad.centre).astype(np.float32)
+    found = cad.scene.compute_closest_points(open3d.core.Tensor(query))
     face = found["primitive_ids"].numpy().astype(np.int64)
     # The scene works in single precision and only says which triangle; the place is computed in double.
     place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)

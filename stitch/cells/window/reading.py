@@ -11,7 +11,7 @@ import numpy as np
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
-from stitch.cells.toml_tables import check_keys, choice, finite, table
+from stitch.cells.toml_tables import check_keys, choice, finite
 from stitch.cells.window.cad import Surface, read_cad
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.scans import Joined, read_scans
