@@ -80,10 +80,8 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     First the nearest triangle; where it looks the other way (a thin sheet's far side), the nearest of samples that
     look the same way.
     """
-    import open3d
-
-    query: Any = (points - cad.centre).astype(np.float32)
-    found = cad.scene.compute_closest_points(open3d.core.Tensor(query))
+    o3d = load_open3d()
+    found = cad.scene.compute_closest_points(o3d.core.Tensor(np.float32(points - cad.centre)))
     face = found["primitive_ids"].numpy().astype(np.int64)
     # The scene works in single precision and only says which triangle; the place is computed in double.
     place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)

@@ -13,6 +13,9 @@ from stitch.cells.window.cad import Surface, nearest
 from stitch.cells.window.scans import Joined
 from stitch.frames import Array
 
+# A cell with fewer points has no mean worth a verdict.
+_FEWEST = 5
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -55,7 +58,9 @@ def deviations(scan: Joined, cad: Surface, T_base_part: Array, tolerance: float,
     average = mean(distance)
     middle = np.column_stack([mean(points[:, k]) for k in range(3)])
     spread = np.sqrt(np.maximum(mean((distance - average[where]) ** 2), 0.0))
-    return Deviations(points, distance, tolerance, Cells(middle, average, spread, count.astype(np.int64)))
+    full = count >= _FEWEST
+    cells = Cells(middle[full], average[full], spread[full], count[full].astype(np.int64))
+    return Deviations(points, distance, tolerance, cells)
 
 
 def write_ply(file: Path, found: Deviations) -> None:

@@ -10,6 +10,8 @@ from stitch.frames import Array
 # Fewer points of a surface or flank fix no edge to a twentieth of a millimetre.
 _FEWEST = 25
 _TUKEY, _MAD = 4.685, 1.4826
+# Edge of the cubes whose points share what the model leaves, mm.
+_CUBE = 3.0
 # Points further from the edge than this say nothing about it that the surface's bend does not blur, mm.
 _REACH = 22.0
 
@@ -47,9 +49,10 @@ def find_edge(points: Array, normals: Array, facing: float) -> Edge:
     if len(flank) < _FEWEST:
         raise NoResultError(f"{len(flank)} points on the flank's upper part; scan it leaned by 30 to 45° towards it")
     a, s, h = top.T
-    surface, surface_spread = _robust(np.column_stack([a**0, a - rim, s, (a - rim) ** 2, s**2, (a - rim) * s]), h)
+    design = np.column_stack([a**0, a - rim, s, (a - rim) ** 2, s**2, (a - rim) * s])
+    surface, surface_spread = _robust(design, h, top)
     a, s, h = flank.T
-    wall, wall_spread = _robust(np.column_stack([a**0, h, s, s**2]), a)
+    wall, wall_spread = _robust(np.column_stack([a**0, h, s, s**2]), a, flank)
     place = _meet(surface, wall, rim)
     step = 1e-5
     columns = [(_meet(surface + step * d, wall, rim) - place) / step for d in np.eye(6)]
@@ -69,8 +72,12 @@ def _meet(surface: Array, wall: Array, rim: float) -> Array:
     return np.array([a, h])
 
 
-def _robust(design: Array, values: Array) -> tuple[Array, Array]:
-    """Coefficients and covariance of a linear fit with Tukey weights, 20 rounds."""
+def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array]:
+    """Coefficients and covariance of a linear fit with Tukey weights, 20 rounds.
+
+    What a facet or a bend leaves is shared by neighbours, so the covariance counts cubes of points (N, 3) and not
+    points as independent (cluster-robust sandwich, Liang & Zeger 1986).
+    """
     weight = np.ones(len(values))
     for _ in range(20):
         root = np.sqrt(weight)
@@ -79,5 +86,7 @@ def _robust(design: Array, values: Array) -> tuple[Array, Array]:
         scale = max(_MAD * float(np.median(np.abs(left))), 1e-9)
         weight = np.where(np.abs(left) < _TUKEY * scale, (1 - (left / (_TUKEY * scale)) ** 2) ** 2, 0.0)
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, weight, design))
-    meat = np.einsum("ni,n,nj->ij", design, (weight * left) ** 2, design)
-    return np.asarray(found), np.asarray(inverse @ meat @ inverse)
+    _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
+    scores = np.zeros((cube.max() + 1, design.shape[1]))
+    np.add.at(scores, cube.ravel(), design * (weight * left)[:, None])
+    return np.asarray(found), np.asarray(inverse @ scores.T @ scores @ inverse)

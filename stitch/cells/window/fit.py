@@ -7,13 +7,16 @@ from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.cells.window.cad import Nearest, Surface, nearest
+from stitch.cells.window.cell_weights import biweight, cell_weights
 from stitch.cells.window.regions import Regions
 from stitch.cells.window.scans import Joined
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 
 _POINTS = 20_000
-_ROUNDS = 60
+_ROUNDS = 80
+# A step below this share of the part is none; and cells along the part for the second kind of weight.
+_STILL, _CELLS = 1e-7, 40
 # Normals are sorted into cells of a quarter of their unit length: about 15°.
 _DIRECTIONS = 4
 # Tukey's biweight: 95 % efficient on normal noise, and no pull at all beyond 4.685 scales (Huber & Ronchetti 2009).
@@ -44,14 +47,16 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
     """Refine a coarse T_base_part (4, 4) until it stands still.
 
     The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
-    beyond 4.7 scales has no say. The points are drawn evenly over the directions they look to (normal-space sampling,
-    Rusinkiewicz & Levoy 2001): on a large smooth sheet the few points of its flanks alone hold it in its plane.
+    beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
+    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn evenly over the
+    directions they look to (normal-space sampling, Rusinkiewicz & Levoy 2001): on a large smooth sheet the few points
+    of its flanks alone hold it in its plane.
 
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction open.
     """
     scan = scan.take(_all_ways(scan, T_base_part))
-    scale, step = cad.size / 100, np.full(6, np.inf)
+    scale, by_cell = cad.size / 100, False
     for _ in range(_ROUNDS):
         local, found, allowed = _look(scan, cad, T_base_part, regions)
         used = found.accept & allowed
@@ -60,12 +65,16 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
         spread = _MAD * float(np.median(np.abs(found.distance[used])))
         scale = max(spread, 0.5 * scale, scan.noise if np.isfinite(scan.noise) else 0.0)
-        weight = used * _biweight(found.distance / (_TUKEY * scale))
+        weight = used * biweight(found.distance / (_TUKEY * scale))
+        if by_cell:
+            weight *= cell_weights(local, found, used, cad.size / _CELLS, scale)
         step, normal_matrix, design = _step(local, found, weight, cad)
         shift = frames.make(np.eye(3), cad.centre)
         T_base_part = T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift))
-        if np.abs(step[3:]).max() < 1e-7 * cad.size and scale <= 1.05 * max(spread, scan.noise):
-            break
+        if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, scan.noise):
+            if by_cell:
+                break
+            by_cell = True
     inverse = np.linalg.inv(normal_matrix)
     # Sandwich: the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7).
     meat = np.einsum("ni,n,nj->ij", design, (weight * scale) ** 2, design)
@@ -105,10 +114,6 @@ def _look(
     found = nearest(cad, local, frames.rotate(T, scan.normals))
     allowed = np.ones(len(local), bool) if regions is None else regions.used(local)
     return local, found, allowed
-
-
-def _biweight(u: Array) -> Array:
-    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
 
 
 def _step(local: Array, found: Nearest, weight: Array, cad: Surface) -> tuple[Array, Array, Array]:

@@ -72,7 +72,8 @@ def read_fit_job(file: Path | str) -> FitJob:
         read_scans(_file(file, document, "scans")), cad, instances,
         finite(file, "tolerance", document.get("tolerance", 0.5), positive=True),
         finite(file, "cell", document.get("cell", cad.size / 60), positive=True),
-        _regions(file, document.get("region", [])), finite(file, "coverage", document.get("coverage", 0.5)), nominal, path,
+        _regions(file, document.get("region", [])), finite(file, "coverage", document.get("coverage", 0.5)),
+        nominal, path,
     )  # fmt: skip
 
 
@@ -91,8 +92,8 @@ def read_seam_job(file: Path | str) -> SeamJob:
     check_keys(file, "limits", limits, set(known))
     values = {key: finite(file, f"limits.{key}", value, positive="tolerance" in key) for key, value in limits.items()}
     return SeamJob(
-        read_scans(_file(file, document, "scans")), part, _stations(_file(file, document, "stations")), Limits(**values),
-        abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
+        read_scans(_file(file, document, "scans")), part, _stations(_file(file, document, "stations")),
+        Limits(**values), abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
     )  # fmt: skip
 
 

@@ -12,9 +12,9 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.native import load_open3d
 
-_POINTS = 2500  # of the scan that judge a candidate
-_KEEP = 8  # candidates that are refined
-_REFINE = 25  # steps of a candidate's refinement
+_POINTS = 1500  # of the scan that judge a candidate
+_KEEP = 6  # candidates that are refined
+_REFINE = 20  # steps of a candidate's refinement
 _FEATURE_RUNS = 3
 # A start of which less than a third of the scan meets the CAD is none.
 _LEAST_SHARE = 1 / 3
