@@ -248,6 +248,34 @@ def test_command_on_the_example(tmp_path, capsys):
     assert {f.name for f in tmp_path.iterdir()} >= {"preposition.csv", "pose_move.csv", "shape_move.csv", "errors.png"}
 
 
+def test_tracker_readings_in_its_own_frame_give_the_same(tmp_path, capsys):
+    """Everything the tracker sees, turned into a frame of its own, with four reference points of the world."""
+    for file in EXAMPLE.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    T = np.linalg.inv(pose(25, 3, -2, -3200, -1800, 1900))
+    for name, columns in (("targets", ["seen_x seen_y seen_z"]), ("control", ["seen_x seen_y seen_z"]),
+                          ("calibration", ["x1 y1 z1", "x2 y2 z2", "x3 y3 z3"])):  # fmt: skip
+        lines = (tmp_path / f"{name}.csv").read_text().splitlines()
+        header, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
+        for triple in columns:
+            at = [header.index(c) for c in triple.split()]
+            for row in rows:
+                moved = T[:3, :3] @ [float(row[i]) for i in at] + T[:3, 3]
+                for i, value in zip(at, moved, strict=True):
+                    row[i] = f"{value:.9f}"
+        (tmp_path / f"{name}.csv").write_text("\n".join([lines[0], *(",".join(r) for r in rows)]))
+    world = np.array([[0, 0, 0], [4000.0, 0, 0], [0, 3000.0, 0], [0, 0, 2000.0]])
+    rows = [f"W{i},{','.join(f'{v:.9f}' for v in [*p, *(T[:3, :3] @ p + T[:3, 3])])}" for i, p in enumerate(world)]
+    (tmp_path / "world.csv").write_text("\n".join(["point,x,y,z,seen_x,seen_y,seen_z", *rows]))
+    job = (tmp_path / "job.toml").read_text()
+    (tmp_path / "job.toml").write_text(job.replace("[files]", '[files]\nworld = "world.csv"'))
+    found = []
+    for folder in (EXAMPLE, tmp_path):
+        main_code(["panel", str(folder / "job.toml"), "--json"])
+        found.append(json.loads(capsys.readouterr().out)["pose"]["position_error"])
+    assert found[1] == pytest.approx(found[0], abs=1e-5)
+
+
 def main_code(arguments):
     try:
         main(arguments)

@@ -63,6 +63,12 @@ def _print_moves(console: Console, job: Job, result: JobResult) -> None:
         f"Slaves against {job.robots[job.master]}, worst rms to expect: {result.shift.position[:, -1].max():.3f} mm "
         f"after 100 mm, {result.turn.position[:, -1].max():.3f} mm after 2°."
     )
+    worst = result.masters.max(axis=1)
+    best = int(np.argmin(worst))
+    if worst[best] < 0.9 * worst[job.master]:
+        console.print(
+            f"As master {job.robots[best]} would leave {worst[best]:.3f} mm instead of {worst[job.master]:.3f}."
+        )
     if result.pose_error is not None:
         x, y, z = result.pose_error[3:]
         turns = " ".join(f"{value:+.4f}" for value in np.degrees(result.pose_error[:3]))

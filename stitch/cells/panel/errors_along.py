@@ -54,6 +54,16 @@ def along(
     return ErrorsAlong(np.asarray(steps, float), out[0], out[1])
 
 
+def by_master(models: Sequence[RobotModel], T_base_flange: Array, distance: float, angle: float) -> Array:
+    """(N, 2) worst rms position error (mm) of any slave after a distance (mm) and an angle (rad), per master."""
+    rows = []
+    for master in range(len(models)):
+        args = models, T_base_flange, master
+        shift, turn = along(*args, np.array([distance]), turn=False), along(*args, np.array([angle]), turn=True)
+        rows.append([shift.position.max(), turn.position.max()])
+    return np.array(rows)
+
+
 def _stack(models: Sequence[RobotModel]) -> tuple[Array, Array]:
     return np.array([m.T_world_base for m in models]), np.array([m.T_flange_contact for m in models])
 

@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.cells.panel.errors_along import ErrorsAlong, along
+from stitch.cells.panel.errors_along import ErrorsAlong, along, by_master
 from stitch.cells.panel.global_model import RobotModel, calibrate
 from stitch.cells.panel.layout import Contacts, contacts
 from stitch.cells.panel.legs import LegOffset, find_leg_offset, true_flanges
 from stitch.cells.panel.motion import adjust_pose, preposition
-from stitch.cells.panel.reading import Job, Points
+from stitch.cells.panel.reading import Job
 from stitch.cells.panel.rigid_fit import RigidFit, rigid_fit
 from stitch.cells.panel.shape import ShapeStep, largest, shape_step
-from stitch.errors import InputError
 from stitch.frames import Array
 
 # The source moves 100 mm and turns 2°.
@@ -31,6 +30,7 @@ class JobResult:
     preposition: Array  # (N, 4, 4)
     shift: ErrorsAlong
     turn: ErrorsAlong
+    masters: Array  # (N, 2) worst error of a slave, mm, after the longest shift and turn, if robot N were master
     pose: RigidFit | None  # T_world_panel
     pose_error: Array | None  # (6,) twist from target to measured pose, panel frame
     pose_commands: Array | None  # (N, 4, 4)
@@ -71,6 +71,7 @@ def solve_job(job: Job) -> JobResult:
     stand = before if job.flanges is None else _real(job, offsets, job.flanges)
     shift = along(models, stand, job.master, _DISTANCES, turn=False)
     turn = along(models, stand, job.master, _ANGLES, turn=True)
+    masters = by_master(models, stand, float(_DISTANCES[-1]), float(_ANGLES[-1]))
     pose = pose_error = pose_commands = shape = shape_largest = shape_commands = None
     if job.targets is not None:
         pose = rigid_fit(job.targets.nominal, job.targets.seen, job.tracker.sigma(job.targets.seen))
@@ -78,7 +79,6 @@ def solve_job(job: Job) -> JobResult:
         moved = adjust_pose(bases, stand, job.master, pose.T, job.T_world_target)
         pose_commands = _commands(job, offsets, moved)
     if job.control is not None:
-        _require_control(job, job.control)
         seen = frames.transform(frames.inverse(job.T_world_target), job.control.seen)
         shape = shape_step(
             seen, job.control.nominal, job.control.clamp, layout.T_panel_contact, stand, clamps, job.axes
@@ -86,7 +86,7 @@ def solve_job(job: Job) -> JobResult:
         shape_largest = largest(shape.deviations, job.control.clamp, layout.T_panel_contact)
         shape_commands = _commands(job, offsets, shape.T_base_flange)
     return JobResult(
-        layout, models, offsets, _commands(job, offsets, before), shift, turn, pose, pose_error, pose_commands,
+        layout, models, offsets, _commands(job, offsets, before), shift, turn, masters, pose, pose_error, pose_commands,
         shape, shape_largest, shape_commands,
     )  # fmt: skip
 
@@ -103,9 +103,3 @@ def _real(job: Job, offsets: tuple[LegOffset, ...], believed: Array, sign: float
 def _commands(job: Job, offsets: tuple[LegOffset, ...], wanted: Array) -> Array:
     """What to tell the controllers so that the flanges really come to `wanted`; first order in the offset."""
     return _real(job, offsets, wanted, sign=-1.0)
-
-
-def _require_control(job: Job, control: Points) -> None:
-    for i, name in enumerate(job.robots):
-        if not (control.clamp == i).any():
-            raise InputError(f"control points: robot {name} has none; measure one or more beside its clamp")

@@ -1,36 +1,26 @@
 """A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stitch.cells.csv_table import Columns, read_columns
 from stitch.cells.panel.global_model import Readings
-from stitch.cells.panel.layout import Layout
+from stitch.cells.panel.layout import Layout, contacts
 from stitch.cells.panel.legs import Legs
+from stitch.cells.panel.tables import Points, read_calibration, read_per_robot, read_points, read_world
 from stitch.cells.panel.tracker import Tracker
-from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
+from stitch.cells.pose_table import COLUMNS, from_numbers
 from stitch.cells.toml_tables import check_keys, choice, finite, table
 from stitch.errors import InputError
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 
 FORMAT = "stitch-panel/1"
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
-_FILES = {"calibration", "flanges", "targets", "control", "forces"}
+_FILES = {"calibration", "flanges", "targets", "control", "forces", "world"}
 _LAYOUT = ("radius", "clamp_width", "spacing", "clamp_height", "edge", "length")
-
-
-@dataclass(frozen=True)
-class Points:
-    """Targets on the panel and where the tracker sees them, mm."""
-
-    names: list[str]
-    nominal: Array  # (K, 3) panel frame
-    seen: Array  # (K, 3) world frame
-    clamp: Indices  # (K,) index of the robot; −1 where the file has none
 
 
 @dataclass(frozen=True)
@@ -69,20 +59,23 @@ def read_job(file: Path | str) -> Job:
     target = table(file, document, "target")
     check_keys(file, "target", target, set(COLUMNS.split()))
     pose = [finite(file, f"target.{key}", target.get(key)) for key in COLUMNS.split()]
-    entries = table(file, document, "layout")
-    check_keys(file, "layout", entries, set(_LAYOUT))
-    sizes = {key: finite(file, f"layout.{key}", entries.get(key), positive=True) for key in _LAYOUT}
-    tracker = _tracker(file, table(file, document, "tracker"))
-    tolerance, axes = _shape(file, document.get("shape", {}))
     paths = _paths(file, table(file, document, "files"))
-    flanges = _per_robot(paths["flanges"], names, COLUMNS) if "flanges" in paths else None
+    tracker = _tracker(file, table(file, document, "tracker"))
+    T_world_tracker = np.eye(4)
+    if "world" in paths:
+        T_world_tracker = read_world(paths["world"], tracker)
+        tracker = replace(tracker, position=T_world_tracker[:3, 3])
+    tolerance, axes = _shape(file, document.get("shape", {}))
+    flanges = read_per_robot(paths["flanges"], names, COLUMNS) if "flanges" in paths else None
+    layout, legs = _layout(file, document, len(names) // 2), _legs(file, document.get("legs"))
     return Job(
         names, names.index(choice(file, "master", document.get("master"), names)), from_numbers(np.array(pose)),
-        Layout(columns=len(names) // 2, **sizes), tracker, tolerance, axes, _legs(file, document.get("legs")),
-        _calibration(paths["calibration"], names, tracker), None if flanges is None else from_numbers(flanges),
-        _points(paths["targets"], None) if "targets" in paths else None,
-        _points(paths["control"], names) if "control" in paths else None,
-        _per_robot(paths["forces"], names, "tx ty tz fx fy fz") if "forces" in paths else None,
+        layout, tracker, tolerance, axes, legs,
+        read_calibration(paths["calibration"], names, tracker, T_world_tracker),
+        None if flanges is None else from_numbers(flanges),
+        read_points(paths["targets"], None, T_world_tracker) if "targets" in paths else None,
+        read_points(paths["control"], names, T_world_tracker) if "control" in paths else None,
+        read_per_robot(paths["forces"], names, "tx ty tz fx fy fz") if "forces" in paths else None,
     )  # fmt: skip
 
 
@@ -99,6 +92,18 @@ def _document(file: Path) -> dict[str, Any]:
         file, "", document, {"format", "robots", "master", "target", "layout", "tracker", "shape", "legs", "files"}
     )
     return document
+
+
+def _layout(file: Path, document: dict[str, Any], columns: int) -> Layout:
+    entries = table(file, document, "layout")
+    check_keys(file, "layout", entries, set(_LAYOUT))
+    sizes = {key: finite(file, f"layout.{key}", entries.get(key), positive=True) for key in _LAYOUT}
+    layout = Layout(columns=columns, **sizes)
+    try:
+        contacts(layout)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    return layout
 
 
 def _tracker(file: Path, entries: dict[str, Any]) -> Tracker:
@@ -127,7 +132,11 @@ def _legs(file: Path, entries: Any) -> Legs | None:
     if entries is None:
         return None
     check_keys(file, "legs", entries, {"base", "platform"})
-    return Legs(*(_vectors(file, f"legs.{key}", entries.get(key), 6) for key in ("base", "platform")))
+    legs = Legs(*(_vectors(file, f"legs.{key}", entries.get(key), 6) for key in ("base", "platform")))
+    for name, joints in (("base", legs.base), ("platform", legs.platform)):
+        if np.linalg.matrix_rank(joints - joints.mean(axis=0), tol=1e-3) < 2:
+            raise InputError(f"{file}: legs.{name}: the six joints lie on one line; give them in mm, leg by leg")
+    return legs
 
 
 def _vectors(file: Path, place: str, value: Any, count: int) -> Array:
@@ -148,39 +157,3 @@ def _paths(file: Path, entries: dict[str, Any]) -> dict[str, Path]:
         if not isinstance(value, str):
             raise InputError(f"{file}: files.{key} is {value!r}; name a CSV file in quotes")
     return {key: file.parent / value for key, value in entries.items()}
-
-
-def _calibration(file: Path, names: tuple[str, ...], tracker: Tracker) -> tuple[Readings, ...]:
-    columns = read_columns(file, "robot", f"{COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
-    poses, seen = from_columns(columns), columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
-    robot = np.array(columns.texts["robot"])
-    _known(file, columns, names)
-    for name in names:
-        if not (robot == name).any():
-            raise InputError(f"{file}: robot {name} has no row; measure its poses, or leave it out of the job")
-    return tuple(Readings(n, poses[robot == n], seen[robot == n], tracker.sigma(seen[robot == n])) for n in names)
-
-
-def _per_robot(file: Path, names: tuple[str, ...], wanted: str) -> Array:
-    columns = read_columns(file, "robot", wanted)
-    _known(file, columns, names)
-    listed = columns.texts["robot"]
-    for name in names:
-        if listed.count(name) != 1:
-            raise InputError(f"{file}: robot {name} stands in {listed.count(name)} rows; give each robot one")
-    return columns.stack(wanted)[[listed.index(name) for name in names]]
-
-
-def _points(file: Path, robots: tuple[str, ...] | None) -> Points:
-    columns = read_columns(file, "point robot" if robots else "point", "x y z seen_x seen_y seen_z")
-    clamp = np.full(columns.rows, -1)
-    if robots:
-        _known(file, columns, robots)
-        clamp = np.array([robots.index(name) for name in columns.texts["robot"]])
-    return Points(columns.texts["point"], columns.stack("x y z"), columns.stack("seen_x seen_y seen_z"), clamp)
-
-
-def _known(file: Path, columns: Columns, names: tuple[str, ...]) -> None:
-    for name in columns.texts["robot"]:
-        if name not in names:
-            raise InputError(f"{file}: robot {name!r} is not in the job's robots {', '.join(names)}; mend its name")

@@ -25,6 +25,7 @@ def document(job: Job, result: JobResult) -> dict[str, Any]:
         "errors": {
             "after_100_mm": result.shift.position[:, -1].max(axis=0).tolist(),
             "after_2_deg": result.turn.position[:, -1].max(axis=0).tolist(),
+            "by_master": dict(zip(job.robots, result.masters.tolist(), strict=True)),
         },
     }  # fmt: skip
     if result.pose is not None and result.pose_error is not None:

@@ -16,6 +16,11 @@ def biweight(u: Array) -> Array:
     return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
 
 
+def biweight_slope(u: Array) -> Array:
+    """Change of weight · u with u: what the normal matrix of a robust fit's covariance takes (Huber & Ronchetti)."""
+    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))
+
+
 def cell_weights(points: Array, found: Nearest, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
     """(N,) weight of each point's cell: a cube of edge `cell` (part frame) and a side that its points look to.
 

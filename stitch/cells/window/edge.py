@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stitch.cells.window.cell_weights import biweight, biweight_slope
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -84,9 +85,11 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array]:
         found = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
         left = values - design @ found
         scale = max(_MAD * float(np.median(np.abs(left))), 1e-9)
-        weight = np.where(np.abs(left) < _TUKEY * scale, (1 - (left / (_TUKEY * scale)) ** 2) ** 2, 0.0)
-    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, weight, design))
+        weight = biweight(left / (_TUKEY * scale))
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, biweight_slope(left / (_TUKEY * scale)), design))
     _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
     scores = np.zeros((cube.max() + 1, design.shape[1]))
     np.add.at(scores, cube.ravel(), design * (weight * left)[:, None])
-    return np.asarray(found), np.asarray(inverse @ scores.T @ scores @ inverse)
+    cubes, unknowns = scores.shape
+    few = cubes / max(cubes - unknowns, 1)
+    return np.asarray(found), np.asarray(few * inverse @ scores.T @ scores @ inverse)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.cells.window.cad import Nearest, Surface, nearest
-from stitch.cells.window.cell_weights import biweight, cell_weights
+from stitch.cells.window.cell_weights import biweight, biweight_slope, cell_weights
 from stitch.cells.window.regions import Regions
 from stitch.cells.window.scans import Joined
 from stitch.errors import NoResultError
@@ -68,16 +68,18 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
         weight = used * biweight(found.distance / (_TUKEY * scale))
         if by_cell:
             weight *= cell_weights(local, found, used, cad.size / _CELLS, scale)
-        step, normal_matrix, design = _step(local, found, weight, cad)
+        step, design = _step(local, found, weight, cad)
         shift = frames.make(np.eye(3), cad.centre)
         T_base_part = T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift))
         if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, scan.noise):
             if by_cell:
                 break
             by_cell = True
-    inverse = np.linalg.inv(normal_matrix)
     # Sandwich: the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7).
-    meat = np.einsum("ni,n,nj->ij", design, (weight * scale) ** 2, design)
+    u = found.distance / (_TUKEY * scale)
+    slope = np.where(weight > 0, weight / np.maximum(biweight(u), 1e-12) * biweight_slope(u), 0.0)
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design))
+    meat = np.einsum("ni,n,nj->ij", design, (weight * found.distance) ** 2, design)
     distance = found.distance[used]
     inliers = float(np.mean(np.abs(distance) < 0.54 * _TUKEY * scale))
     rms = float(np.sqrt((distance**2).mean()))
@@ -116,12 +118,12 @@ def _look(
     return local, found, allowed
 
 
-def _step(local: Array, found: Nearest, weight: Array, cad: Surface) -> tuple[Array, Array, Array]:
-    """One Gauss-Newton step about the CAD's centre: twist, normal matrix, design (N, 6)."""
+def _step(local: Array, found: Nearest, weight: Array, cad: Surface) -> tuple[Array, Array]:
+    """One Gauss-Newton step about the CAD's centre: twist (6,) and design (N, 6)."""
     design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal])
     N = np.einsum("ni,n,nj->ij", design, weight, design)
     units = np.repeat([cad.size / 2, 1.0], 3)
     values = np.linalg.eigvalsh(N / np.outer(units, units))
     if values[0] < _OPEN * values[-1]:
         raise NoResultError("the scanned surface leaves a direction open (plane, cylinder or sphere); scan an edge too")
-    return np.linalg.solve(N, -design.T @ (weight * found.distance)), N, design
+    return np.linalg.solve(N, -design.T @ (weight * found.distance)), design

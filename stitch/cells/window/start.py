@@ -12,6 +12,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.native import load_open3d
 
+_FEWEST = 50
 _POINTS = 1500  # of the scan that judge a candidate
 _KEEP = 6  # candidates that are refined
 _REFINE = 20  # steps of a candidate's refinement
@@ -40,6 +41,8 @@ def find_start(scan: Joined, cad: Surface) -> Start:
     Raises:
         NoResultError: no candidate brings a third of the scan onto the CAD.
     """
+    if scan.usable.sum() < _FEWEST:
+        raise NoResultError(f"{scan.usable.sum()} usable points in the scan; the rest are edges or seen too flat")
     index = _spread(scan)
     points, normals = scan.points[index], scan.normals[index]
     gate, fine = cad.size / 25, cad.size / 250
