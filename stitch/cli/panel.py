@@ -54,6 +54,13 @@ def _print_legs(console: Console, result: JobResult) -> None:
             f"Robot {o.robot}: leg {o.leg} is {o.offset:+.3f} ± {o.sigma:.3f} mm longer than its controller believes"
             f"{doubt}. Taken out of its model and put into its commands."
         )
+    for model in result.models:
+        if model.p_value < 1e-4:
+            times = np.sqrt(model.chi_square / model.redundancy)
+            console.print(
+                f"Robot {model.name}: its residuals are {times:.1f} times what the tracker's sigma allows and nothing "
+                "known explains them; look at single rows, or at the robot."
+            )
     if result.legs and not found:
         console.print("No leg offset beyond chance in any robot.")
 

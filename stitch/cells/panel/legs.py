@@ -12,12 +12,15 @@ from scipy.stats import chi2
 
 from stitch import frames
 from stitch.cells.panel.global_model import Readings, RobotModel
+from stitch.errors import NoResultError
 from stitch.frames import Array
 
 # Chance of naming an offset that is not there, over all legs of all robots.
 _FALSE_ALARM = 1e-3
 # A leg whose effect base and clamp swallow to this share cannot be judged.
 _SWALLOWED = 1e-6
+# Legs in mm: 1e3 or so comes from mm against rad, more is a robot near a singular pose.
+_SINGULAR = 1e7
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,11 @@ def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: in
 
     Args:
         tests: legs of all robots together, for the chance of a false alarm.
+
+    Raises:
+        NoResultError: the legs cannot hold the flange in a pose.
     """
-    twists = np.linalg.inv(leg_jacobian(legs, readings.T_base_flange))  # (M, 6, leg)
+    twists = _twists_per_leg(legs, readings.T_base_flange)
     R = model.T_world_base[:3, :3] @ readings.T_base_flange[:, :3, :3]
     local = np.concatenate([-frames.skew(model.reflectors), np.tile(np.eye(3), (3, 1, 1))], axis=-1)
     moved = np.einsum("mij,kjc,mcl->mkil", R, local, twists) / readings.sigma[..., None, None]
@@ -81,7 +87,24 @@ def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: in
 
 
 def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, float]]) -> Array:
-    """Where the flange (M, 4, 4) really is when legs (from 1) are longer than the controller believes, mm."""
-    twists = np.linalg.inv(leg_jacobian(legs, T_base_flange))
+    """Where the flange (M, 4, 4) really is when legs (from 1) are longer than the controller believes, mm.
+
+    Raises:
+        NoResultError: the legs cannot hold the flange in a pose.
+    """
+    twists = _twists_per_leg(legs, T_base_flange)
     xi = sum((twists[..., leg - 1] * size for leg, size in offsets), np.zeros((len(T_base_flange), 6)))
     return np.asarray(T_base_flange @ frames.exp(np.asarray(xi)))
+
+
+def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
+    """(M, 6, leg): flange twist per mm of each leg."""
+    lengths = leg_jacobian(legs, T_base_flange)
+    loose = ~np.isfinite(lengths).all(axis=(1, 2))
+    loose |= np.asarray(np.linalg.cond(np.where(loose[:, None, None], 0.0, lengths))) > _SINGULAR
+    if loose.any():
+        x, y, z = T_base_flange[np.argmax(loose), :3, 3]
+        raise NoResultError(
+            f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; mend that pose, or the joints in [legs]"
+        )
+    return np.asarray(np.linalg.inv(lengths))

@@ -15,6 +15,7 @@ from stitch.native import load_open3d
 
 # Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
 _SAME_SIDE = np.cos(np.radians(45.0))
+_FAR_SIDE = -0.5
 _MOST_SAMPLES = 400_000
 
 
@@ -77,8 +78,8 @@ def surface(mesh: Any) -> Surface:
 def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     """Partners of points (N, 3) with normals (N, 3), part frame.
 
-    First the nearest triangle; where it looks the other way (a thin sheet's far side), the nearest of samples that
-    look the same way.
+    First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
+    A normal that lies between is smeared over an edge and has no partner.
     """
     o3d = load_open3d()
     found = cad.scene.compute_closest_points(o3d.core.Tensor(np.float32(points - cad.centre)))
@@ -87,7 +88,7 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)
     normal = np.array(cad.mesh.face_normals[face])
     distance, accept = _judge(points - place, normal, normals, 1e-3 * cad.spacing)
-    other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) <= _SAME_SIDE)
+    other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) < _FAR_SIDE)
     if len(other):
         index = sample_partners(cad, points[other], normals[other])
         normal[other] = cad.normals[index]
