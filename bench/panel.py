@@ -133,8 +133,9 @@ def leg_table(draws: int) -> list[str]:
                     values, sigmas = [*values, o.offset], [*sigmas, o.sigma]
                     errors.append(_base_errors(cell, reading, model, o))
         b, a = np.sqrt((np.array(errors) ** 2).mean(0))
-        lines.append(f"| {size} | {found} of {draws} | {right} of {draws} | {np.mean(values):+.3f} ± {np.std(values):.3f} "
-                     f"| {np.mean(sigmas):.3f} | {wrong} of {5 * draws} | {b:.3f} | {a:.3f} |")  # fmt: skip
+        mean = f"{np.mean(values):+.3f} ± {np.std(values):.3f} | {np.mean(sigmas):.3f}"
+        counts = f"{found} of {draws} | {right} of {draws}"
+        lines.append(f"| {size} | {counts} | {mean} | {wrong} of {5 * draws} | {b:.3f} | {a:.3f} |")
     return lines
 
 

@@ -21,6 +21,12 @@ _POSE = [(x, a) for x in (-1400.0, -470.0, 470.0, 1400.0) for a in (-0.31, 0.0, 
 _CONTROL = [(-1310.0, -0.03), (-1310.0, 0.03), (-830.0, 0.0)]
 _COLUMN = 0.2197  # angle between neighbouring clamps of that layout
 SKIN = 3.0
+_COMMENT = """# Lengths in mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
+# robots: row by row as the layout counts its clamps, each row from one long edge of the panel to the other.
+# target: where the panel's frame shall stand in the world; z out of the panel, x along its axis.
+# legs: joints of the six-legged robots, leg by leg; leave the table out for other robots.
+# files: calibration is needed; flanges (where the robots stand now) goes with targets and control.
+"""
 
 
 def inner(x: float, angle: float) -> list[float]:
@@ -105,7 +111,7 @@ def write_job(file: Path, cell: PanelCell, files: dict[str, str]) -> None:
         "legs": {"base": np.round(hexapod.BASE, 4).tolist(), "platform": np.round(hexapod.PLATFORM, 4).tolist()},
         "files": files,
     }  # fmt: skip
-    file.write_text(tomli_w.dumps(document), encoding="utf-8")
+    file.write_text(_COMMENT + tomli_w.dumps(document), encoding="utf-8")
 
 
 def _write(file: Path, header: str, rows: list[list[object]]) -> None:

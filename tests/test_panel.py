@@ -166,7 +166,7 @@ def test_rigid_motions_of_the_shell_cost_nothing():
     s = shell(2960.0)
     x, arc = s._x, s._s
     points = np.column_stack([x, 2960 * np.sin(arc / 2960), 2960 * np.cos(arc / 2960)])
-    field = np.cross([1e-3, -7e-4, 5e-4], points) + [0.1, 0.2, 0.3]
+    field = np.cross([1e-3, -7e-4, 5e-4], points) + np.array([0.1, 0.2, 0.3])
     local = np.einsum("nij,ni->nj", s.axes(arc), field)
     bent = np.column_stack([0 * x, 0 * x, 1e-3 * arc**2 / 400])
     rigid, bend = (energy(s, f) for f in (local, bent))

@@ -107,7 +107,9 @@ def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     assert furthest(found.T_base_part, T, door) < 0.05
     shown = deviations(scan, cad, found.T_base_part, 0.5, 15.0)
     # Compared where the outer skin is flat enough for a dent along y to be one along the normal within 5 %.
-    slope = np.gradient(car_door.outer_surface(CarDoor(**DOOR), np.full(3, 170.0), np.array([88.0, 90.0, 92.0])), 2.0)[1]
+    slope = np.gradient(car_door.outer_surface(CarDoor(**DOOR), np.full(3, 170.0), np.array([88.0, 90.0, 92.0])), 2.0)[
+        1
+    ]
     middle = shown.cells.middle
     at = (np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) < 25) & (shown.cells.mean < -1)
     assert at.sum() >= 4

@@ -100,10 +100,11 @@ def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, 
 def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
     """(M, 6, leg): flange twist per mm of each leg."""
     lengths = leg_jacobian(legs, T_base_flange)
-    loose = ~np.isfinite(lengths).all(axis=(1, 2))
-    loose |= np.asarray(np.linalg.cond(np.where(loose[:, None, None], 0.0, lengths))) > _SINGULAR
-    if loose.any():
-        x, y, z = T_base_flange[np.argmax(loose), :3, 3]
+    broken = np.logical_not(np.asarray(np.isfinite(lengths).all(axis=(1, 2))))
+    condition = np.linalg.cond(np.where(broken[:, None, None], 0.0, lengths))
+    loose = np.flatnonzero(np.logical_not(condition < _SINGULAR))
+    if len(loose):
+        x, y, z = T_base_flange[loose[0], :3, 3]
         raise NoResultError(
             f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; mend that pose, or the joints in [legs]"
         )
