@@ -73,17 +73,17 @@ def solve_job(job: Job) -> JobResult:
     turn = along(models, stand, job.master, _ANGLES, turn=True)
     masters = by_master(models, stand, float(_DISTANCES[-1]), float(_ANGLES[-1]))
     pose = pose_error = pose_commands = shape = shape_largest = shape_commands = None
+    T_world_panel = job.T_world_target
     if job.targets is not None:
         pose = rigid_fit(job.targets.nominal, job.targets.seen, job.tracker.sigma(job.targets.seen))
-        pose_error = frames.log(frames.inverse(job.T_world_target) @ pose.T)
-        moved = adjust_pose(bases, stand, job.master, pose.T, job.T_world_target)
-        pose_commands = _commands(job, offsets, moved)
+        T_world_panel, pose_error = pose.T, frames.log(frames.inverse(job.T_world_target) @ pose.T)
+        stand = adjust_pose(bases, stand, job.master, pose.T, job.T_world_target)
+        pose_commands = _commands(job, offsets, stand)
     if job.control is not None:
-        seen = frames.transform(frames.inverse(job.T_world_target), job.control.seen)
-        shape = shape_step(
-            seen, job.control.nominal, job.control.clamp, layout.T_panel_contact, stand, clamps, job.axes
-        )
-        shape_largest = largest(shape.deviations, job.control.clamp, layout.T_panel_contact)
+        # With targets, the shape is judged on the panel where it was measured and mended where it goes.
+        seen, clamp = frames.transform(frames.inverse(T_world_panel), job.control.seen), job.control.clamp
+        shape = shape_step(seen, job.control.nominal, clamp, layout.T_panel_contact, stand, clamps, job.axes)
+        shape_largest = largest(shape.deviations, clamp, layout.T_panel_contact)
         shape_commands = _commands(job, offsets, shape.T_base_flange)
     return JobResult(
         layout, models, offsets, _commands(job, offsets, before), shift, turn, masters, pose, pose_error, pose_commands,
