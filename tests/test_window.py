@@ -250,3 +250,11 @@ def test_expected_region_without_points_is_no_fit(pane_cad):
         from stitch.cells.window import read_fit_job
 
         read_fit_job("nowhere.toml")
+
+
+def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
+    scan = scan_pane(pane, truth(1), 1)
+    points = scan.points + np.where(np.arange(len(scan.points)) < 2000, 1e8, 0.0)[:, None]
+    thrown = type(scan)(points, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
+    with pytest.raises(NoResultError, match="mend a scanner's pose"):
+        find_start(thrown, pane_cad)

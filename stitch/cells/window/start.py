@@ -68,6 +68,8 @@ def _spread(scan: Joined) -> Indices:
     size = np.ptp(scan.points[usable], axis=0).max() / 70
     _, first = np.unique(np.floor(scan.points[usable] / size).astype(int), axis=0, return_index=True)
     kept = usable[np.sort(first)]
+    if len(kept) < _FEWEST:
+        raise NoResultError(f"the scans reach over {70 * size:.3g}, mostly empty; mend a scanner's pose, or cut them")
     picked: Indices = kept[np.linspace(0, len(kept) - 1, min(_POINTS, len(kept))).astype(int)]
     return picked
 
