@@ -132,7 +132,8 @@ def judge(run: Path, truth: Path) -> dict[str, Any]:
         for name, value in parameters.items():
             got = fitted.get(effect, {}).get(name)
             if got:
-                judged[f"{effect}.{name}"] = f"{got['value']:.3g} ± {got['sigma']:.1g}, true {value:.3g}"
+                sigma = "" if got["sigma"] is None else f" ± {got['sigma']:.1g}"
+                judged[f"{effect}.{name}"] = f"{got['value']:.3g}{sigma}, true {value:.3g}"
     return judged
 
 

@@ -17,8 +17,11 @@ from stitch.cli.compare import compare_run
 from stitch.cli.diagnose import diagnose_run, next_measurement
 from stitch.cli.drill import drill
 from stitch.cli.effects import effects
+from stitch.cli.fit import fit
 from stitch.cli.import_file import import_command
+from stitch.cli.panel import panel
 from stitch.cli.run import run
+from stitch.cli.seam import seam
 from stitch.errors import StitchError
 
 app = typer.Typer(
@@ -41,6 +44,9 @@ def build() -> typer.Typer:
     app.command()(drill)
     app.command("import")(import_command)
     app.add_typer(calibrate, name="calibrate")
+    app.command()(panel)
+    app.command()(fit)
+    app.command()(seam)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

@@ -1,0 +1,39 @@
+"""A six-legged parallel robot: from leg lengths to the flange, by Newton's method."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch import frames
+
+Array = NDArray[np.float64]
+
+
+def ring(radius: float, half_gap_deg: float, first_deg: float) -> Array:
+    """(6, 3) joints in three pairs on a circle in the plane z = 0, mm."""
+    pairs = np.radians(np.repeat(first_deg + 120.0 * np.arange(3), 2))
+    angles = pairs + np.radians(half_gap_deg) * np.tile([-1.0, 1.0], 3)
+    return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(6)])
+
+
+# Neighbouring joints of base and platform belong to one leg.
+BASE = ring(620.0, 48.0, 0.0)
+PLATFORM = ring(330.0, 12.0, 0.0)
+HOME_HEIGHT = 760.0
+
+
+def lengths(T_base_flange: Array) -> Array:
+    """(6,) leg lengths, mm."""
+    ends = PLATFORM @ T_base_flange[:3, :3].T + T_base_flange[:3, 3]
+    return np.asarray(np.linalg.norm(ends - BASE, axis=1))
+
+
+def forward(leg_lengths: Array, guess: Array) -> Array:
+    """T_base_flange (4, 4) of six leg lengths, near a guess."""
+    T = np.array(guess, float)
+    for _ in range(20):
+        miss = leg_lengths - lengths(T)
+        if np.abs(miss).max() < 1e-10:
+            break
+        slopes = [(lengths(T @ frames.exp(d)) - lengths(T @ frames.exp(-d))) / 2e-6 for d in 1e-6 * np.eye(6)]
+        T = T @ frames.exp(np.linalg.solve(np.array(slopes).T, miss))
+    return T

@@ -1,0 +1,121 @@
+"""A panel cell's measurements as the files that `stitch panel` reads."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from data_synth import hexapod
+from data_synth.panel_cell import LENGTH, NAMES, RADIUS, PanelCell
+from stitch import frames
+
+Array = NDArray[np.float64]
+
+LAYOUT = {"radius": RADIUS, "clamp_width": 360.0, "spacing": 290.0, "clamp_height": 360.0, "edge": 300.0,
+          "length": LENGTH}  # fmt: skip
+# Targets of the pose on the inner side, and three control points at each clamp: axial place and angle.
+_POSE = [(x, a) for x in (-1400.0, -470.0, 470.0, 1400.0) for a in (-0.31, 0.0, 0.31)]
+_CONTROL = [(-1310.0, -0.03), (-1310.0, 0.03), (-830.0, 0.0)]
+_COLUMN = 0.2197  # angle between neighbouring clamps of that layout
+SKIN = 3.0
+_COMMENT = """# Lengths in mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
+# robots: row by row as the layout counts its clamps, each row from one long edge of the panel to the other.
+# target: where the panel's frame shall stand in the world; z out of the panel, x along its axis.
+# legs: joints of the six-legged robots, leg by leg; leave the table out for other robots.
+# files: calibration is needed; flanges (where the robots stand now) goes with targets and control.
+"""
+
+
+def inner(x: float, angle: float) -> list[float]:
+    """A nominal point on the panel's inner side, mm."""
+    r = RADIUS - SKIN
+    return [x, r * np.sin(angle), r * np.cos(angle) - RADIUS]
+
+
+def pose_targets() -> Array:
+    """(12, 3) panel frame."""
+    return np.array([inner(*at) for at in _POSE])
+
+
+def control_points() -> tuple[Array, NDArray[np.int64]]:
+    """(18, 3) panel frame and the index of the clamp of each."""
+    points, clamp = [], []
+    for i in range(6):
+        side, angle = (1.0 if i < 3 else -1.0), _COLUMN * (i % 3 - 1)
+        for x, off in _CONTROL:
+            points.append(inner(side * x, angle + off))
+            clamp.append(i)
+    return np.array(points), np.array(clamp)
+
+
+def calibration_poses(count: int, seed: int = 0) -> Array:
+    """(M, 6, 4, 4) commands all about the robots' workspace: ±80 mm and ±8°."""
+    rng = np.random.default_rng(seed)
+    twist = rng.uniform(-1, 1, (count, 6, 6)) * np.repeat([np.radians(8.0), 80.0], 3)
+    return np.asarray(frames.make(np.eye(3), [0.0, 0.0, hexapod.HOME_HEIGHT]) @ frames.exp(twist))
+
+
+def calibration(cell: PanelCell, commands: Array) -> Array:
+    """(M, 6, 3, 3) reflectors seen at commanded poses."""
+    seen = []
+    for T in commands:
+        cell.drive(T)
+        seen.append(cell.see_reflectors())
+    return np.array(seen)
+
+
+def numbers(T: Array) -> list[float]:
+    """x, y, z, a, b, c (mm, deg about z, y', x'')."""
+    angles = Rotation.from_matrix(T[:3, :3]).as_euler("ZYX", degrees=True)
+    return [round(float(v), 6) for v in (*T[:3, 3], *angles)]
+
+
+def write_calibration(file: Path, commands: Array, seen: Array) -> None:
+    """One row per robot and pose."""
+    rows = [[NAMES[i], m + 1, *numbers(commands[m, i]), *np.round(seen[m, i].ravel(), 5).tolist()]
+            for i in range(6) for m in range(len(commands))]  # fmt: skip
+    header = "robot pose x y z a_deg b_deg c_deg x1 y1 z1 x2 y2 z2 x3 y3 z3"
+    _write(file, header, rows)
+
+
+def write_flanges(file: Path, T_base_flange: Array) -> None:
+    """Where the robots stand."""
+    _write(file, "robot x y z a_deg b_deg c_deg", [[n, *numbers(T)] for n, T in zip(NAMES, T_base_flange, strict=True)])
+
+
+def write_points(file: Path, names: list[str], nominal: Array, seen: Array, robots: list[str] | None = None) -> None:
+    """Nominal points in the panel frame and what the tracker sees in the world."""
+    extra = [[r] for r in robots] if robots else [[] for _ in names]
+    rows = [[n, *e, *np.round(p, 4).tolist(), *np.round(q, 5).tolist()]
+            for n, e, p, q in zip(names, extra, nominal, seen, strict=True)]  # fmt: skip
+    _write(file, f"point {'robot ' if robots else ''}x y z seen_x seen_y seen_z", rows)
+
+
+def write_forces(file: Path, forces: Array) -> None:
+    """Change of the sensors since the panel was laid on, N·mm and N."""
+    rows = [[n, *np.round(f, 2).tolist()] for n, f in zip(NAMES, forces, strict=True)]
+    _write(file, "robot tx ty tz fx fy fz", rows)
+
+
+def write_job(file: Path, cell: PanelCell, files: dict[str, str]) -> None:
+    """The job file."""
+    document = {
+        "format": "stitch-panel/1", "robots": list(NAMES), "master": "B",
+        "target": dict(zip(("x", "y", "z", "a_deg", "b_deg", "c_deg"), numbers(cell.target), strict=True)),
+        "layout": LAYOUT,
+        "tracker": {"position": cell.tracker.tolist(), "constant": 0.010, "per_length": 5e-6},
+        "shape": {"tolerance": 0.6, "axes": ["z", "rx", "ry"]},
+        "legs": {"base": np.round(hexapod.BASE, 4).tolist(), "platform": np.round(hexapod.PLATFORM, 4).tolist()},
+        "files": files,
+    }  # fmt: skip
+    file.write_text(_COMMENT + tomli_w.dumps(document), encoding="utf-8")
+
+
+def _write(file: Path, header: str, rows: list[list[object]]) -> None:
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(header.split())
+        writer.writerows(rows)

@@ -1,0 +1,48 @@
+"""Poses as CSV rows: x, y, z and the angles a, b, c in degrees, turned about z, y', x'' in this order."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.cells.csv_table import Columns
+from stitch.frames import Array
+
+COLUMNS = "x y z a_deg b_deg c_deg"
+
+
+def from_numbers(numbers: Array) -> Array:
+    """Poses (..., 4, 4) from rows (..., 6)."""
+    numbers = np.asarray(numbers, float)
+    R = Rotation.from_euler("ZYX", numbers[..., 3:].reshape(-1, 3), degrees=True).as_matrix()
+    return frames.make(R.reshape(*numbers.shape[:-1], 3, 3), numbers[..., :3])
+
+
+def to_numbers(poses: Array) -> Array:
+    """Rows (N, 6) from poses (N, 4, 4)."""
+    poses = np.asarray(poses, float)
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)])
+
+
+def from_columns(table: Columns) -> Array:
+    """Poses (N, 4, 4) of a table that holds the six columns."""
+    return from_numbers(table.stack(COLUMNS))
+
+
+def write_poses(file: Path, key: str, names: Sequence[str], poses: Array) -> None:
+    """A CSV of named poses (N, 4, 4)."""
+    rows = np.round(to_numbers(poses), 6) + 0.0
+    columns = {name: rows[:, i] for i, name in enumerate(COLUMNS.split())}
+    write_columns(file, {key: list(names), **columns})
+
+
+def write_columns(file: Path, columns: Mapping[str, Sequence[object] | Array]) -> None:
+    """A CSV with a header; numbers keep nine digits."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([f"{value:.9g}" if isinstance(value, float) else value for value in row])

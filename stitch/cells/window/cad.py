@@ -1,0 +1,111 @@
+"""The CAD surface: nearest places for scanned points, told apart by the side they look to."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pykdtree.kdtree import KDTree
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.native import load_open3d
+
+# Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
+_SAME_SIDE = np.cos(np.radians(45.0))
+_FAR_SIDE = -0.5
+_MOST_SAMPLES = 400_000
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh with two ways to search it; part frame."""
+
+    mesh: Any  # trimesh.Trimesh
+    scene: Any  # Open3D ray-casting scene of the mesh about its centre, single precision
+    centre: Array  # (3,)
+    size: float  # diagonal of the bounding box
+    spacing: float  # of the samples
+    samples: Array  # (S, 3) on the surface
+    normals: Array  # (S, 3) outwards
+    tree: Any  # KDTree over (samples, reach · normals)
+    reach: float  # distance that counts as much as normals one radian apart
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """For N points: signed distance along the CAD's normal, that normal, and whether the place is a partner."""
+
+    distance: Array  # (N,) positive outside
+    normal: Array  # (N, 3)
+    accept: NDArray[np.bool_]  # (N,)
+
+
+def read_cad(file: Path) -> Surface:
+    """Read a mesh (STL, PLY, OBJ …) in length_unit.
+
+    Raises:
+        InputError: missing, unreadable or without triangles.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}: not found; name the CAD model as a mesh, STL, PLY or OBJ")
+    try:
+        mesh = trimesh.load_mesh(file)
+    except Exception as error:
+        raise InputError(f"{file}: cannot be read ({error or type(error).__name__}); export the mesh again") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{file}: holds no triangles; export the CAD model as a triangle mesh")
+    return surface(mesh)
+
+
+def surface(mesh: Any) -> Surface:
+    """Make a trimesh ready for searching."""
+    o3d = load_open3d()
+    centre = mesh.bounds.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.float32(mesh.vertices - centre), np.uint32(mesh.faces))
+    count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
+    tree = KDTree(np.hstack([samples, reach * normals]))
+    spacing = float(np.sqrt(mesh.area / count))
+    return Surface(mesh, scene, centre, size, spacing, np.asarray(samples), normals, tree, reach)
+
+
+def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
+    """Partners of points (N, 3) with normals (N, 3), part frame.
+
+    First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
+    A normal that lies between is smeared over an edge and has no partner.
+    """
+    o3d = load_open3d()
+    found = cad.scene.compute_closest_points(o3d.core.Tensor(np.float32(points - cad.centre)))
+    face = found["primitive_ids"].numpy().astype(np.int64)
+    # The scene works in single precision and only says which triangle; the place is computed in double.
+    place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)
+    normal = np.array(cad.mesh.face_normals[face])
+    distance, accept = _judge(points - place, normal, normals, 1e-3 * cad.spacing)
+    other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) < _FAR_SIDE)
+    if len(other):
+        index = sample_partners(cad, points[other], normals[other])
+        normal[other] = cad.normals[index]
+        off = points[other] - cad.samples[index]
+        distance[other], accept[other] = _judge(off, normal[other], normals[other], 2 * cad.spacing)
+    return Nearest(distance, normal, accept)
+
+
+def sample_partners(cad: Surface, points: Array, normals: Array) -> NDArray[np.int64]:
+    """Index of the sample nearest in place and direction to each point (N, 3) with normal (N, 3)."""
+    query = np.ascontiguousarray(np.hstack([points, cad.reach * normals]))
+    return np.asarray(cad.tree.query(query, k=1)[1], np.int64)
+
+
+def _judge(off: Array, normal: Array, seen: Array, loose: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Distance along the normal; a partner lies straight below its point, not beyond an edge of the surface."""
+    distance = np.einsum("ij,ij->i", off, normal)
+    aside = np.linalg.norm(off - distance[:, None] * normal, axis=1)
+    same = np.einsum("ij,ij->i", normal, seen) > _SAME_SIDE
+    return distance, same & (aside <= 0.5 * np.abs(distance) + loose)

@@ -1,0 +1,41 @@
+"""Robust weights of whole cells of the surface: a cell's mean shows a shift that no single point can."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch.cells.window.cad import Nearest
+from stitch.frames import Array
+
+_TUKEY, _MAD = 4.685, 1.4826
+# Cells with fewer points have no mean worth judging; their points keep their own weights.
+_FEWEST = 5
+
+
+def biweight(u: Array) -> Array:
+    """Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
+    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
+
+
+def biweight_slope(u: Array) -> Array:
+    """Change of weight · u with u: what the normal matrix of a robust fit's covariance takes (Huber & Ronchetti)."""
+    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))
+
+
+def cell_weights(points: Array, found: Nearest, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
+    """(N,) weight of each point's cell: a cube of edge `cell` (part frame) and a side that its points look to.
+
+    The scale is the cells' own spread (median), at least what the points' `scale` leaves in a mean: where a scan is
+    only as good as its robot, all cells are off a little and none is thrown out for it.
+    """
+    key = np.hstack([np.floor(points / cell), np.round(found.normal)]).astype(np.int64)
+    _, where = np.unique(key, axis=0, return_inverse=True)
+    where = where.ravel()
+    count = np.bincount(where, used)
+    mean = np.bincount(where, used * found.distance) / np.maximum(count, 1)
+    full = count >= _FEWEST
+    if not full.any():
+        return np.ones(len(points))
+    floor = scale / np.sqrt(np.median(count[full]))
+    spread = max(_MAD * float(np.median(np.abs(mean[full]))), float(floor))
+    weight = np.where(full, biweight(mean / (_TUKEY * spread)), 1.0)
+    return np.asarray(weight[where])

@@ -1,0 +1,88 @@
+"""The deviation map: every scanned point's signed distance from the CAD, and cells that are out of tolerance."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+from stitch import frames
+from stitch.cells.pose_table import write_columns
+from stitch.cells.window.cad import Surface, nearest
+from stitch.cells.window.scans import Joined
+from stitch.frames import Array
+
+# A cell with fewer points has no mean worth a verdict.
+_FEWEST = 5
+
+
+@dataclass(frozen=True)
+class Cells:
+    """C cells of the map: points of one cube that look the same way, averaged."""
+
+    middle: Array  # (C, 3) part frame
+    mean: Array  # (C,) deviation, positive outside
+    spread: Array  # (C,) 1-sigma of the points
+    count: NDArray[np.int64]  # (C,)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """N points that have a place on the CAD, part frame."""
+
+    points: Array  # (N, 3)
+    distance: Array  # (N,) positive outside
+    tolerance: float
+    cells: Cells
+
+    @property
+    def outside(self) -> NDArray[np.bool_]:
+        """(C,) cells whose mean is beyond the tolerance."""
+        return np.asarray(np.abs(self.cells.mean) > self.tolerance)
+
+
+def deviations(scan: Joined, cad: Surface, T_base_part: Array, tolerance: float, cell: float) -> Deviations:
+    """Distances of all usable points; cells of the edge length `cell` average the noise away."""
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, scan.points[scan.usable])
+    found = nearest(cad, local, frames.rotate(T, scan.normals[scan.usable]))
+    points, distance, normal = local[found.accept], found.distance[found.accept], found.normal[found.accept]
+    key = np.hstack([np.floor(points / cell), np.round(normal)]).astype(np.int64)
+    _, where, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    where = where.ravel()
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(where, values, len(count)) / count)
+
+    average = mean(distance)
+    middle = np.column_stack([mean(points[:, k]) for k in range(3)])
+    spread = np.sqrt(np.maximum(mean((distance - average[where]) ** 2), 0.0))
+    full = count >= _FEWEST
+    cells = Cells(middle[full], average[full], spread[full], count[full].astype(np.int64))
+    return Deviations(points, distance, tolerance, cells)
+
+
+def write_ply(file: Path, found: Deviations) -> None:
+    """Points with the scalar `deviation` and a colour: blue inside, red outside, full at the tolerance."""
+    share = np.clip(found.distance / found.tolerance, -1, 1)
+    vertex = np.empty(
+        len(share), [(n, "f4") for n in ("x", "y", "z", "deviation")] + [(n, "u1") for n in ("red", "green", "blue")]
+    )
+    vertex["x"], vertex["y"], vertex["z"] = found.points.T
+    vertex["deviation"] = found.distance
+    pale = 235 * (1 - np.abs(share))
+    vertex["red"], vertex["green"] = np.where(share > 0, 235, pale), pale
+    vertex["blue"] = np.where(share < 0, 235, pale)
+    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(file))
+
+
+def write_csv(file: Path, found: Deviations) -> None:
+    """One row per cell, the worst first."""
+    order = np.argsort(-np.abs(found.cells.mean))
+    c = found.cells
+    write_columns(file, {
+        "x": c.middle[order, 0], "y": c.middle[order, 1], "z": c.middle[order, 2], "deviation": c.mean[order],
+        "spread": c.spread[order], "points": c.count[order].tolist(),
+        "verdict": ["bad" if bad else "good" for bad in found.outside[order]],
+    })  # fmt: skip

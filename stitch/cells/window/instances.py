@@ -1,0 +1,36 @@
+"""Several parts of the same kind in one scan."""
+
+import numpy as np
+
+from stitch.cells.window.cad import Surface
+from stitch.cells.window.scans import Joined
+from stitch.errors import NoResultError
+from stitch.native import load_open3d
+
+# Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
+_GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40
+# A heap of points smaller than this share of the part's surface is no part.
+_LEAST = 0.1
+
+
+def split(scan: Joined, cad: Surface, wanted: int) -> list[Joined]:
+    """The scan's heaps of points (DBSCAN, Ester et al. 1996, through Open3D), largest first.
+
+    Raises:
+        NoResultError: fewer heaps of a part's size than wanted.
+    """
+    if wanted == 1:
+        return [scan]
+    o3d = load_open3d()
+    gap = max(_GAP_SPACINGS * scan.spacing, _GAP_SHARE * cad.size)
+    cells, where = np.unique(np.floor(scan.points / (gap / 3)).astype(int), axis=0, return_inverse=True)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((cells + 0.5) * gap / 3))
+    labels = np.asarray(cloud.cluster_dbscan(eps=gap, min_points=1))[where.ravel()]
+    heaps = [labels == label for label in range(labels.max() + 1)]
+    # Of a part at most one side is seen, so half its surface is the most a heap can hold.
+    big = [heap for heap in heaps if scan.area[heap].sum() > _LEAST * cad.mesh.area / 2]
+    if len(big) < wanted:
+        raise NoResultError(
+            f"{len(big)} separate parts in the scan, {wanted} wanted; scan the others, or mend `instances`"
+        )
+    return [scan.take(heap) for heap in sorted(big, key=lambda heap: -scan.area[heap].sum())[:wanted]]

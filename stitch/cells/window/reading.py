@@ -1,0 +1,167 @@
+"""Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here."""
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch import frames
+from stitch.cells.csv_table import read_columns
+from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
+from stitch.cells.toml_tables import check_keys, choice, finite
+from stitch.cells.window.cad import Surface, read_cad
+from stitch.cells.window.regions import Box, Regions
+from stitch.cells.window.scans import Joined, read_scans
+from stitch.cells.window.seam import Limits, Station
+from stitch.errors import InputError
+from stitch.frames import Array
+
+FIT, SEAM = "stitch-fit/1", "stitch-seam/1"
+_FIT_KEYS = {"format", "scans", "cad", "instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
+_SEAM_KEYS = {"format", "scans", "stations", "fit", "part", "limits", "pose_sigma"}
+
+
+@dataclass(frozen=True)
+class FitJob:
+    """Scans onto one CAD model; lengths in the CAD's unit."""
+
+    scan: Joined
+    cad: Surface
+    instances: int
+    tolerance: float
+    cell: float
+    regions: Regions
+    coverage: float  # share of every expected region that must be seen
+    T_base_part_nominal: Array | None  # (4, 4)
+    path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
+
+
+@dataclass(frozen=True)
+class SeamJob:
+    """Scans of a seam, where the part lies and where to measure; mm."""
+
+    scan: Joined
+    T_base_part: Array  # (4, 4)
+    stations: tuple[Station, ...]
+    limits: Limits
+    pose_sigma: float
+
+
+def read_fit_job(file: Path | str) -> FitJob:
+    """Read and check a job of `stitch fit`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file, document = Path(file), _document(Path(file), FIT, _FIT_KEYS)
+    nominal = _pose(file, "nominal", document["nominal"]) if "nominal" in document else None
+    if "path" in document and nominal is None:
+        raise InputError(f"{file}: path needs [nominal]: the part's pose for which the path was programmed")
+    path = None
+    if "path" in document:
+        rows = read_columns(_file(file, document, "path"), "name", COLUMNS)
+        path = (rows.texts["name"], from_columns(rows))
+    instances = document.get("instances", 1)
+    if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
+        raise InputError(f"{file}: instances is {instances!r}; write how many parts are in the scan, 1 or more")
+    cad = read_cad(_file(file, document, "cad"))
+    return FitJob(
+        read_scans(_file(file, document, "scans")), cad, instances,
+        finite(file, "tolerance", document.get("tolerance", 0.5), positive=True),
+        finite(file, "cell", document.get("cell", cad.size / 60), positive=True),
+        _regions(file, document.get("region", [])), finite(file, "coverage", document.get("coverage", 0.5)),
+        nominal, path,
+    )  # fmt: skip
+
+
+def read_seam_job(file: Path | str) -> SeamJob:
+    """Read and check a job of `stitch seam`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file, document = Path(file), _document(Path(file), SEAM, _SEAM_KEYS)
+    if ("part" in document) == ("fit" in document):
+        raise InputError(f"{file}: say where the part lies: either [part] with its pose, or fit = the fit.json of it")
+    part = _pose(file, "part", document["part"]) if "part" in document else _fitted(_file(file, document, "fit"))
+    limits = document.get("limits", {})
+    known = Limits.__dataclass_fields__
+    check_keys(file, "limits", limits, set(known))
+    values = {key: finite(file, f"limits.{key}", value, positive="tolerance" in key) for key, value in limits.items()}
+    return SeamJob(
+        read_scans(_file(file, document, "scans")), part, _stations(_file(file, document, "stations")),
+        Limits(**values), abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
+    )  # fmt: skip
+
+
+def _document(file: Path, wanted: str, known: set[str]) -> dict[str, Any]:
+    try:
+        document = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; see examples/window for how a job looks") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid TOML: {error}") from None
+    if document.get("format") != wanted:
+        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{wanted}"')
+    check_keys(file, "", document, known)
+    return document
+
+
+def _file(file: Path, document: dict[str, Any], key: str) -> Path:
+    if not isinstance(document.get(key), str):
+        raise InputError(f"{file}: {key} is {document.get(key)!r}; name a file in quotes")
+    return file.parent / str(document[key])
+
+
+def _pose(file: Path, place: str, entries: Any) -> Array:
+    check_keys(file, place, entries, set(COLUMNS.split()))
+    return from_numbers(np.array([finite(file, f"{place}.{key}", entries.get(key)) for key in COLUMNS.split()]))
+
+
+def _regions(file: Path, entries: Any) -> Regions:
+    boxes: dict[str, list[Box]] = {"expected": [], "forbidden": []}
+    if not isinstance(entries, list):
+        raise InputError(f"{file}: region must be written as [[region]], one for each box")
+    for i, entry in enumerate(entries):
+        place = f"region[{i + 1}]"
+        check_keys(file, place, entry, {"name", "kind", "low", "high"})
+        kind = choice(file, f"{place}.kind", entry.get("kind"), tuple(boxes))
+        low, high = (_corner(file, f"{place}.{key}", entry.get(key)) for key in ("low", "high"))
+        if (low >= high).any():
+            raise InputError(f"{file}: {place}.low must lie below its high in x, y and z; the box is empty")
+        boxes[kind].append(Box(str(entry.get("name", place)), low, high))
+    return Regions(tuple(boxes["expected"]), tuple(boxes["forbidden"]))
+
+
+def _corner(file: Path, place: str, value: Any) -> Array:
+    if not isinstance(value, list) or len(value) != 3:
+        raise InputError(f"{file}: {place} is {value!r}; write [x, y, z] in the part's frame")
+    return np.array([finite(file, place, number) for number in value])
+
+
+def _fitted(file: Path) -> Array:
+    try:
+        T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; run stitch fit with -o first, or give [part]") from None
+    except (ValueError, KeyError, IndexError, TypeError):
+        raise InputError(f"{file}: holds no parts[0].T_base_part; name the fit.json that stitch fit wrote") from None
+    if not frames.is_rigid(T):
+        raise InputError(f"{file}: parts[0].T_base_part is no rigid motion; run stitch fit again")
+    return T
+
+
+def _stations(file: Path) -> tuple[Station, ...]:
+    columns = read_columns(file, "station", "x y z across_x across_y across_z out_x out_y out_z")
+    names = columns.texts["station"]
+    middle = columns.stack("x y z")
+    across, out = columns.stack("across_x across_y across_z"), columns.stack("out_x out_y out_z")
+    for i, name in enumerate(names):
+        if names.count(name) > 1:
+            raise InputError(f"{file}: station {name} stands twice; rename one")
+        if np.linalg.norm(np.cross(across[i], out[i])) < 0.5 or abs(np.linalg.norm(out[i]) - 1) > 0.05:
+            raise InputError(f"{file}: station {name}: across and out must be unit vectors at right angles")
+    return tuple(Station(n, m, a, o) for n, m, a, o in zip(names, middle, across, out, strict=True))
