@@ -29,7 +29,7 @@ from stitch.pipeline import run
 from stitch.state import state_of
 from stitch.threads import library_threads_off
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from in_memory import session_of
 
 OUTSIDE = ("third_harmonic", "knock", "covariate_bias")

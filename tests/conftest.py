@@ -44,14 +44,15 @@ def blade_mesh():
 
 def measured_blade(
     seed: int, views: int = 12, mount: str = "eye_to_hand", repeatability: tuple[float, float] = (20e-6, 0.02),
-    small: float = 0.0, pixels: int = 190, hidden: dict[str, float] | None = None,
-    spread: tuple[float, float] = (0.003, 1.0), **plan,
+    small: float = 0.0, pixels: int = 150, hidden: dict[str, float] | None = None,
+    spread: tuple[float, float] = (0.003, 1.0), noise: float | None = None, **plan,
 ) -> Measured:  # fmt: skip
     """A blade scanned in a cell of known truth, with a scanner that has noise and nothing else."""
     scene = load_scene(SCENE_OF_MOUNT[mount])
     scanner = replace(
-        scene.scanner, columns=pixels, rows=pixels, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0
-    )
+        scene.scanner, columns=pixels, rows=pixels, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0,
+        noise=scene.scanner.noise if noise is None else noise,
+    )  # fmt: skip
     scene = replace(
         scene, repeatability=repeatability, small=small, mount_spread=spread, scanner=scanner,
         plan=replace(scene.plan, **plan),

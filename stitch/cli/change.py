@@ -1,6 +1,5 @@
 """`stitch add RUN EFFECT…`, `stitch drop RUN EFFECT…`: change the model, refit, print the ledger."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -96,7 +95,7 @@ def _finish(run: Path, result: Run, as_json: bool) -> None:
     run_folder.extend("stitch.reports", result, scratch / "report.html")
     run_folder.take_over(scratch, run)
     if as_json:
-        print(json.dumps(run_folder.result_document(result), indent=1))
+        print(run_folder.to_json(run_folder.result_document(result)))
     else:
         show_ledger(result)
 

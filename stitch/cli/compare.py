@@ -1,6 +1,5 @@
 """`stitch compare RUN`: where model and measurement differ."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ from rich.table import Table as Printed
 
 from stitch.cli.progress import MICROMETRES
 from stitch.diagnosis.compare import Table, compare, comparison_document
-from stitch.run_folder import extend, write_json
+from stitch.run_folder import extend, to_json, write_json
 from stitch.state import load_state
 
 _WORST = 5
@@ -28,7 +27,7 @@ def compare_run(
     write_json(comparison_document(found), run / "compare.json")
     extend("stitch.comparison_reports", found, state, run)
     if as_json:
-        print(json.dumps(comparison_document(found), indent=1))
+        print(to_json(comparison_document(found)))
         return
     to_um = MICROMETRES[state.session.length_unit]
     console = Console(stderr=True)

@@ -1,6 +1,5 @@
 """`stitch diagnose RUN`: which effect is missing; `stitch next RUN`: what to measure."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,7 @@ from stitch.cli.progress import MICROMETRES
 from stitch.diagnosis.diagnose import Diagnosis, Suspect, diagnose
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.words import amounts_of
-from stitch.run_folder import extend, write_json
+from stitch.run_folder import extend, to_json, write_json
 from stitch.state import State, load_state
 
 _SHOWN = 6
@@ -28,7 +27,7 @@ def diagnose_run(
     """Say which physical effect is missing in the model of a run, or why nobody can tell."""
     found, document, unit = _diagnosed(run, effects_file)
     if as_json:
-        print(json.dumps(document, indent=1))
+        print(to_json(document))
     else:
         show(found, unit)
 
@@ -43,9 +42,7 @@ def next_measurement(
     """Say which poses or artefacts would separate what cannot be told apart."""
     found, document, _ = _diagnosed(run, effects_file)
     if as_json:
-        print(
-            json.dumps({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}, indent=1)
-        )
+        print(to_json({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}))
         return
     console = Console(stderr=True)
     if not found.next:

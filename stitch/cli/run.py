@@ -1,6 +1,5 @@
 """`stitch run SESSION...`: coarse → correct → register → fuse, one run folder per call."""
 
-import json
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -72,7 +71,7 @@ def run(
             write_model(run_folder.model_of(runs[0]), scratch / "model.toml")
     documents = [run_folder.result_document(result) for result in runs]
     if as_json:
-        print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1))
+        print(run_folder.to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
 

@@ -184,12 +184,13 @@ def twists(chain: Chain, terms: Sequence[Term], term: Term, T_mount: Array, cent
         if parameter.discrete:
             out.append(np.zeros((chain.views.count, 6)))
             continue
-        step = 0.1 * parameter.typical * np.eye(len(term.values))[i]
+        size = (0.005 if parameter.grid else 0.1) * parameter.typical
+        step = size * np.eye(len(term.values))[i]
         both = []
         for sign in (1, -1):
             left, right = placed(chain, [*others, replace(term, values=term.values + sign * step)])
             both.append(to_centre @ left @ T_mount @ right)
-        out.append(frames.log(both[0] @ frames.inverse(both[1])) / (0.2 * parameter.typical))
+        out.append(frames.log(both[0] @ frames.inverse(both[1])) / (2 * size))
     return np.array(out).reshape(len(term.values), chain.views.count, 6)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -81,10 +80,9 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
     overlaps = tuple(_settled_overlaps(c, T_mount, gate) for c, gate in zip(captures, gate, strict=True))
     sigmas = np.full(len(seen), np.nan)
     sigmas[seen] = np.sqrt(np.diag(fitted.values_covariance))
-    cuts: Any = np.cumsum([len(t.values) for t in terms])[:-1] if terms else []
-    return Refinement(
-        fitted, tuple(terms), tuple(np.split(sigmas, cuts)), captures, tuple(freed), overlaps, tuple(history)
-    )
+    cuts = np.cumsum([len(t.values) for t in terms], dtype=int)
+    own = tuple(np.split(sigmas, cuts)[: len(terms)])
+    return Refinement(fitted, tuple(terms), own, captures, tuple(freed), overlaps, tuple(history))
 
 
 def _free(

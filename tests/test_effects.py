@@ -1,0 +1,213 @@
+"""Effects of the model against nature's laws, which share no code with them, and against finite differences."""
+
+import numpy as np
+import pytest
+from conftest import measured_blade
+from in_memory import session_of
+
+from stitch import frames
+from stitch.capture import capture
+from stitch.effects import EFFECTS
+from stitch.effects.chain import Term, chain_of, corrected, placed, shifts, twists
+from stitch.effects.terms import known, require
+from stitch.effects.user_file import load
+from stitch.errors import InputError
+from stitch.robot import forward, forward_with_errors
+
+# Amplitude 1 is a tenth of a millimetre; a hundredth of that must remain: second-order terms are smaller still.
+_LEFT = 0.03
+
+
+@pytest.fixture(scope="module")
+def cells():
+    """Per mount a cell with nothing wrong and perfect poses, and its chain."""
+    out = {}
+    for mount in ("eye_to_hand", "eye_in_hand"):
+        measured = measured_blade(0, views=5, mount=mount, repeatability=(0.0, 0.0), pixels=60)
+        out[mount] = measured
+    return out
+
+
+def chain_for(measured):
+    session = session_of(measured)
+    return chain_of(session, capture(session))
+
+
+def hidden(name, mount):
+    return measured_blade(0, views=5, mount=mount, repeatability=(0.0, 0.0), pixels=60, hidden={name: 1.0}, noise=0.0)
+
+
+RIGID = [
+    "mount_drift", "mount_warmup", "joint_offset", "link_geometry", "joint_compliance", "gear_eccentricity",
+    "gear_harmonic", "backlash", "settling", "robot_thermal_growth",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("name", RIGID)
+def test_undoing_an_effect_gives_natures_poses(cells, name, mount):
+    """The model with nature's own parameters places every view where it truly was."""
+    measured = hidden(name, mount)
+    chain = chain_for(measured)
+    told = measured.hidden[name]
+    effect = EFFECTS[name]
+    values = np.array([told.get(p.name, 0.0) for p in chain.parameters(effect)])
+    left, right = placed(chain, [Term(effect, values)])
+    poses = left @ measured.T_mount @ right
+    plain, still = placed(chain, [])
+    middle = np.array([[0.0, 0.0, 420.0]])
+    truth = frames.transform(measured.T_reference_scanner, middle)
+    off = np.linalg.norm(frames.transform(poses, middle) - truth, axis=-1).max()
+    before = np.linalg.norm(frames.transform(plain @ measured.T_mount @ still, middle) - truth, axis=-1).max()
+    assert before > 0.01
+    assert off < 1e-6
+
+
+@pytest.mark.parametrize(
+    "name", ["range_scale", "range_nonlinearity", "field_curvature", "lens_distortion", "scanner_thermal_scale"]
+)
+def test_undoing_a_scanner_effect_gives_the_true_points(name):
+    """Same seed with and without: the corrected points are those of the cell without the effect."""
+    plain, bent = hidden_pair(name, "eye_to_hand")
+    chain = chain_for(bent)
+    effect = EFFECTS[name]
+    values = np.array([bent.hidden[name][p.name] for p in chain.parameters(effect)])
+    mended = corrected(chain, [Term(effect, values)], bent.T_mount)
+    for scan, true, wrong in zip(mended.scans, plain.clouds, bent.clouds, strict=True):
+        before = np.abs(wrong.points - true.points).max()
+        assert np.abs(scan.points - true.points).max() <= _LEFT * before + 1e-9
+
+
+def hidden_pair(name, mount):
+    common = {"views": 3, "mount": mount, "repeatability": (0.0, 0.0), "pixels": 50}
+    return measured_blade(2, **common), measured_blade(2, hidden={name: 1.0}, **common)
+
+
+@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.place in ("robot", "links", "mount", "part")])
+def test_twists_are_the_derivative_of_the_poses(cells, name):
+    """Central differences of half the size about the same place, by another route: a point carried along."""
+    chain = chain_for(cells["eye_to_hand"])
+    effect = EFFECTS[name]
+    if chain.lacks(effect):
+        pytest.skip(f"needs {chain.lacks(effect)}")
+    parameters = chain.parameters(effect)
+    # A twist that is zero hides its time constant: begin where it is not.
+    values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
+    T = cells["eye_to_hand"].T_mount
+    centre = np.array([5.0, -3.0, 80.0])
+    slopes = twists(chain, [], Term(effect, values), T, centre)
+    point = np.array([10.0, 20.0, 120.0])
+    for i, parameter in enumerate(parameters):
+        if parameter.discrete:
+            assert not slopes[i].any()
+            continue
+        h = 0.01 * parameter.typical
+        carried = []
+        for sign in (1, -1):
+            left, right = placed(chain, [Term(effect, values + sign * h * np.eye(len(values))[i])])
+            left0, right0 = placed(chain, [Term(effect, values)])
+            carried.append(frames.transform(left @ T @ right @ frames.inverse(left0 @ T @ right0), point[None])[:, 0])
+        expected = (carried[0] - carried[1]) / (2 * h)
+        predicted = slopes[i][:, 3:] + np.cross(slopes[i][:, :3], point - centre)
+        # At the plausible size, within two parts in a thousand and a nanometre.
+        off = np.abs(predicted - expected).max() * parameter.typical
+        assert off < 2e-3 * np.abs(expected).max() * parameter.typical + 1e-6
+
+
+@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.place in ("sensor", "shape")])
+def test_point_slopes_are_minus_what_nature_does(cells, name):
+    """To first order the correction is the negative of the effect itself."""
+    measured = cells["eye_to_hand"]
+    chain = chain_for(measured)
+    effect = EFFECTS[name]
+    pose = measured.T_reference_scanner[2]
+    index = np.arange(0, 200, 7)
+    slopes = shifts(chain, [], Term(effect, np.zeros(len(chain.parameters(effect)))), 2, pose, index)
+    parameter = chain.parameters(effect)[0]
+    from dataclasses import replace
+
+    view = chain.scan_views[2]
+    view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
+    points = chain.capture.scans[2].points[index]
+    at = frames.transform(pose, points) if effect.place == "shape" else points
+    h = 1e-3 * parameter.typical
+    key = next(iter(effect.specs))
+    moved = (effect.function(at, view, **{key: h}) - at) / h
+    expected = -frames.rotate(frames.inverse(pose), moved) if effect.place == "shape" else -moved
+    assert np.allclose(slopes[0], expected, rtol=1e-2, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_wrong_rows_are_another_arm(convention):
+    """Errors of DH rows give the same pose as an arm built with those rows."""
+    from stitch.robot import robot_from_dh
+
+    rng = np.random.default_rng(0)
+    rows = [{"a": float(rng.uniform(0, 400)), "alpha_deg": float(rng.uniform(-90, 90)), "d": float(rng.uniform(0, 300)),
+                 "theta_deg": 10.0} for _ in range(6)]  # fmt: skip
+    da, dd, dalpha = rng.normal(0, 0.3, 6), rng.normal(0, 0.3, 6), rng.normal(0, 1e-3, 6)
+    other = [dict(r, a=1.001 * (r["a"] + da[i]), d=1.001 * (r["d"] + dd[i]), alpha_deg=r["alpha_deg"] + np.degrees(dalpha[i]))
+             for i, r in enumerate(rows)]  # fmt: skip
+    gravity = np.array([0, 0, -9.81])
+    arm, wrong = (robot_from_dh("x", convention, r, None, gravity, "mm") for r in (rows, other))
+    q = rng.uniform(-2, 2, (7, 6))
+    assert np.allclose(forward_with_errors(arm, q, np.full(7, 1.001), da, dd, dalpha), forward(wrong, q), atol=1e-9)
+
+
+def test_parameters_are_in_the_unit_of_the_session():
+    effect = EFFECTS["mount_drift"]
+    mm, m = (effect.parameters(6, (), unit) for unit in ("mm", "m"))
+    assert [p.unit for p in mm] == ["rad/h"] * 3 + ["mm/h"] * 3
+    assert m[3].unit == "m/h"
+    assert m[3].typical == pytest.approx(mm[3].typical / 1000)
+    kappa = EFFECTS["part_sag"].parameters(6, (), "m")[0]
+    assert kappa.unit == "1/m"
+    assert kappa.typical == pytest.approx(1000 * EFFECTS["part_sag"].parameters(6, (), "mm")[0].typical)
+
+
+USER = '''
+from stitch.effects import effect, number
+
+@effect("sensor", needs=["humidity_percent"], k=number("mm", typical=0.02, limit=1.0))
+def humidity_bias(points, view, k):
+    """x = x* + u·k·(humidity − first humidity)"""
+    return points + view.along(points) * (k * view.since_first("humidity_percent"))
+'''
+
+
+def test_a_users_effect_takes_its_place(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(USER)
+    try:
+        assert load(file) == ["humidity_bias"]
+        assert EFFECTS["humidity_bias"].tier == "user"
+        assert EFFECTS["humidity_bias"].formula.startswith("x = x*")
+        assert load(file) == ["humidity_bias"]  # a second time is no conflict with itself
+    finally:
+        EFFECTS.pop("humidity_bias", None)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x = 1 +\n", "line 1"),
+        ("from stitch.effects import effect, number\nraise ValueError('no')\n", "line 2"),
+        ("x = 1\n", "no effect in it"),
+        (USER.replace("humidity_bias", "range_scale"), "in the library already"),
+        (USER.replace('"sensor"', '"elbow"'), "places are"),
+    ],
+)
+def test_a_bad_effects_file_is_one_line(tmp_path, text, expected):
+    file = tmp_path / "mine.py"
+    file.write_text(text)
+    with pytest.raises(InputError, match=expected) as error:
+        load(file)
+    assert "\n" not in str(error.value)
+    assert str(file) in str(error.value)
+
+
+def test_unknown_and_impossible_effects_are_refused(cells):
+    with pytest.raises(InputError, match="no effect 'elbow'"):
+        known("elbow")
+    with pytest.raises(InputError, match="velocity_deg_s"):
+        require(chain_for(cells["eye_to_hand"]), EFFECTS["latency"])
