@@ -15,6 +15,11 @@ from stitch.capture import Capture, place
 from stitch.scan import prepare_view
 from stitch.threads import library_threads_off
 
+# Two test processes that each use all cores would fight for them.
+if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):
+    _cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {_cores[int(os.environ["PYTEST_XDIST_WORKER"][2:]) % len(_cores)]})
+
 # As inside a run: the tests call the stages directly.
 library_threads_off()
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stitch.diagnosis.select import Ranked
+from stitch.diagnosis.select import IMPLAUSIBLE, Ranked
 
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnose import Diagnosis
@@ -31,7 +31,7 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
         return f"Something is missing ({now} remain, noise {floor}), but these views cannot tell {names} apart" + (
             f"; {d.next[0].do}." if d.next else "."
         )
-    return _unknown(d, now, floor, scatter)
+    return _unknown(d, to_um, now, floor, scatter)
 
 
 def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | None) -> str:
@@ -50,15 +50,16 @@ def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | 
     )
 
 
-def _unknown(d: Diagnosis, now: str, floor: str, scatter: str) -> str:
+def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> str:
     clear = [x for x in d.depends_on if x.p_value < 0.01]
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
     if clear:
         names = ", ".join(x.covariate for x in clear[:3])
         return f"{start}it follows {names}; the poses scatter by {scatter} otherwise."
     why = "; " + "; ".join(d.notes) if d.notes else ""
-    lack = _lack(d)
-    return f"{start}the poses scatter by {scatter}, which no sound arm does{why}{lack}."
+    wild = d.rotation > IMPLAUSIBLE[0] or d.translation * to_um > 1e3 * IMPLAUSIBLE[1]
+    odd = ", which no sound arm does" if wild else ""
+    return f"{start}the poses scatter by {scatter}{odd}{why}{_lack(d)}."
 
 
 def _lack(d: Diagnosis) -> str:
