@@ -53,7 +53,8 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
     Points are numbers of the pose channel in units of their scatter; a straight line through zero of slope 1
     is an effect that is there as fitted.
     """
-    shown = [s for s in found.suspects if s.ranked.score.observable and np.any(s.ranked.score.values)][:at_most]
+    # Of candidates that gain nothing no amplitude was fitted.
+    shown = [s for s in found.suspects if s.ranked.score.observable and s.ranked.score.p_value < 1.0][:at_most]
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, suspect in zip(axes, shown, strict=False):

@@ -10,6 +10,7 @@ from importlib.metadata import entry_points
 import typer
 
 from stitch.cli.base import base
+from stitch.cli.batch import batch
 from stitch.cli.calibrate import calibrate
 from stitch.cli.change import add, drop
 from stitch.cli.check import check
@@ -20,6 +21,7 @@ from stitch.cli.effects import effects
 from stitch.cli.fit import fit
 from stitch.cli.import_file import import_command
 from stitch.cli.panel import panel
+from stitch.cli.report import report
 from stitch.cli.run import run
 from stitch.cli.seam import seam
 from stitch.errors import StitchError
@@ -40,6 +42,8 @@ def build() -> typer.Typer:
     app.command()(drop)
     app.command("next")(next_measurement)
     app.command()(effects)
+    app.command()(report)
+    app.command()(batch)
     app.command()(base)
     app.command()(drill)
     app.command("import")(import_command)

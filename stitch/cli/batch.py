@@ -1,0 +1,85 @@
+"""`stitch batch SESSION…`: many sessions, each a run of its own."""
+
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import run_folder
+from stitch.cli.progress import MICROMETRES
+from stitch.errors import InputError, NoResultError, StitchError
+from stitch.pipeline import run
+from stitch.session import load_session
+
+
+def batch(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = Path("runs"),
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")] = 1,
+    scheduler: Annotated[str, typer.Option("--scheduler", metavar="tcp://…", help="A Dask scheduler instead.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list of results on standard output.")] = False,
+) -> None:
+    """Run many sessions; one that fails does not stop the others."""
+    folders = [output / path.resolve().name for path in sessions]
+    if len(set(folders)) < len(folders):
+        raise InputError("two of the sessions have folders of the same name; run them with -o of their own")
+    rows = list(_map(sessions, folders, workers, scheduler))
+    if as_json:
+        print(run_folder.to_json(rows))
+    else:
+        _show(rows)
+    failed = [row for row in rows if row["error"]]
+    if failed:
+        raise NoResultError(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")
+
+
+def stitch_one(session: Path, folder: Path) -> dict[str, Any]:
+    """Run one session into its folder; what goes wrong becomes part of the answer."""
+    try:
+        result = run(load_session(session))
+        with run_folder.new_folder(folder) as scratch:
+            run_folder.write_run(result, scratch)
+            run_folder.extend("stitch.reports", result, scratch / "report.html")
+    except StitchError as error:
+        return {"session": str(session), "run": None, "error": str(error)}
+    um = MICROMETRES[result.session.length_unit]
+    return {
+        "session": str(session), "run": str(folder), "error": None, "residual_um": result.residual_rms * um,
+        "registered_um": result.stages[2].rms * um, "noise_floor_um": result.noise_floor * um,
+        "seconds": sum(s.seconds for s in result.stages),
+    }  # fmt: skip
+
+
+def _map(sessions: list[Path], folders: list[Path], workers: int, scheduler: str) -> Iterator[dict[str, Any]]:
+    if scheduler:
+        try:
+            client = import_module("distributed").Client(scheduler, timeout=10)
+        except ModuleNotFoundError:
+            raise InputError("--scheduler needs the package distributed: pip install distributed") from None
+        except OSError as error:
+            raise InputError(f"--scheduler {scheduler}: no answer ({error})") from None
+        absolute = [[p.resolve() for p in paths] for paths in (sessions, folders)]
+        yield from client.gather(client.map(stitch_one, *absolute))
+    elif workers > 1:
+        with ProcessPoolExecutor(workers) as pool:
+            yield from pool.map(stitch_one, sessions, folders)
+    else:
+        yield from map(stitch_one, sessions, folders)
+
+
+def _show(rows: list[dict[str, Any]]) -> None:
+    console, table = Console(stderr=True), Table()
+    for heading in ("session", "one hand-eye (µm)", "registered (µm)", "noise (µm)", "seconds"):
+        table.add_column(heading, justify="left" if heading == "session" else "right")
+    for row in rows:
+        keys = ("residual_um", "registered_um", "noise_floor_um", "seconds")
+        table.add_row(Path(row["session"]).name, *("–" if row["error"] else f"{row[key]:.1f}" for key in keys))
+    console.print(table)
+    for row in rows:
+        if row["error"]:
+            console.print(f"{row['session']}: {row['error']}", soft_wrap=True, highlight=False)
