@@ -93,3 +93,12 @@ def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
     assert ended.value.code == 0
     assert np.allclose(read_model(tmp_path / "cone").T_mount, read_model(folder).T_mount)
     assert not (tmp_path / "cone" / "recording.rrd").exists()
+
+
+def test_diagnosis_of_a_real_object_says_that_poses_dominate_and_joints_are_not_known(runs):
+    found = runs["david"].diagnose()
+    assert found.verdict in ("unknown_effect", "cannot_tell")
+    assert "pose errors dominate" in found.sentence
+    assert "repeat" in found.sentence
+    assert "joint effects" in found.sentence
+    assert "joint_compliance" in found.missing

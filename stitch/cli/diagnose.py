@@ -83,8 +83,10 @@ def show(found: Diagnosis, length_unit: str) -> None:
     unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
     if unseen:
         console.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True, highlight=False)
-    for name, needs in found.missing.items():
-        console.print(f"Not tested: {name} (needs {', '.join(needs)}).", soft_wrap=True, highlight=False)
+    lacking = sorted({need for needs in found.missing.values() for need in needs})
+    for need in lacking:
+        names = ", ".join(name for name, needs in found.missing.items() if need in needs)
+        console.print(f"Not tested without {need}: {names}.", soft_wrap=True, highlight=False)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
         console.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True, highlight=False)
     for p in found.next[:3]:

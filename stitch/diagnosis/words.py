@@ -51,25 +51,24 @@ def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | 
 
 
 def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> str:
-    clear = [x for x in d.depends_on if x.p_value < 0.01]
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
-    if clear:
-        names = ", ".join(x.covariate for x in clear[:3])
-        return f"{start}it follows {names}; the poses scatter by {scatter} otherwise."
-    why = "; " + "; ".join(d.notes) if d.notes else ""
+    clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
+    follows = f"it follows {', '.join(clear)}; " if clear else ""
+    notes = "".join(f"; {note}" for note in d.notes)
     wild = d.rotation > IMPLAUSIBLE[0] or d.translation * to_um > 1e3 * IMPLAUSIBLE[1]
-    odd = ", which no sound arm does" if wild else ""
-    return f"{start}the poses scatter by {scatter}{odd}{why}{_lack(d)}."
+    if not wild:
+        return f"{start}{follows}the poses scatter by {scatter} otherwise{notes}{_lack(d)}."
+    return (
+        f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, which no sound arm does; such "
+        f"errors repeat at the same poses, so that those found on one object mend another{notes}{_lack(d)}."
+    )
 
 
 def _lack(d: Diagnosis) -> str:
     untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
     if not untested:
         return ""
-    return (
-        "; the robot's pose errors dominate, and without joint angles and the robot's geometry its effects "
-        f"({', '.join(untested)}) cannot be tested"
-    )
+    return f"; without joint angles and the robot's geometry joint effects ({', '.join(untested)}) cannot be tested"
 
 
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:

@@ -55,9 +55,12 @@ class Chain:
         return effect.arguments(values, self.views.joints.shape[1], len(self.views.torques.names))
 
     def lacks(self, effect: Effect) -> tuple[str, ...]:
-        """What an effect needs and this session has not."""
-        return tuple(need for need in effect.needs if not (self.has_intensity if need == "intensity"
-                                                           else self.views.has(need)))  # fmt: skip
+        """What an effect needs and this session has not; time stands in for a covariate that it prefers."""
+        known = {"intensity": self.has_intensity}
+        lacking = [need for need in effect.needs if not known.get(need, self.views.has(need))]
+        if effect.prefers and not any(self.views.has(name) for name in (*effect.prefers, "time")):
+            lacking.append("time")
+        return tuple(lacking)
 
     @property
     def has_intensity(self) -> bool:
