@@ -69,9 +69,7 @@ def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
     Twists are scale · U · z: rotations count as displacements at the correspondences' lever.
     """
     H, _ = assemble(g)
-    total = g.matrix.sum(axis=0)
-    lever = float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
-    scale = np.tile([1 / max(lever, 1e-300)] * 3 + [1.0] * 3, g.views)
+    scale = np.tile([1 / max(g.lever, 1e-300)] * 3 + [1.0] * 3, g.views)
     values, vectors = np.linalg.eigh(H * scale[:, None] * scale[None, :])
     keep = values > _NEAR_NULL * values[-1]
     return values[keep], vectors[:, keep], scale

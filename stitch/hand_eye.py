@@ -110,9 +110,7 @@ class _Evidence:
         return self.channel().left @ self.extra if self.extra.shape[1] else None
 
     def folds(self) -> list[Indices]:
-        total = self.gram.matrix.sum(axis=0)
-        lever = float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
-        return grouped_folds(self.capture.T_reference_mount, max(lever, 1e-9))
+        return grouped_folds(self.capture.T_reference_mount, max(self.gram.lever, 1e-9))
 
     def without(self, views: Indices) -> "_Evidence":
         g = self.gram

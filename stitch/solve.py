@@ -44,6 +44,12 @@ class Gram:
         return float(np.sqrt(self.raw_square.sum() / max(self.count.sum(), 1)))
 
     @property
+    def lever(self) -> float:
+        """Rms distance by which a radian about `centre` displaces the correspondences along their normals."""
+        total = self.matrix.sum(axis=0)
+        return float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
+
+    @property
     def variance(self) -> float:
         """Weighted mean of e²."""
         return float(self.square.sum() / max(self.weight.sum(), 1e-300))

@@ -20,6 +20,7 @@ class Form:
 
     term: Term  # at zero, gridded parameters at their value
     keep: Array  # (P,) bool: parameters that are free in this form
+    twists: Array  # (6V, p) of the free ones
     columns: Array  # (n, p) of the free ones in the channel
     sizes: Array  # (p,) plausible sizes
 
@@ -86,7 +87,7 @@ def _forms(evidence: PoseEvidence, term: Term, parameters: Sequence[Parameter], 
     groups = _groups(term.effect, parameters)
     if len(groups) > 1:
         keeps += [free & np.isin(np.arange(len(parameters)), g) for g in groups]
-    return [Form(term, keep, channel[:, keep], sizes[keep]) for keep in keeps]
+    return [Form(term, keep, twists[:, keep], channel[:, keep], sizes[keep]) for keep in keeps]
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:

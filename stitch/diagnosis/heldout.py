@@ -29,8 +29,7 @@ def null_left(evidence: PoseEvidence) -> float:
 
 def left_by(evidence: PoseEvidence, scored: Score, points: PointGram | None) -> Left:
     """Add the best form of a candidate to the model, in the linear approximation."""
-    twists = evidence.columns([scored.form.term])[0][0][:, scored.form.keep]
-    X = np.hstack([evidence.model, twists])
+    X = np.hstack([evidence.model, scored.form.twists])
     own = None if points is None or scored.candidate.points is None else _own(points, scored)
     whole = _solve(evidence, X, None)
     base = null_left(evidence)

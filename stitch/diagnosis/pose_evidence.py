@@ -69,9 +69,7 @@ class PoseEvidence:
 
     def folds(self) -> list[Array]:
         """Groups of views to leave out."""
-        total = self.freed.overlaps.gram.matrix.sum(axis=0)
-        lever = float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
-        return [np.asarray(f) for f in grouped_folds(self.capture.T_reference_mount, lever)]
+        return [np.asarray(f) for f in grouped_folds(self.capture.T_reference_mount, self.freed.overlaps.gram.lever)]
 
 
 def pose_evidence(

@@ -1,13 +1,12 @@
 """A stand file (TOML) -> `Stand`; every check of the input is made here."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
-from stitch.cells.toml_tables import check_keys, choice, finite, table
+from stitch.cells.toml_tables import check_keys, choice, finite, read_toml, table
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot import METRES
@@ -28,12 +27,7 @@ def read_stand(file: Path | str) -> Stand:
         InputError: the file is missing, not TOML, or an entry is missing, unknown, not a number or impossible.
     """
     file = Path(file)
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; see examples/base_to_base.toml for how a stand file looks") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+    document = read_toml(file, "examples/base_to_base.toml for how a stand file looks")
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
     check_keys(file, "", document, {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"})

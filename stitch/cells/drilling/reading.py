@@ -1,6 +1,5 @@
 """A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here."""
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.toml_tables import check_keys, choice, finite
+from stitch.cells.toml_tables import check_keys, choice, finite, read_toml
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot import METRES
@@ -56,12 +55,7 @@ def read_job(file: Path | str) -> Job:
         InputError: anything missing, unknown, contradictory or not a number; names the file, the place and the mend.
     """
     file = Path(file)
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; see examples/drilling/job.toml for how a job looks") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+    document = read_toml(file, "examples/drilling/job.toml for how a job looks")
     check_keys(file, "", document, {"format", "length_unit", "height", "image_size", *_FILES})
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')

@@ -1,6 +1,5 @@
 """A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here."""
 
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from stitch.cells.panel.legs import Legs
 from stitch.cells.panel.tables import Points, read_calibration, read_per_robot, read_points, read_world
 from stitch.cells.panel.tracker import Tracker
 from stitch.cells.pose_table import COLUMNS, from_numbers
-from stitch.cells.toml_tables import check_keys, choice, finite, table
+from stitch.cells.toml_tables import check_keys, choice, finite, read_toml, table
 from stitch.errors import InputError
 from stitch.frames import Array
 
@@ -80,12 +79,7 @@ def read_job(file: Path | str) -> Job:
 
 
 def _document(file: Path) -> dict[str, Any]:
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; see examples/panel/job.toml for how a job looks") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+    document = read_toml(file, "examples/panel/job.toml for how a job looks")
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
     check_keys(

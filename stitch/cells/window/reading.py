@@ -1,7 +1,6 @@
 """Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here."""
 
 import json
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
-from stitch.cells.toml_tables import check_keys, choice, finite
+from stitch.cells.toml_tables import check_keys, choice, finite, read_toml
 from stitch.cells.window.cad import Surface, read_cad
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.scans import Joined, read_scans
@@ -98,12 +97,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
 
 
 def _document(file: Path, wanted: str, known: set[str]) -> dict[str, Any]:
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; see examples/window for how a job looks") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+    document = read_toml(file, "examples/window for how a job looks")
     if document.get("format") != wanted:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{wanted}"')
     check_keys(file, "", document, known)
