@@ -33,6 +33,7 @@ HARD = {
     "three times the repeatability": {"repeatability": 3.0},
 }
 HARD["all four"] = {key: value for kind in HARD.values() for key, value in kind.items()}
+_USUAL_SPREAD = 0.18  # of the brightness, in which nature counts it
 LAST_JOINT = "the last joint alone"
 
 
@@ -99,6 +100,15 @@ def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> flo
     amplitude = _FACTOR / max(strength, 1e-12)
     # Four times that must still be of a size that somebody would believe.
     return amplitude if all(abs(t) * 4 * amplitude < p.limit for t, p in zip(theta, kept, strict=True)) else None
+
+
+def in_session_units(measured: Measured) -> dict[str, dict[str, float]]:
+    """What is hidden, with brightness counted as a session counts it: in its own standard deviations."""
+    hidden = {name: dict(values) for name, values in measured.hidden.items()}
+    if "intensity_bias" in hidden:
+        spread = float(np.concatenate([cloud.intensity for cloud in measured.clouds]).std())
+        hidden["intensity_bias"]["k"] *= spread / _USUAL_SPREAD
+    return hidden
 
 
 def hand_eye_error(measured: Measured, T_mount: Array) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from blind_cells import OUTSIDE, drawn, hand_eye_error, measure, smallest, user_effect
+from blind_cells import OUTSIDE, drawn, hand_eye_error, in_session_units, measure, smallest, user_effect
 
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
@@ -103,11 +103,11 @@ def _effect(job: Row) -> Row:
 
 def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
     """What the change brought: held-out residual, hand-eye against the truth, amplitudes in sigmas."""
-    true = measured.hidden[job["effect"]]
-    names = [p.name for p in added.chain.parameters(added.terms[0].effect) if not p.grid]
-    values = dict(zip([p.name for p in added.chain.parameters(added.terms[0].effect)], added.terms[0].values,
-                      strict=True))  # fmt: skip
-    sigmas = dict(zip([p.name for p in added.chain.parameters(added.terms[0].effect)], added.sigmas[0], strict=True))
+    true = in_session_units(measured)[job["effect"]]
+    parameters = added.chain.parameters(added.terms[0].effect)
+    names = [p.name for p in parameters if not p.grid]
+    values = dict(zip([p.name for p in parameters], added.terms[0].values, strict=True))
+    sigmas = dict(zip([p.name for p in parameters], added.sigmas[0], strict=True))
     return {
         "heldout": [first.heldout_rms, added.heldout_rms],
         "hand_eye": [hand_eye_error(measured, first.T_mount), hand_eye_error(measured, added.T_mount)],

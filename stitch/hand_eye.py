@@ -7,19 +7,16 @@ not independent from view to view has a larger one, never a smaller.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
-from stitch.folds import grouped_folds
+from stitch.capture_evidence import DRAWS, CaptureEvidence, drop, information, measured_and_drawn
 from stitch.frames import Array, Indices
-from stitch.free_poses import FreePoses, visible_directions
-from stitch.repeatability import PoseChannel, Repeatability, covariance_of, estimate, pose_channel
-from stitch.solve import Gram, pair_squares
-
-_DRAWS = 200
+from stitch.free_poses import FreePoses
+from stitch.repeatability import Repeatability, estimate
 
 
 @dataclass(frozen=True)
@@ -44,11 +41,6 @@ class HandEye:
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
 
-def jacobian(carriers: Array, centre: Array) -> Array:
-    """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
-    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ carriers)))
-
-
 def fit_hand_eye(
     captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns | None = None
 ) -> HandEye:
@@ -61,14 +53,14 @@ def fit_hand_eye(
     """
     columns = columns or Columns(tuple(np.zeros((6 * len(c.scans), 0)) for c in captures), np.zeros(0), np.zeros(0))
     evidence = [
-        _Evidence(c, f.overlaps.gram, f.twists, c.carriers(T_mount), extra)
+        CaptureEvidence(c, f.overlaps.gram, f.twists, c.carriers(T_mount), extra)
         for c, f, extra in zip(captures, freed, columns.twists, strict=True)
     ]
     scatter = [estimate(e.channel(), e.further()) for e in evidence]
     prior = _prior(captures, freed, T_mount, columns)
     # Column 0 is what was measured; the others are draws of what this scatter alone would give.
-    twists = [_measured_and_drawn(e, s) for e, s in zip(evidence, scatter, strict=True)]
-    blocks = [_information(e, s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
+    twists = [measured_and_drawn(e, s) for e, s in zip(evidence, scatter, strict=True)]
+    blocks = [information(e, s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
     blocks.append(_pull(columns))
     x, covariance = _combine(blocks, prior)
     left_out, outside = [], np.zeros(2)
@@ -89,48 +81,9 @@ def fit_hand_eye(
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
     """The repeatability of one capture's poses, whatever its hand-eye."""
     nothing = np.zeros((6 * len(capture.scans), 0))
-    return estimate(_Evidence(capture, freed.overlaps.gram, freed.twists, capture.carriers(T_mount), nothing).channel())
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """One capture's pairs and freed views."""
-
-    capture: Capture
-    gram: Gram
-    twists: Array  # (V, 6)
-    carriers: Array  # (V, 4, 4) of the hand-eye
-    extra: Array  # (6V, P)
-
-    def channel(self) -> PoseChannel:
-        return pose_channel(self.gram, self.twists, self.carriers, self.capture.T_reference_flange)
-
-    def further(self) -> Array | None:
-        """(n, P) the effects' columns in the channel."""
-        return self.channel().left @ self.extra if self.extra.shape[1] else None
-
-    def folds(self) -> list[Indices]:
-        return grouped_folds(self.capture.T_reference_mount, max(self.gram.lever, 1e-9))
-
-    def without(self, views: Indices) -> "_Evidence":
-        g = self.gram
-        keep = ~np.isin(g.pairs, views).any(axis=1)
-        number = np.cumsum(~np.isin(np.arange(g.views), views)) - 1
-        fewer = replace(
-            g, views=g.views - len(views), pairs=number[g.pairs[keep]], matrix=g.matrix[keep], vector=g.vector[keep],
-            square=g.square[keep], weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
-        )  # fmt: skip
-        return _Evidence(
-            self.capture.without(views), fewer, np.delete(self.twists, views, 0), np.delete(self.carriers, views, 0),
-            _drop(self.extra, views),
-        )  # fmt: skip
-
-    def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
-        """Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""
-        touched = np.isin(self.gram.pairs, views).any(axis=1)
-        J = np.column_stack([jacobian(self.carriers, self.gram.centre), self.extra])
-        moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
-        return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
+    return estimate(
+        CaptureEvidence(capture, freed.overlaps.gram, freed.twists, capture.carriers(T_mount), nothing).channel()
+    )
 
 
 def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns) -> Array:
@@ -146,47 +99,21 @@ def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Arr
 def _pull(columns: Columns) -> tuple[Array, Array]:
     """The effects' prior is about zero, not about their present values."""
     size = 6 + len(columns.values)
-    pull = np.zeros((size, 1 + _DRAWS))
+    pull = np.zeros((size, 1 + DRAWS))
     pull[6:, 0] = -columns.values * columns.prior**-2.0
     return np.zeros((size, size)), pull
 
 
 def _without(
-    blocks: Sequence[tuple[Array, Array]], k: int, evidence: _Evidence, scatter: Repeatability, twists: Array,
+    blocks: Sequence[tuple[Array, Array]], k: int, evidence: CaptureEvidence, scatter: Repeatability, twists: Array,
     views: Indices, prior: Array,
 ) -> Array:  # fmt: skip
     """(6 + P, 1 + draws) estimates without some views of capture k."""
     fewer = evidence.without(views)
     size = len(prior)
     nothing = (np.zeros((size, size)), np.zeros((size, twists.shape[1])))
-    block = _information(fewer, scatter, _drop(twists, views)) if len(fewer.gram.pairs) else nothing
+    block = information(fewer, scatter, drop(twists, views)) if len(fewer.gram.pairs) else nothing
     return _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)[0]
-
-
-def _measured_and_drawn(evidence: _Evidence, scatter: Repeatability) -> Array:
-    """(6V, 1 + _DRAWS) twists: the measured ones, then draws under the scatter and the noise alone."""
-    rng = np.random.default_rng(0)
-    g = evidence.gram
-    to_centre = frames.make(np.eye(3), -g.centre)
-    carried = frames.adjoint(to_centre @ evidence.capture.T_reference_flange)
-    sigma = np.array([scatter.rotation] * 3 + [scatter.translation] * 3)
-    robot = np.einsum("vij,vjd->vid", carried, sigma[:, None] * rng.standard_normal((g.views, 6, _DRAWS)))
-    values, vectors, scale = visible_directions(g)
-    noise = np.sqrt(scatter.noise_factor * g.variance / values)[:, None] * rng.standard_normal((len(values), _DRAWS))
-    drawn = robot.reshape(6 * g.views, _DRAWS) + scale[:, None] * (vectors @ noise)
-    return np.column_stack([evidence.twists.reshape(-1), drawn])
-
-
-def _drop(rows: Array, views: Indices) -> Array:
-    return np.delete(rows, (6 * views[:, None] + np.arange(6)).ravel(), axis=0)
-
-
-def _information(evidence: _Evidence, scatter: Repeatability, twists: Array) -> tuple[Array, Array]:
-    """Information matrix (6 + P, 6 + P) and vectors (6 + P, D) from one pose channel and twists (6V, D)."""
-    channel = evidence.channel()
-    X = np.column_stack([channel.hand_eye, channel.left @ evidence.extra])
-    weighted = np.linalg.solve(covariance_of(channel, scatter), X).T
-    return np.asarray(weighted @ X), np.asarray(weighted @ channel.left @ twists)
 
 
 def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:

@@ -6,8 +6,9 @@ from conftest import disturbed, synthetic
 from scipy.spatial import cKDTree
 
 from stitch import frames
+from stitch.capture_evidence import jacobian
 from stitch.free_poses import free_poses
-from stitch.hand_eye import jacobian, scatter_of
+from stitch.hand_eye import scatter_of
 from stitch.match import match, overlapping_pairs, sample
 from stitch.overlaps import collect
 from stitch.scan import prepare_view

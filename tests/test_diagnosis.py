@@ -9,16 +9,19 @@ from conftest import measured_blade
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_memory import session_of
+from scipy.stats import binomtest
 
 from data_synth.commands import judge
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
+from stitch import frames
 from stitch.cli.main import main
 from stitch.diagnosis.compare import compare
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.heldout import null_left
 from stitch.diagnosis.start import evidence_of_state
+from stitch.effects.supported import supported
 from stitch.effects.visible import independent
 from stitch.errors import InputError
 from stitch.folds import grouped_folds
@@ -54,6 +57,9 @@ def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     # What the linear prediction promised comes true when everything is fitted and matched anew.
     left = next(s.left for s in found.suspects if s.name == name)
     assert after.residual_rms == pytest.approx(before.residual_rms * np.sqrt(left.inside), rel=0.15)
+    # The truth, which no overlap knows, comes nearer too: a fit that borrows from the hand-eye would not show above.
+    errors = [frames.log(frames.inverse(measured.T_mount) @ r.T_mount)[3:] for r in (before, after)]
+    assert np.linalg.norm(errors[1]) < max(np.linalg.norm(errors[0]), 3 * np.sqrt(np.trace(after.mount_covariance[3:, 3:])))
     term, sigmas = after.terms[0], after.sigmas[0]
     z = [
         (value - measured.hidden[name].get(p.name, 0.0)) / sigma
@@ -152,6 +158,29 @@ def test_units_do_not_decide_what_is_visible(seed, exponent):
     chosen = independent(base, columns, sizes, 0.3)
     assert np.array_equal(chosen, independent(base, columns / unit, sizes * unit, 0.3))
     assert chosen.sum() == 5  # of two that say the same, one
+
+
+def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
+    """White noise, six groups, one of them true at ten sigmas: another one by chance at most 1 in 20."""
+    groups, others = [[0, 1], [2, 3], [4, 5], [6], [7], [8]], 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        own, further = rng.standard_normal((60, 6)), rng.standard_normal((60, 9))
+        z = further[:, 2] * 1.5 + own @ rng.standard_normal(6) + rng.standard_normal(60)
+        chosen = supported(own, further, z, np.full(9, 0.5), groups, [0] * 6)
+        assert chosen[2] and chosen[3]
+        others += chosen.sum() > 2
+    # 5 groups whose log evidence exceeds 2.5 by chance in some 0.4 % each.
+    assert binomtest(others, 200, 0.05, alternative="greater").pvalue > 0.01
+
+
+def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
+    rng = np.random.default_rng(0)
+    chosen = supported(
+        rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60), np.full(3, 0.1),
+        [[0], [1], [2]], [0, 0, 1],
+    )  # fmt: skip
+    assert chosen[2] and chosen[:2].sum() == 1
 
 
 def test_folds_leave_out_neighbours():

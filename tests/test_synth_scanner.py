@@ -8,6 +8,8 @@ import open3d as o3d
 import pytest
 import trimesh
 from scipy.optimize import least_squares
+from scipy.stats import kstest, norm
+from scipy.stats import t as t_distribution
 from synthetic_cells import clean, mesh_for, mesh_of, simulated, with_part
 
 from data_synth.scanner import Scanner, cast, field_map, rays, scan
@@ -124,6 +126,25 @@ def test_noise_is_as_set_and_grows_with_range_squared():
             n = len(z)
             assert n == 3600
             assert abs(z.mean()) < 4 / np.sqrt(n) and abs(z.std() - 1) < 4 / np.sqrt(2 * n)
+
+
+def test_heavy_tails_follow_students_t_of_the_same_variance():
+    scanner = ideal(noise=0.05, standoff=400.0, tail=3.0, columns=100, rows=100)
+    cloud = scan(plate(), facing(400.0), scanner, NO_FIELD, np.random.default_rng(4))
+    r = ranges(cloud)
+    z = (r - 400.0 * r / cloud.points[:, 2]) / (r / 400.0) ** 2 / 0.05
+    assert kstest(z * np.sqrt(3.0), t_distribution(3).cdf).pvalue > 1e-3
+    assert kstest(z, norm.cdf).pvalue < 1e-6
+
+
+def test_edge_bias_moves_two_pixels_beside_an_edge_and_no_other():
+    scanner = ideal(columns=120, rows=120)
+    true = scan(step_part(), facing(420.0), scanner, NO_FIELD, np.random.default_rng(0))
+    biased = scan(step_part(), facing(420.0), replace(scanner, edge_bias=0.5), NO_FIELD, np.random.default_rng(0))
+    moved = ranges(biased) - ranges(true)
+    at_edge = moved > 1e-9
+    assert np.allclose(moved[at_edge], 0.5) and np.allclose(moved[~at_edge], 0.0, atol=1e-9)
+    assert 0.01 < at_edge.mean() < 0.3
 
 
 def test_noise_lies_along_the_ray():

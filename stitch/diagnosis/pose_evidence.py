@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from stitch.capture import Capture
+from stitch.capture_evidence import jacobian
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
 from stitch.effects.visible import independent, project_out
 from stitch.folds import grouped_folds
 from stitch.frames import Array
 from stitch.free_poses import FreePoses
-from stitch.hand_eye import jacobian
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
 from stitch.variance import Evidence, VarianceFit, fit_variances
 

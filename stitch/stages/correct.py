@@ -12,10 +12,11 @@ import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
+from stitch.capture_evidence import jacobian
 from stitch.effects.chain import Term
 from stitch.frames import Array
 from stitch.free_poses import free_poses
-from stitch.hand_eye import HandEye, fit_hand_eye, jacobian
+from stitch.hand_eye import HandEye, fit_hand_eye
 from stitch.match import sample
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.recorder import Recorder, Silent
