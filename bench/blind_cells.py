@@ -113,8 +113,18 @@ def in_session_units(measured: Measured) -> dict[str, dict[str, float]]:
 
 def hand_eye_error(measured: Measured, T_mount: Array) -> float:
     """Rms displacement (mm) of points of the field, half of it wide, by the error of the hand-eye."""
-    scanner = measured.scene.scanner
-    half = scanner.standoff * np.tan(np.radians(scanner.field_of_view / 4))
-    field = np.array([[x, y, scanner.standoff] for x in (-half, half) for y in (-half, half)])
+    field = _field(measured)
     moved = frames.transform(T_mount, field) - frames.transform(measured.T_mount, field)
     return float(np.sqrt((moved**2).sum(axis=1).mean()))
+
+
+def hand_eye_sigma(measured: Measured, covariance: Array) -> float:
+    """The same as a covariance (6, 6) of the right perturbation predicts it."""
+    jacobians = [np.hstack([-frames.skew(p), np.eye(3)]) for p in _field(measured)]
+    return float(np.sqrt(np.mean([np.trace(J @ covariance @ J.T) for J in jacobians])))
+
+
+def _field(measured: Measured) -> Array:
+    scanner = measured.scene.scanner
+    half = scanner.standoff * np.tan(np.radians(scanner.field_of_view / 4))
+    return np.array([[x, y, scanner.standoff] for x in (-half, half) for y in (-half, half)])

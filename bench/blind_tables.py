@@ -70,7 +70,7 @@ def _added(rows: list[Row]) -> str:
         f"| amplitudes within 2 sigma | {share([{'z': v} for v in z], lambda r: abs(r['z']) < 2)} |",
         f"| SD of (found − true)/sigma | {np.sqrt(np.mean(z**2)):.2f}, of its middle {_robust(z):.2f}, n = {len(z)} |",
         f"| hand-eye nearer to the truth | {share(rows, lambda r: _ratio(r) < 1)} |",
-        f"| hand-eye farther from it by more than 10 % | {share(rows, lambda r: _ratio(r) > 1.1)} |",
+        f"| hand-eye farther from it, by more than its sigma | {share(rows, _worse)} |",
         f"| hand-eye error, median, before → after | {_median(rows, 0):.3f} → {_median(rows, 1):.3f} mm |",
     ]  # fmt: skip
     return "\n".join(lines)
@@ -79,6 +79,11 @@ def _added(rows: list[Row]) -> str:
 def _ratio(row: Row) -> float:
     before, after = row["added"]["hand_eye"]
     return float(after / before)
+
+
+def _worse(row: Row) -> bool:
+    before, after = row["added"]["hand_eye"]
+    return bool(after - before > row["added"]["hand_eye_sigma"])
 
 
 def _median(rows: list[Row], which: int) -> float:

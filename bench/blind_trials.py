@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from blind_cells import OUTSIDE, drawn, hand_eye_error, in_session_units, measure, smallest, user_effect
+from blind_cells import OUTSIDE, drawn, hand_eye_error, hand_eye_sigma, in_session_units, measure, smallest, user_effect
 
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
@@ -111,6 +111,7 @@ def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
     return {
         "heldout": [first.heldout_rms, added.heldout_rms],
         "hand_eye": [hand_eye_error(measured, first.T_mount), hand_eye_error(measured, added.T_mount)],
+        "hand_eye_sigma": hand_eye_sigma(measured, added.mount_covariance),
         "z": {n: (values[n] - true.get(n, 0.0)) / sigmas[n] for n in names if n in true and np.isfinite(sigmas[n])},
         "unseen": [n for n in names if n in true and not np.isfinite(sigmas[n])],
     }
