@@ -23,6 +23,9 @@ from stitch.result import Run
 from stitch.state import State, load_state, state_of
 
 _SCRATCH = ".new"
+# A held-out residual falls if it does by more than new matches alone change it.
+_FALLS = 0.995
+_CLEAR = 4.0
 _EffectsFile = Annotated[
     Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
 ]
@@ -124,17 +127,27 @@ def remarks(result: Run) -> list[str]:
     out = []
     if len(result.ledger) > 1:
         before, after = result.ledger[-2], result.ledger[-1]
-        grown = set(after.effects) - set(before.effects)
-        if grown and not after.heldout_rms < 0.995 * before.heldout_rms:
-            out.append(f"{', '.join(sorted(grown))} did not earn a place: the held-out residual did not fall.")
-    for term, sigmas in zip(result.terms, result.sigmas, strict=True):
+        grown = sorted(set(after.effects) - set(before.effects))
+        if grown and not after.heldout_rms < _FALLS * before.heldout_rms:
+            clear = max(_clearest(result, name) for name in grown)
+            out.append(
+                f"{', '.join(grown)}: {clear:.0f} sigmas from zero, but too small for a residual to show."
+                if clear > _CLEAR
+                else f"{', '.join(grown)} did not earn a place: the held-out residual did not fall."
+            )
+    for term in result.terms:
         parameters = result.chain.parameters(term.effect)
         wild = [p.name for p, v in zip(parameters, term.values, strict=True) if not p.grid and abs(v) > p.limit]
         if wild:
             out.append(f"{term.effect.name}: {', '.join(wild)} is larger than anybody would believe.")
-        known_ = [
-            abs(v) / s for p, v, s in zip(parameters, term.values, sigmas, strict=True) if np.isfinite(s) and not p.grid
-        ]
-        if known_ and max(known_) < 2:
+        if _clearest(result, term.effect.name) < 2:
             out.append(f"{term.effect.name}: no parameter differs from zero by two sigmas; it can be dropped.")
     return out
+
+
+def _clearest(result: Run, name: str) -> float:
+    """The largest |value|/sigma of an effect's parameters; 0 where the views see none."""
+    k = list(result.effects).index(name)
+    parameters = result.chain.parameters(result.terms[k].effect)
+    fitted = np.array([not p.grid for p in parameters]) & np.isfinite(result.sigmas[k])
+    return float(np.max(np.abs(result.terms[k].values[fitted]) / result.sigmas[k][fitted], initial=0.0))
