@@ -14,14 +14,15 @@ from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, part_mesh, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.detectable import least_noncentrality
 from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.score import form_weights
 from stitch.effects import EFFECTS
 from stitch.effects.user_file import load
 from stitch.frames import Array
 
 # Evidence counts in views: a few thousand points a view show what millions would.
 _PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80}
-_FACTOR = 3.86 + 0.84  # z for 0.05 over two sides and about 20 tests, and for power 0.8
 _USER = Path(__file__).parents[1] / "examples" / "effects"
 # Laws without a counterpart in the library, and what a user would write for them.
 OUTSIDE = {"third_harmonic": "third_harmonic", "knock": "knock", "covariate_bias": "humidity_bias"}
@@ -87,19 +88,22 @@ def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> flo
     candidate = candidate_of(evidence, EFFECTS[effect])
     if candidate is None:
         return None
-    # The grid value nearest to the truth.
-    form = min(
-        (f for f in candidate.forms if f.keep.sum() == candidate.forms[0].keep.sum()),
-        key=lambda f: sum(
-            abs(v - true.get(p.name, v)) for p, v in zip(candidate.parameters, f.term.values, strict=True) if p.grid
-        ),
-    )
-    kept = [p for p, k in zip(candidate.parameters, form.keep, strict=True) if k]
-    theta = np.array([true.get(p.name, 0.0) for p in kept])
-    strength = float(np.linalg.norm(evidence.whiten_channel(form.columns) @ theta))
-    amplitude = _FACTOR / max(strength, 1e-12)
+    e, tests = evidence.evidence, len(EFFECTS)
+    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
+    fitted = np.array([not p.grid for p in candidate.parameters])
+    found = []
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        # Forms that hold all of the truth, at the value of the grid that is nearest to it.
+        off = np.abs(form.term.values - values)[~fitted].sum()
+        if not values[fitted & ~form.keep].any():
+            white = evidence.whiten_channel(form.columns)
+            least = least_noncentrality(white * form.sizes, float(weight), tests, e.size - e.A.shape[2])
+            found.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
+    nearest = min(off for off, _ in found)
+    amplitude = float(min(size for off, size in found if off == nearest))
     # Four times that must still be of a size that somebody would believe.
-    return amplitude if all(abs(t) * 4 * amplitude < p.limit for t, p in zip(theta, kept, strict=True)) else None
+    limits = np.array([p.limit for p in candidate.parameters])
+    return amplitude if (np.abs(values) * 4 * amplitude < limits)[fitted].all() else None
 
 
 def in_session_units(measured: Measured) -> dict[str, dict[str, float]]:

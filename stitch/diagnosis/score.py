@@ -10,15 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import f as f_distribution
-from scipy.stats import norm
 
 from stitch.diagnosis.candidates import Candidate, Form
+from stitch.diagnosis.detectable import smallest_sizes
 from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.frames import Array
 from stitch.variance import VarianceFit, fit_variances
 
-ALPHA = 0.05
-_POWER = 0.8
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 _SEEN = 0.5
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
@@ -56,14 +54,11 @@ def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
     full = candidate.forms[0]
     white = evidence.whiten(candidate.twists)[:, full.keep]
     seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
-    detectable = _detectable(candidate, white, tests)
     tried = [_try(evidence, form) for form in candidate.forms]
     singles = len(candidate.forms)
     best = max(range(singles), key=lambda i: tried[i][0])
-    # The full forms share one half of the prior, the single joints the other.
-    gains = np.array([gain for gain, *_ in tried])
-    whole = np.array([form.keep.sum() == full.keep.sum() for form in candidate.forms])
-    weights = np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1))
+    gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
+    detectable = _detectable(evidence, candidate, weights, tests)
     gain = float(logsumexp(gains + np.log(weights)))
     p_values = np.array([p for _, p, _ in tried])
     p = float(min(1.0, np.min(p_values / weights)))
@@ -103,12 +98,24 @@ def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
     return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
 
 
-def _detectable(candidate: Candidate, white: Array, tests: int) -> dict[str, float]:
-    """|θ| = (z_{1−α/2K} + z_{power})/√I for every parameter alone, K tests."""
-    factor = float(norm.isf(ALPHA / (2 * max(tests, 1))) + norm.ppf(_POWER))
-    names = [p.name for p, keep in zip(candidate.parameters, candidate.forms[0].keep, strict=True) if keep]
-    root = np.linalg.norm(white, axis=0)
-    return {name: factor / r if r > 0 else float("inf") for name, r in zip(names, root, strict=True)}
+def form_weights(candidate: Candidate) -> Array:
+    """(F,) share of the prior of each form: the full forms share one half, those of single joints the other."""
+    kept = np.array([form.keep.sum() for form in candidate.forms])
+    whole = kept == kept[0]
+    return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
+
+
+def _detectable(evidence: PoseEvidence, candidate: Candidate, weights: Array, tests: int) -> dict[str, float]:
+    """Smallest detectable size of every free parameter."""
+    e = evidence.evidence
+    told = [
+        (
+            tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep),
+            evidence.whiten_channel(form.columns), form.sizes, float(weight),
+        )
+        for form, weight in zip(candidate.forms, weights, strict=True)
+    ]  # fmt: skip
+    return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
 
 
 def _fill(

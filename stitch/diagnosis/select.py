@@ -8,18 +8,13 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.pose_evidence import PoseEvidence
-from stitch.diagnosis.score import ALPHA, Score, score
+from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.thresholds import ALPHA_NAME, ALPHA_UNKNOWN, GAIN, ODDS
 from stitch.frames import Array
 from stitch.variance import fit_variances
 
 # Prior shares: nothing is missing, one effect of the library, something without a name.
 _NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
-# The family-wise error is shared between names and the alarm without one.
-ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
-# A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name.
-_ODDS = float(np.log(20.0))
-# Log evidence over "nothing is missing" that a name needs: 12 to 1.
-_GAIN = 2.5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
@@ -62,22 +57,22 @@ def score_all(evidence: PoseEvidence, candidates: Sequence[Candidate]) -> list[S
 def select(evidence: PoseEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = rank(score_all(evidence, candidates))
-    best = next((r for r in ranked if _nameable(r)), None)
-    stray = next((r for r in empirical[:1] if r.adjusted < ALPHA_UNKNOWN and r.score.gain > _GAIN), None)
-    if best is None and stray is None:
+    contenders = [r for r in ranked if _contends(r)]
+    stray = next((r for r in empirical[:1] if r.adjusted < ALPHA_UNKNOWN and r.score.gain > GAIN), None)
+    if stray is None and not any(r.score.gain > GAIN for r in contenders):
         verdict = "unknown_effect" if implausible(evidence, length_unit) else "adequate"
         return Selection(verdict, (), ranked, empirical)
-    if best is None:
+    if not contenders:
         return Selection("unknown_effect", (), ranked, empirical)
-    second = None
-    if stray is not None and stray.log_posterior > best.log_posterior + _ODDS:
+    best, second = contenders[0], None
+    if stray is not None and stray.log_posterior > best.log_posterior + ODDS:
         # Two known effects at once may look like none of them: try the best with a second one.
         best, second = _pair(evidence, candidates, best)
         together = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(_PHYSICAL / len(ranked)))
-        if stray.log_posterior > together + _ODDS:
+        if stray.log_posterior > together + ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
-    group = tuple(r for r in ranked if _nameable(r) and r.log_posterior > best.log_posterior - _ODDS)
-    group = (best, *(r for r in group if r.name != best.name))
+    others = (r for r in contenders if r.name != best.name and r.log_posterior > best.log_posterior - ODDS)
+    group = (best, *others)
     return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second)
 
 
@@ -104,23 +99,22 @@ def implausible(evidence: PoseEvidence, length_unit: str) -> bool:
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
 
 
-def _nameable(r: Ranked) -> bool:
-    """Significant, more likely than chance, seen, and of a size that somebody would believe.
+def _contends(r: Ranked) -> bool:
+    """Significant, more likely than nothing, seen, and of a size that somebody would believe.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the evidence
     does not know how many were tried.
     """
     kept = [p for p, k in zip(r.score.candidate.parameters, r.score.form.keep, strict=True) if k]
     believable = all(abs(v) < p.limit for v, p in zip(r.score.values, kept, strict=True))
-    likely = r.adjusted < ALPHA_NAME and r.score.gain > _GAIN
-    return r.physical and r.score.observable and likely and believable
+    return r.physical and r.score.observable and r.adjusted < ALPHA_NAME and r.score.gain > 0 and believable
 
 
 def _pair(evidence: PoseEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
     """The best effect and the one that explains most beside it; of the two the stronger comes first."""
     others = [c for c in candidates if c.name != best.name and c.effect.tier != "empirical"]
     ranked, _ = rank(score_all(with_columns(evidence, best.score.form.columns), others))
-    second = next((r for r in ranked if _nameable(r)), None)
+    second = next((r for r in ranked if _contends(r) and r.score.gain > GAIN), None)
     if second is None:
         return best, None
     return best, second
