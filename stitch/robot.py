@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.robot_table import gravity_of, known_keys, numbers, payload_of, point_mass
@@ -53,9 +51,15 @@ class Robot:
 def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
     """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
     angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
-    unit = np.eye(3)["xyz".index(axis)]
-    R = Rotation.from_rotvec(angle.reshape(-1, 1) * unit).as_matrix().reshape(*angle.shape, 3, 3)
-    return frames.make(R, shift[..., None] * unit)
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    T = np.zeros((*angle.shape, 4, 4))
+    T[..., i, i] = T[..., 3, 3] = 1.0
+    T[..., j, j] = T[..., k, k] = np.cos(angle)
+    T[..., k, j] = np.sin(angle)
+    T[..., j, k] = -T[..., k, j]
+    T[..., i, 3] = shift
+    return T
 
 
 def robot_from_dh(

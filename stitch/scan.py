@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from pykdtree.kdtree import KDTree
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.session import Session
 from stitch.threads import parallel
 
@@ -44,27 +44,34 @@ def prepare(session: Session) -> tuple[Scan, ...]:
     return tuple(parallel(lambda item: prepare_view(*item), clouds))
 
 
-def prepare_view(name: str, points: Array) -> Scan:
-    """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan."""
+def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Scan:
+    """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan.
+
+    Args:
+        picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
+    """
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points, leafsize=16)
+    own = points if picked is None or len(picked) == len(points) else points[picked]
     neighbours = min(_PLANE_NEIGHBOURS, len(points))
-    distance, index = tree.query(points, k=neighbours)
+    distance, index = tree.query(own, k=neighbours)
     around = points[index]
     centroid = around.mean(axis=1)
     radius = distance[:, -1]
     normals, variation = _planes(around - centroid[:, None])
-    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    ray = own / np.linalg.norm(own, axis=1, keepdims=True)
     cosine = np.einsum("ij,ij->i", normals, ray)
     normals *= -np.sign(cosine)[:, None]
     confidence = np.abs(cosine)
-    offset = np.linalg.norm(centroid - points, axis=1)
+    offset = np.linalg.norm(centroid - own, axis=1)
     usable = (confidence > _GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
     usable &= variation < _CREASE_VARIATION
-    return Scan(
-        name, points, normals, usable, np.pi * radius**2 / neighbours, confidence, tree,
-        float(np.median(distance[:, 1])), _noise(points, normals, tree),
-    )  # fmt: skip
+    noise = _noise(points, own, normals, tree)
+    if len(own) < len(points):
+        tree = KDTree(own, leafsize=16)
+        distance, _ = tree.query(own, k=2)
+    area = np.pi * radius**2 / neighbours * (len(points) / len(own))
+    return Scan(name, own, normals, usable, area, confidence, tree, float(np.median(distance[:, 1])), noise)
 
 
 def _planes(centred: Array) -> tuple[Array, Array]:
@@ -74,8 +81,8 @@ def _planes(centred: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(vectors[:, :, 0]), values[:, 0] / np.maximum(values.sum(axis=1), 1e-300)
 
 
-def _noise(points: Array, normals: Array, tree: Any) -> float:
-    """1-sigma of the points across a local quadric: median over sampled neighbourhoods.
+def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
+    """1-sigma of the points across a local quadric: median over neighbourhoods of some of `own` in `points`.
 
     A plane would count curvature as noise. White noise only: an error that is smooth over the
     neighbourhood moves the quadric with it and is not seen.
@@ -83,9 +90,9 @@ def _noise(points: Array, normals: Array, tree: Any) -> float:
     count = min(_QUADRIC_NEIGHBOURS, len(points))
     if count <= 8:
         return float("nan")
-    centre = np.linspace(0, len(points) - 1, min(_NOISE_SAMPLES, len(points))).astype(int)
-    _, index = tree.query(points[centre], k=count)
-    local = points[index] - points[centre][:, None]
+    centre = np.linspace(0, len(own) - 1, min(_NOISE_SAMPLES, len(own))).astype(int)
+    _, index = tree.query(own[centre], k=count)
+    local = points[index] - own[centre][:, None]
     n = normals[centre]
     helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     a = np.cross(n, helper)

@@ -18,6 +18,7 @@ from stitch.result import Run, Step
 from stitch.session import Session, load_session
 from stitch.stages.coarse import part_size
 from stitch.stages.reuse import REUSE_GATE, settle
+from stitch.thin import thinned
 from stitch.threads import library_threads_off
 
 
@@ -45,8 +46,8 @@ def state_of(run: Run) -> State:
     )  # fmt: skip
 
 
-def load_state(folder: Path, effects_file: Path | None = None) -> State:
-    """The state of a run folder; its session is read again.
+def load_state(folder: Path, effects_file: Path | None = None, thin: bool = False) -> State:
+    """The state of a run folder; its session is read again, for questions about poses with thinned scans.
 
     Raises:
         InputError: not a run of one session, its session has gone, or an effect is not known.
@@ -61,7 +62,8 @@ def load_state(folder: Path, effects_file: Path | None = None) -> State:
         raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
     session = load_session(path)
     with library_threads_off():
-        chain = chain_of(session, capture(session))
+        session, scans = thinned(session) if thin else (session, capture(session))
+        chain = chain_of(session, scans)
         terms = tuple(terms_of(model, chain))
         own = corrected(chain, terms, model.T_mount)
         overlaps = settle(own, model.T_mount, REUSE_GATE * part_size([own]))

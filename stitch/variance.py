@@ -80,10 +80,10 @@ def at_variances(
     """The same without searching: mean, covariance and deviance for given variances (3,)."""
     problem = _problem(evidence, G, prior)
     deviance, _ = _deviance(np.log(variances), problem)
-    V = np.einsum("c,cbij->bij", variances, problem.components)
+    V = np.tensordot(variances, problem.components, 1)
     X = problem.X
     weighted = np.linalg.solve(V, np.concatenate([X, problem.z[..., None]], axis=2))
-    M = np.einsum("bma,bmc->ac", X, weighted[..., :-1]) + np.diag(problem.precision)
+    M = _summed(X, weighted[..., :-1]) + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     covariance = np.linalg.pinv(M * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
@@ -120,31 +120,35 @@ def _guess(evidence: Evidence) -> Array:
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     variances = np.exp(log_variances)
-    V = np.einsum("c,cbij->bij", variances, problem.components)
+    V = np.tensordot(variances, problem.components, 1)
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:
         return 1e300, np.zeros(3)
     inverse = np.linalg.inv(V)
     WX = inverse @ problem.X
-    M = np.einsum("bma,bmc->ac", problem.X, WX) + np.diag(problem.precision)
+    M = _summed(problem.X, WX) + np.diag(problem.precision)
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = np.einsum("bma,bm->a", WX, problem.z)
+    b = WX.reshape(-1, WX.shape[2]).T @ problem.z.ravel()
     beta = half @ (half.T @ b)
     rest = problem.z - problem.X @ beta
-    Wr = np.einsum("bij,bj->bi", inverse, rest)
+    Wr = np.matmul(inverse, rest[..., None])
     WXh = WX @ half
-    slope = np.empty(3)
-    for i, C in enumerate(problem.components):
-        trace = float((inverse * C).sum()) - float(np.einsum("bmk,bmn,bnk->", WXh, C, WXh, optimize=True))
-        slope[i] = variances[i] * (trace - float(np.einsum("bi,bij,bj->", Wr, C, Wr, optimize=True)))
+    # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
+    against = inverse - WXh @ WXh.transpose(0, 2, 1) - Wr @ Wr.transpose(0, 2, 1)
+    slope = variances * (problem.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
-    square = float(np.einsum("bi,bi->", rest, Wr)) + float(beta @ (problem.precision * beta))
+    square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
     off = (log_variances[2] - _USUAL_FACTOR) / _FACTOR_SPREAD
     slope[2] += 2 * off / _FACTOR_SPREAD
     return logdet + square + off**2 - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
+
+
+def _summed(X: Array, Y: Array) -> Array:
+    """Σ_b XᵀY, (a, c)."""
+    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))

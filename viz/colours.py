@@ -6,6 +6,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Okabe & Ito's colours: people who do not see red and green alike can tell them apart.
+BLUE, ORANGE, GREEN, DARK = "#0072B2", "#D55E00", "#009E73", "#707070"
 # Grey: no other view sees this place, so there is nothing to compare.
 UNSEEN = (160, 160, 160)
 # Blue–white–red: below, at and above the surface of the other views.

@@ -7,27 +7,31 @@ from stitch.diagnosis.compare import Comparison, Table
 from stitch.diagnosis.diagnose import Diagnosis, Suspect
 from stitch.diagnosis.unknown import displacements
 from stitch.result import Step
+from viz.colours import BLUE, DARK, GREEN, ORANGE
+from viz.drawing import above, covariate, plain
 from viz.units import to_micrometres
-
-_BLUE, _GREEN, _GREY, _RED = "#4878a8", "#6a9955", "#8a8a8a", "#b5523b"
 
 
 def waterfall(ledger: tuple[Step, ...], length_unit: str) -> Figure:
     """Residual, held-out residual and noise floor over the model's history."""
     um = to_micrometres(length_unit)
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    figure = Figure(figsize=(7, 2.9), layout="constrained")
     axes = figure.subplots()
     place = np.arange(len(ledger))
-    axes.bar(place - 0.2, [s.residual_rms * um for s in ledger], 0.38, color=_BLUE, label="in the fit")
-    axes.bar(place + 0.2, [s.heldout_rms * um for s in ledger], 0.38, color=_GREEN, label="on views left out")
-    axes.plot(place, [s.noise_floor * um for s in ledger], color=_GREY, ls="--", marker="_", label="noise floor")
-    axes.set_xticks(place, [_change(ledger, i) for i in place])
-    axes.set_ylabel("rms between the views (µm)")
-    axes.legend(frameon=False)
-    return _plain(figure)
+    inside = axes.bar(place - 0.2, [s.residual_rms * um for s in ledger], 0.38, color=BLUE, label="in the fit")
+    outside = axes.bar(place + 0.2, [s.heldout_rms * um for s in ledger], 0.38, color=GREEN, label="on views left out")
+    for bars in (inside, outside):
+        axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
+    floors = np.array([s.noise_floor * um for s in ledger])
+    axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
+    axes.set_xticks(place, [change_of(ledger, i) for i in place])
+    axes.set_ylabel("rms between views (µm)")
+    above(axes)
+    return plain(figure)
 
 
-def _change(ledger: tuple[Step, ...], i: int) -> str:
+def change_of(ledger: tuple[Step, ...], i: int) -> str:
+    """What step i brought or took: + joint_compliance."""
     if i == 0:
         return ", ".join(ledger[0].effects) or "hand-eye alone"
     new = [f"+ {e}" for e in ledger[i].effects if e not in ledger[i - 1].effects]
@@ -40,11 +44,11 @@ def suspects(found: Diagnosis) -> Figure:
     shown = [s for s in found.suspects if s.ranked.score.observable][:8][::-1]
     figure = Figure(figsize=(7, 0.4 + 0.3 * max(len(shown), 1)), layout="constrained")
     axes = figure.subplots()
-    colours = [_RED if s.name in found.effects else _BLUE for s in shown]
+    colours = [ORANGE if s.name in found.effects else BLUE for s in shown]
     axes.barh([s.name for s in shown], [s.ranked.score.gain for s in shown], color=colours)
     axes.axvline(0, color="k", lw=0.8)
     axes.set_xlabel('log evidence over "nothing is missing"')
-    return _plain(figure)
+    return plain(figure)
 
 
 def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
@@ -59,17 +63,19 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, suspect in zip(axes, shown, strict=False):
         _added(ax, found, suspect)
+    reach = 1.08 * max((float(np.abs(ax.dataLim.get_points()).max()) for ax in axes if shown), default=1.0)
+    for ax in axes:
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes[0].set_ylabel("seen (sigma)")
-    return _plain(figure)
+    return plain(figure)
 
 
 def _added(ax, found: Diagnosis, suspect: Suspect) -> None:
     s = suspect.ranked.score
     predicted = found.evidence.whiten_channel(s.form.columns) @ s.values
-    ax.scatter(predicted, found.evidence.white_z, s=6, color=_BLUE, alpha=0.7, lw=0)
-    reach = np.array([predicted.min(), predicted.max()])
-    ax.plot(reach, reach, color=_RED, lw=1)
-    ax.set_title(suspect.name, fontsize=9)
+    ax.scatter(predicted, found.evidence.white_z, s=6, color=BLUE, alpha=0.7, lw=0)
+    ax.axline((0, 0), slope=1, color=ORANGE, lw=1)
+    ax.set_title(f"{suspect.name}, p = {suspect.ranked.adjusted:.1g}", fontsize=9)
     ax.set_xlabel("predicted (sigma)")
 
 
@@ -77,9 +83,13 @@ def alias_picture(found: Diagnosis, at_most: int = 12) -> Figure:
     """How much of each suspect's pattern the others can imitate."""
     keep = [k for k, s in enumerate(found.suspects) if s.ranked.score.observable][:at_most]
     names = [found.suspects[k].name for k in keep]
-    figure = Figure(figsize=(6.2, 5.2), layout="constrained")
+    figure = Figure(figsize=(7, 5.6), layout="constrained")
     axes = figure.subplots()
-    image = axes.imshow(found.matrix[np.ix_(keep, keep)], vmin=0, vmax=1, cmap="Blues")
+    matrix = found.matrix[np.ix_(keep, keep)]
+    image = axes.imshow(matrix, vmin=0, vmax=1, cmap="Blues")
+    for i, j in np.argwhere(matrix >= 0.5):
+        colour = "w" if matrix[i, j] > 0.6 else "k"
+        axes.text(j, i, f"{matrix[i, j]:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_xlabel("… can be imitated by")
@@ -95,12 +105,12 @@ def shape(found: Diagnosis, length_unit: str, at_most: int = 3) -> Figure:
     figure = Figure(figsize=(7, 2.5), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, d in zip(axes, shown, strict=False):
-        ax.errorbar(d.bins, d.mean * um, 2 * d.sigma * um, color=_BLUE, marker="o", ms=4, lw=1, capsize=2)
+        ax.errorbar(d.bins, d.mean * um, 2 * d.sigma * um, color=BLUE, marker="o", ms=4, lw=1, capsize=2)
         ax.axhline(0, color="k", lw=0.6)
-        ax.set_title(f"p = {d.p_value:.1g}", fontsize=9)
-        ax.set_xlabel(d.covariate)
-    axes[0].set_ylabel("displaced (µm, ± 2 sigma)")
-    return _plain(figure)
+        ax.set_title(f"p = {d.p_value:.1g}" + ("" if d.p_value < 0.05 else ": chance"), fontsize=9)
+        ax.set_xlabel(covariate(d.covariate))
+    axes[0].set_ylabel("displaced (µm)")
+    return plain(figure)
 
 
 def budget(found: Diagnosis, length_unit: str) -> Figure:
@@ -109,8 +119,8 @@ def budget(found: Diagnosis, length_unit: str) -> Figure:
     total, noise = (found.residual_rms * um) ** 2, (found.noise_floor * um) ** 2
     left = next((s.left for s in found.suspects if s.left is not None and s.name in found.effects), None)
     explained = 0.0 if left is None else max(total * (1 - left.inside), 0.0)
-    parts = [("sensor noise", min(noise, total), _GREY), (", ".join(found.effects) or "explained", explained, _RED),
-             ("scatter of the poses and the rest", max(total - noise - explained, 0.0), _BLUE)]  # fmt: skip
+    parts = [("sensor noise", min(noise, total), DARK), (", ".join(found.effects) or "explained", explained, ORANGE),
+             ("scatter of the poses and the rest", max(total - noise - explained, 0.0), BLUE)]  # fmt: skip
     figure = Figure(figsize=(7, 1.3), layout="constrained")
     axes = figure.subplots()
     start = 0.0
@@ -120,8 +130,8 @@ def budget(found: Diagnosis, length_unit: str) -> Figure:
             start += size / total * 100
     axes.set_yticks([])
     axes.set_xlabel(f"share of the mean square, {np.sqrt(total):.1f} µm rms (%)")
-    axes.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return _plain(figure)
+    above(axes)
+    return plain(figure)
 
 
 def comparison(found: Comparison, length_unit: str, at_most: int = 9) -> Figure:
@@ -137,12 +147,12 @@ def comparison(found: Comparison, length_unit: str, at_most: int = 9) -> Figure:
         ax.axis("off")
     for ax in axes[::3]:
         ax.set_ylabel("mean (µm)")
-    return _plain(figure)
+    return plain(figure)
 
 
 def _against(ax, table: Table, um: float) -> None:
     x = (table.low + table.high) / 2
-    ax.errorbar(x, table.mean * um, 2 * table.mean_sigma * um, color=_BLUE, marker="o", ms=3, lw=1, capsize=2)
+    ax.errorbar(x, table.mean * um, 2 * table.mean_sigma * um, color=BLUE, marker="o", ms=3, lw=1, capsize=2)
     ax.axhline(0, color="k", lw=0.6)
     ax.set_xlabel(f"{table.name}{f' ({table.unit})' if table.unit else ''}", fontsize=8)
     ax.tick_params(labelsize=7)
@@ -152,17 +162,13 @@ def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     """How far every view sits from where the model puts it."""
     um = to_micrometres(length_unit)
     moved = displacements(found.evidence) * um
-    figure = Figure(figsize=(7, 2.3), layout="constrained")
+    figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots()
-    for i, (axis, colour) in enumerate(zip("xyz", (_RED, _GREEN, _BLUE), strict=True)):
-        axes.plot(moved[:, i], marker="o", ms=3, lw=0.8, color=colour, label=axis)
+    for i, (axis, colour, marker) in enumerate(zip("xyz", (ORANGE, GREEN, BLUE), "osv", strict=True)):
+        axes.plot(moved[:, i], marker=marker, ms=4, lw=0.8, color=colour, label=axis)
     axes.axhline(0, color="k", lw=0.6)
-    axes.set(xlabel="view", ylabel="displaced (µm)")
-    axes.legend(frameon=False, ncols=3)
-    return _plain(figure)
-
-
-def _plain(figure: Figure) -> Figure:
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure
+    names = [scan.name for scan in found.evidence.capture.scans]
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    axes.set_ylabel("displaced (µm)")
+    above(axes)
+    return plain(figure)

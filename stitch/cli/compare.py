@@ -22,7 +22,7 @@ def compare_run(
     as_json: Annotated[bool, typer.Option("--json", help="Print all tables as JSON.")] = False,
 ) -> None:
     """Show the residual by view, pair, joint, range, incidence, field, time, covariate and place on the part."""
-    state = load_state(run)
+    state = load_state(run, thin=True)
     found = compare(state)
     write_json(comparison_document(found), run / "compare.json")
     extend("stitch.comparison_reports", found, state, run)

@@ -52,7 +52,7 @@ def next_measurement(
 
 
 def _diagnosed(run: Path, effects_file: Path | None) -> tuple[Diagnosis, dict[str, object], str]:
-    state = load_state(run, effects_file)
+    state = load_state(run, effects_file, thin=True)
     found = diagnose(state)
     return found, write_diagnosis(found, state, run), state.session.length_unit
 

@@ -11,13 +11,15 @@ import numpy as np
 
 from stitch import frames
 from stitch.effects.chain import Chain, Term, shifts, twists
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.free_poses import FreePoses, visible_directions
 from stitch.match import Match
 from stitch.solve import tukey
 from stitch.threads import parallel
 
 POINTS = ("sensor", "shape")
+# Correspondences whose slopes are held at a time: a few megabytes a thread, whatever the session's size.
+_BLOCK = 10_000
 
 
 @dataclass(frozen=True)
@@ -36,32 +38,29 @@ def pose_twists(chain: Chain, terms: Sequence[Term], term: Term, T_mount: Array,
 
 
 def point_gram(chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], freed: FreePoses) -> PointGram:
-    """Stream the pairs once for all parameters of the point effects in `candidates`."""
-    matches, g = freed.overlaps.matches, freed.overlaps.gram
-    used = [np.zeros(len(scan.points), bool) for scan in chain.capture.scans]
-    for m in matches:
-        used[m.v][m.index_v] = True
-        used[m.w][m.index_w] = True
-    index = [np.flatnonzero(u) for u in used]
+    """Stream the pairs once for all parameters of the point effects in `candidates`, a block of rows at a time."""
+    g = freed.overlaps.gram
 
-    def slopes(v: int) -> Array:
-        found = [shifts(chain, terms, term, v, freed.poses[v], index[v]) for term in candidates]
-        # In the reference frame; single precision is plenty for a slope.
-        turned = frames.rotate(freed.poses[v], np.concatenate(found).reshape(-1, 3))
-        return turned.reshape(-1, len(index[v]), 3).astype(np.float32)
-
-    by_view = list(parallel(slopes, range(len(index))))
-    place = [np.cumsum(u) - 1 for u in used]
+    def slopes(v: int, index: Indices, normal: Array) -> Array:
+        """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
+        own = frames.rotate(frames.inverse(freed.poses[v]), normal)
+        found = [shifts(chain, terms, term, v, freed.poses[v], index) for term in candidates]
+        return np.concatenate([np.einsum("kni,ni->nk", f, own) for f in found], axis=1)
 
     def of_pair(m: Match) -> tuple[Array, Array, Array]:
-        d = by_view[m.v][:, place[m.v][m.index_v]] - by_view[m.w][:, place[m.w][m.index_w]]
-        change = np.einsum("kni,ni->nk", d.astype(float), m.normal)
         weight = m.weight * tukey(m.residual, g.scale)
-        B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)
-        weighted = change * weight[:, None]
-        return B.T @ weighted, weighted.T @ m.residual, weighted.T @ change
+        parts = []
+        for start in range(0, len(m.residual), _BLOCK):
+            at = slice(start, start + _BLOCK)
+            normal = m.normal[at]
+            change = slopes(m.v, m.index_v[at], normal) - slopes(m.w, m.index_w[at], normal)
+            weighted = change * weight[at, None]
+            B = np.concatenate([np.cross(m.middle[at] - g.centre, normal), normal], axis=1)
+            parts.append((B.T @ weighted, weighted.T @ m.residual[at], weighted.T @ change))
+        vector, residual, square = (sum(p) for p in zip(*parts, strict=True))
+        return vector, residual, square
 
-    sums = list(parallel(of_pair, matches))
+    sums = list(parallel(of_pair, freed.overlaps.matches))
     return PointGram(*(np.array([s[i] for s in sums]) for i in range(3)))
 
 

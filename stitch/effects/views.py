@@ -74,7 +74,7 @@ class ScanView:
 
     def along(self, points: Array) -> Array:
         """(N, 3) unit rays."""
-        return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
+        return np.asarray(points / np.sqrt(np.einsum("ij,ij->i", points, points))[:, None])
 
     def rho2(self, points: Array) -> Array:
         """(N,) ρ² = a² + b² of (a, b) = (x/z, y/z)."""

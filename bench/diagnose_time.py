@@ -1,0 +1,100 @@
+"""How long diagnosis takes and how much memory: a blade of 18 views × 200 000 points, then 10⁷ correspondences.
+
+Run: python bench/diagnose_time.py [--points 200000] [--correspondences 10000000]
+
+The first part times whole commands, reading the session and writing the page included. The second streams the
+correspondences of that session through the sums of all effects of points; an N×K matrix would not fit.
+"""
+
+import argparse
+import os
+import resource
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from subprocess import DEVNULL, Popen
+
+import numpy as np
+
+from data_synth.scene import load_scene
+from data_synth.simulate import simulate
+from data_synth.write import write_session
+from stitch.diagnosis.candidates import _grid_terms
+from stitch.effects.chain import corrected
+from stitch.effects.columns import POINTS, point_gram
+from stitch.effects.contract import EFFECTS
+from stitch.free_poses import FreePoses
+from stitch.match import sample
+from stitch.overlaps import collect
+from stitch.state import load_state
+from stitch.threads import library_threads_off
+
+# Points of a view of the blade scene with 280 × 280 rays.
+_USUAL_RAYS, _USUAL_POINTS = 280, 15_840
+_COMMAND = "from stitch.cli.main import main; main()"
+
+
+def session(folder: Path, points: int) -> Path:
+    """A blade with a hidden effect, about `points` a view."""
+    scene = load_scene("blade")
+    rays = round(_USUAL_RAYS * (points / _USUAL_POINTS) ** 0.5)
+    scene = replace(scene, scanner=replace(scene.scanner, columns=rays, rows=rays))
+    measured = simulate(scene, {"joint_compliance": 2.0}, seed=3)
+    write_session(folder / "blade", measured, "blade")
+    print(f"{len(measured.clouds)} views × {np.mean([len(c.points) for c in measured.clouds]):,.0f} points")
+    return folder / "blade"
+
+
+def command(*arguments: str) -> None:
+    """One command as a process of its own: wall time and peak memory."""
+    start = time.perf_counter()
+    child = Popen([sys.executable, "-c", _COMMAND, *arguments], stderr=DEVNULL, stdout=DEVNULL)
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    seconds = time.perf_counter() - start
+    print(f"stitch {arguments[0]:<10} {seconds:6.1f} s {usage.ru_maxrss / 1e6:6.2f} GB   exit {child.returncode}")
+
+
+def streamed(run: Path, correspondences: int) -> None:
+    """The sums over many correspondences, in this process."""
+    state = load_state(run)
+    with library_threads_off():
+        own = corrected(state.chain, state.terms, state.T_mount)
+        poses = own.poses(state.T_mount)
+        few = collect(own, poses, state.gate, [sample(scan, 1000) for scan in own.scans])
+        per_view = round(1000 * correspondences / few.gram.count.sum())
+        many = collect(own, poses, state.gate, [sample(scan, per_view) for scan in own.scans])
+    before = _peak()
+    effects = [e for e in EFFECTS.values() if e.place in POINTS and not state.chain.lacks(e)]
+    terms = [t for e in effects for t in _grid_terms(e, state.chain.parameters(e))]
+    start = time.perf_counter()
+    sums = point_gram(state.chain, state.terms, terms, FreePoses(poses, np.zeros((len(poses), 6)), many))
+    count, columns = sum(len(m.residual) for m in many.matches), sums.residual.shape[1]
+    print(
+        f"{count:,} correspondences × {columns} columns: {time.perf_counter() - start:.1f} s, peak {_peak():.2f} GB, "
+        f"{before:.2f} GB before (a matrix of all would be {count * columns * 8e-9:.1f} GB more)"
+    )
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=200_000)
+    parser.add_argument("--correspondences", type=int, default=10_000_000)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        place = session(Path(folder), given.points)
+        run = Path(folder) / "run"
+        command("run", str(place), "-o", str(run))
+        command("diagnose", str(run))
+        command("compare", str(run))
+        streamed(run, given.correspondences)
+
+
+if __name__ == "__main__":
+    main()
