@@ -30,11 +30,18 @@ class Evidence:
     z: Array  # (B, m)
     A: Array  # (B, m, a) columns of the free mean
     components: Array  # (3, B, m, m) covariance of unit rotation scatter, translation scatter, sensor noise
+    fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
+    independent: int | None = None  # numbers that could err independently, if that is not all of them
 
     @property
     def size(self) -> int:
         """Numbers in all."""
-        return int(self.z.size)
+        return int(self.z.size) if self.independent is None else self.independent
+
+    def covariance(self, variances: Array) -> Array:
+        """(B, m, m) for variances (3,)."""
+        V = np.einsum("c,cbij->bij", variances, self.components)
+        return np.asarray(V if self.fixed is None else V + self.fixed)
 
 
 @dataclass(frozen=True)
@@ -80,35 +87,34 @@ def at_variances(
     """The same without searching: mean, covariance and deviance for given variances (3,)."""
     problem = _problem(evidence, G, prior)
     deviance, _ = _deviance(np.log(variances), problem)
-    V = np.einsum("c,cbij->bij", variances, problem.components)
+    V = evidence.covariance(variances)
     X = problem.X
-    weighted = np.linalg.solve(V, np.concatenate([X, problem.z[..., None]], axis=2))
-    M = np.einsum("bma,bmc->ac", X, weighted[..., :-1]) + np.diag(problem.precision)
+    weighted = np.linalg.solve(V, np.concatenate([X, evidence.z[..., None]], axis=2))
+    M = _gram(X, weighted[..., :-1]) + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     covariance = np.linalg.pinv(M * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
-    mean = covariance @ np.einsum("bma,bm->a", X, weighted[..., -1])
+    mean = covariance @ _gram(X, weighted[..., -1:])[:, 0]
     return VarianceFit(np.asarray(variances), deviance, mean, covariance)
 
 
 @dataclass(frozen=True)
 class _Problem:
-    z: Array  # (B, m)
+    evidence: Evidence
     X: Array  # (B, m, a + g)
     precision: Array  # (a + g,) of the prior
-    components: Array
     offset: float  # log det of the prior covariance
 
 
 def _problem(evidence: Evidence, G: Array | None, prior: Array | None) -> _Problem:
     a = evidence.A.shape[2]
     if G is None:
-        return _Problem(evidence.z, evidence.A, np.zeros(a), evidence.components, 0.0)
+        return _Problem(evidence, evidence.A, np.zeros(a), 0.0)
     X = np.concatenate([evidence.A, G], axis=2)
     if prior is None:
-        return _Problem(evidence.z, X, np.zeros(X.shape[2]), evidence.components, 0.0)
+        return _Problem(evidence, X, np.zeros(X.shape[2]), 0.0)
     precision = np.concatenate([np.zeros(a), 1 / prior**2])
-    return _Problem(evidence.z, X, precision, evidence.components, float(2 * np.log(prior).sum()))
+    return _Problem(evidence, X, precision, float(2 * np.log(prior).sum()))
 
 
 def _guess(evidence: Evidence) -> Array:
@@ -120,26 +126,27 @@ def _guess(evidence: Evidence) -> Array:
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     variances = np.exp(log_variances)
-    V = np.einsum("c,cbij->bij", variances, problem.components)
+    evidence = problem.evidence
+    V = evidence.covariance(variances)
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:
         return 1e300, np.zeros(3)
     inverse = np.linalg.inv(V)
     WX = inverse @ problem.X
-    M = np.einsum("bma,bmc->ac", problem.X, WX) + np.diag(problem.precision)
+    M = _gram(problem.X, WX) + np.diag(problem.precision)
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = np.einsum("bma,bm->a", WX, problem.z)
+    b = _gram(WX, evidence.z[..., None])[:, 0]
     beta = half @ (half.T @ b)
-    rest = problem.z - problem.X @ beta
+    rest = evidence.z - problem.X @ beta
     Wr = np.einsum("bij,bj->bi", inverse, rest)
     WXh = WX @ half
     slope = np.empty(3)
-    for i, C in enumerate(problem.components):
-        trace = float((inverse * C).sum()) - float(np.einsum("bmk,bmn,bnk->", WXh, C, WXh, optimize=True))
+    for i, C in enumerate(evidence.components):
+        trace = float((inverse * C).sum()) - float(np.vdot(WXh, C @ WXh))
         slope[i] = variances[i] * (trace - float(np.einsum("bi,bij,bj->", Wr, C, Wr, optimize=True)))
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(np.einsum("bi,bi->", rest, Wr)) + float(beta @ (problem.precision * beta))
@@ -148,3 +155,8 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     off = (log_variances[2] - _USUAL_FACTOR) / _FACTOR_SPREAD
     slope[2] += 2 * off / _FACTOR_SPREAD
     return logdet + square + off**2 - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
+
+
+def _gram(X: Array, Y: Array) -> Array:
+    """(a, c) Σ over blocks of XᵀY, for (B, m, a) and (B, m, c)."""
+    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))

@@ -31,6 +31,8 @@ EVERY_VIEW = (-1.0,)
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Units are written for millimetres; a session in metres has the same unit with m.
 _PER_MM = {"mm": 1.0, "m": 1e-3}
+# What a link and all that it carries may well weigh, kg, where nobody states it.
+_LINK_MASS = 10.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,10 @@ class Effect:
             else:
                 names = {"number": [key], "joint": [f"{key}{i + 1}" for i in range(joints)],
                          "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
-                out += [_in_unit(n, spec.unit, spec.typical, spec.limit, spec.grid, length_unit) for n in names]
+                # A torque between two joints is that of 1 kg there; the link's mass is in the coefficient.
+                mass = [_LINK_MASS if spec.kind == "torque" and "_" in n[len(key) :] else 1.0 for n in names]
+                out += [_in_unit(n, spec.unit, m * spec.typical, m * spec.limit, spec.grid, length_unit)
+                        for n, m in zip(names, mass, strict=True)]  # fmt: skip
         return tuple(out)
 
     def arguments(self, values: Array, joints: int, torques: int) -> dict[str, Any]:

@@ -115,6 +115,7 @@ def views_of(session: Session) -> Views:
 
 def _median_range(session: Session) -> float:
     ranges = [np.median(np.linalg.norm(v.cloud.points, axis=1)) for v in session.views if v.cloud]
+    ranges += [np.median(np.linalg.norm(v.sighting.points, axis=1)) for v in session.views if v.sighting]
     return float(np.median(ranges)) if ranges else 1.0
 
 

@@ -21,8 +21,8 @@ _MAXIMUM_ITERATIONS = 6
 _SETTLED = 0.05
 # A parameter that these views know worse than this many times its plausible size stays at zero: it would
 # only borrow from the hand-eye.
-_UNSEEN = 4.0
-_WEAK = 10.0
+UNSEEN = 4.0
+WEAK = 10.0
 
 
 @dataclass(frozen=True)
@@ -62,16 +62,16 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
         captures, freed = _free(chains, terms, T_mount, gate)
         columns = [np.hstack([np.zeros((6 * len(c.scans), 0)), *all_columns(chain, terms, terms, T_mount, f)[0]])
                    for chain, c, f in zip(chains, captures, freed, strict=True)]  # fmt: skip
-        seen = independent(*whitened(captures, freed, T_mount, columns), sizes, 1 / _UNSEEN)
+        seen = independent(*whitened(captures, freed, T_mount, columns), sizes, 1 / UNSEEN)
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
         fitted = fit_hand_eye(
-            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], _WEAK * sizes[seen])
+            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen])
         )
         T_mount, before = fitted.T_mount, values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[~held] = 0.0
         values[seen] = fitted.values
-        terms = _with_values(terms, values)
+        terms = with_values(terms, values)
         history.append(float(np.median([f.overlaps.gram.rms for f in freed])))
         sigma = np.sqrt(np.maximum(np.diag(fitted.values_covariance), 1e-300))
         if not len(values) or np.max(np.abs(values - before)[seen] / sigma, initial=0.0) < _SETTLED:
@@ -99,7 +99,8 @@ def _settled_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps
     return collect(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples)
 
 
-def _with_values(terms: Sequence[Term], values: Array) -> list[Term]:
+def with_values(terms: Sequence[Term], values: Array) -> list[Term]:
+    """The terms with the values of all their parameters in one row."""
     out, at = [], 0
     for term in terms:
         out.append(replace(term, values=values[at : at + len(term.values)]))
