@@ -1,6 +1,6 @@
 """Fit hand-eye, landmarks and the effects in use to labelled points: Gauss–Newton with REML of the scatter."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,8 @@ from stitch.stages.refine import UNSEEN, WEAK, with_values
 from stitch.variance import fit_variances
 
 _MAXIMUM_ITERATIONS = 12
+# Which parameters the views can know is settled early: a choice that changes with every step never ends.
+_CHOOSING = 3
 # Settled when no unknown moves by this share of its sigma.
 _SETTLED = 0.02
 
@@ -65,7 +67,7 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
     parameters = [p for term in terms for p in chain.parameters(term.effect)]
     sizes, held = np.array([p.typical for p in parameters]), np.array([bool(p.grid) for p in parameters], bool)
     variances = None
-    for _ in range(_MAXIMUM_ITERATIONS):
+    for index in range(_MAXIMUM_ITERATIONS):
         own = corrected(chain, terms, T_mount)
         rows = rows_of(own, T_mount, landmarks)
         history.append(rms_of(rows.distances(rows.left)))
@@ -76,7 +78,8 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
         base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
         variances = fit_variances(evidence_of_rows(rows, np.concatenate([base, columns], axis=2)), start=variances,
                                   both_starts=variances is None).variances  # fmt: skip
-        seen = _seen(rows, base, columns, sizes, variances)
+        if index < _CHOOSING:
+            seen = _seen(rows, base, columns, sizes, variances)
         blocks = _blocks(rows, np.concatenate([base, columns[..., seen]], axis=2), sizes[seen], values[seen], variances)
         x, covariance = blocks.solve(), blocks.estimates_covariance()
         a = base.shape[2]
@@ -139,27 +142,44 @@ def _lever(rows: Rows) -> float:
 def robust_fit(
     chain: Chain, terms: Sequence[Term], T_mount: Array, drawing: Drawing | None
 ) -> tuple[LabelledFit, Chain, list[Outlier]]:
-    """The fit with gross errors taken out one after the other; the chain that is left, and what was taken.
+    """The fit with gross errors taken out; the chain that is left, and what was taken.
+
+    Raises:
+        NoResultError: more than a third of what was seen would have to go.
+    """
+    found: LabelledFit | None = None
+
+    def examine(chain: Chain) -> LabelledFit:
+        nonlocal found
+        begin, T = (terms, T_mount) if found is None else (found.terms, found.T_mount)
+        found = fit(chain, begin, T, settled(corrected(chain, begin, T), T, drawing))
+        return found
+
+    return without_gross(chain, examine)
+
+
+def without_gross(
+    chain: Chain, examine: Callable[[Chain], LabelledFit]
+) -> tuple[LabelledFit, Chain, list[Outlier]]:
+    """Examine a chain, take out what is off, and again, until nothing is.
 
     Raises:
         NoResultError: more than a third of what was seen would have to go.
     """
     assert chain.capture.sightings is not None
     everything = chain.capture.sightings.everything
-    chain = replace(chain, capture=replace(chain.capture, sightings=everything))
-    taken: list[Outlier] = []
+    sightings, taken = everything, list[Outlier]()
     while True:
-        landmarks = settled(corrected(chain, terms, T_mount), T_mount, drawing)
-        found = fit(chain, terms, T_mount, landmarks)
+        chain = replace(chain, capture=replace(chain.capture, sightings=sightings))
+        found = examine(chain)
         worse = gross(found.rows, found.variances)
         if not worse:
             return found, chain, taken
         taken += worse
-        used = outside(chain.capture.sightings.used, worse, everything.targets, everything.target)
+        used = outside(sightings.used, worse, sightings.targets, sightings.target)
         if used.sum() < 2 * everything.used.sum() / 3:
             raise NoResultError(
                 f"{chain.capture.name}: more than a third of the labelled points contradict the rest; check the names "
                 "of the targets, the order of the views, mount and pose convention"
             )
-        chain = replace(chain, capture=replace(chain.capture, sightings=replace(everything, used=used)))
-        terms, T_mount = found.terms, found.T_mount
+        sightings = replace(everything, used=used)

@@ -22,7 +22,7 @@ class Outlier:
 
     view: int
     target: str | None  # None: all that the view shows
-    distance: float  # from where the model puts it, 3D, length_unit
+    distance: float  # 3D, length_unit: of a target from where the rest of its view has it, of a view from the model
     times: float  # the deviation over what is usual here
 
 
@@ -37,7 +37,7 @@ def gross(rows: Rows, variances: Array) -> list[Outlier]:
     V, S = sightings.used.shape
     P = np.linalg.inv(evidence_of_rows(rows, rows.hand_eye).covariance(variances)[:V])
     left = rows.left[:V]
-    slots = _slot_deviations(P, left, S)
+    slots, apart = _slot_deviations(P, left, S)
     slots[~sightings.used] = np.nan
     views = np.sqrt(np.einsum("vi,vij,vj->v", left, P, left) / np.maximum(rows.used.sum(axis=1), 1))
     views[~sightings.used.any(axis=1)] = np.nan
@@ -50,14 +50,14 @@ def gross(rows: Rows, variances: Array) -> list[Outlier]:
         if worst > GROSS and not alone[v]:
             slot = int(np.nanargmax(slots[v]))
             name = sightings.targets[sightings.target[v, slot]]
-            out.append(Outlier(v, name, float(distances[v, slot]), worst))
+            out.append(Outlier(v, name, float(apart[v, slot]), worst))
         elif views[v] > GROSS:
             out.append(Outlier(v, None, float(np.nanmax(distances[v])), float(views[v])))
     return out
 
 
-def _slot_deviations(P: Array, left: Array, slots: int) -> Array:
-    """(V, S) of each target from what the rest of its view foretells, in sigmas.
+def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
+    """(V, S) of each target from what the rest of its view foretells, in sigmas and in length_unit.
 
     With P the inverse covariance of a view, that deviation is P_ss⁻¹ (P e)_s with covariance P_ss⁻¹.
     """
@@ -65,7 +65,8 @@ def _slot_deviations(P: Array, left: Array, slots: int) -> Array:
     pushed = np.einsum("vij,vj->vi", P, left)[:, : 3 * slots].reshape(V, slots, 3)
     own = P[:, : 3 * slots, : 3 * slots].reshape(V, slots, 3, slots, 3)
     own = np.moveaxis(own[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # (V, S, 3, 3)
-    return np.sqrt(np.maximum(np.einsum("vsi,vsij,vsj->vs", pushed, np.linalg.inv(own), pushed), 0.0))
+    apart = np.einsum("vsij,vsj->vsi", np.linalg.inv(own), pushed)
+    return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
 
 
 def outside(used: Array, found: list[Outlier], targets: tuple[str, ...], target: Array) -> Array:

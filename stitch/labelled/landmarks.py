@@ -9,6 +9,7 @@ from stitch import frames
 from stitch.capture import Capture
 from stitch.frames import Array, Indices
 from stitch.points_csv import Nominal
+from stitch.sightings import Sightings
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,11 @@ class Landmarks:
         )
 
 
-def drawing_of(nominal: Nominal | None, names: tuple[str, ...], usual: float) -> Drawing | None:
-    """The drawing of the targets seen; `usual` stands in for a sigma that targets.csv does not state."""
+def drawing_of(nominal: Nominal | None, sightings: Sightings) -> Drawing | None:
+    """The drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
     if nominal is None:
         return None
+    names, usual = sightings.targets, float(np.median(sightings.sigma[sightings.used]))
     pairs = [(names.index(name), i) for i, name in enumerate(nominal.targets) if name in names]
     target, rows = (np.array(column) for column in zip(*pairs, strict=True))
     sigma = nominal.sigma[rows]
