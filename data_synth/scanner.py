@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 Array = NDArray[np.float64]
 _BLOCK = 1 << 18  # rays cast at a time
@@ -26,8 +27,10 @@ class Scanner:
     standoff: float = 420.0
     depth_of_field: float = 400.0  # full, about the standoff
     noise: float = 0.02  # 1-sigma along the ray at the standoff, grows with range²
+    tail: float = 0.0  # degrees of freedom of Student's t for that noise, above 2; 0 is Gaussian
     field_error: float = 0.0  # rms over the field of a smooth error along the ray, new for every cell
     mixed_pixels: float = 0.0  # share of edge pixels that lie between front and back
+    edge_bias: float = 0.0  # pixels within two of an edge lie this much too far
     grazing: float = 78.0  # incidence from which nothing returns; fewer and fewer do on the way there
     dropout: float = 0.0  # share lost on the darkest surface
     quantisation: float = 0.0  # step of the range
@@ -107,12 +110,14 @@ def scan(
         shape = (-1, scanner.columns)
         distance[rows], cosine[rows] = far.reshape(shape), cos.reshape(shape)
         albedo[rows] = _albedo(far, directions, poses).reshape(shape)
+    if scanner.edge_bias:
+        distance += scanner.edge_bias * _beside_an_edge(distance, scanner)
     _mix(distance, scanner, rng, blocks)
     seen = np.concatenate([_returned(distance, cosine, albedo, scanner, rows, rng) for rows in blocks])
     d = np.concatenate([_aim(scanner, T_part_scanner, rows)[0][seen[rows].ravel()] for rows in blocks])
     r, cos, bright = distance[seen], cosine[seen], albedo[seen]
     sigma = scanner.noise * (r / scanner.standoff) ** 2
-    r = r + sigma * rng.standard_normal(len(r)) + _field(d, scanner, field_weights)
+    r = r + sigma * _white(scanner, len(r), rng) + _field(d, scanner, field_weights)
     if scanner.quantisation:
         r = np.round(r / scanner.quantisation) * scanner.quantisation
     intensity = bright * cos * (scanner.standoff / r) ** 2
@@ -151,6 +156,20 @@ def _albedo(distance: Array, directions: Array, T_part_scanner: Array) -> Array:
     p = (local @ R.T if R.ndim == 2 else np.einsum("rij,rj->ri", R, local)) + t
     waves = np.sin(p @ [0.11, 0.05, 0.09]) + np.sin(p @ [-0.04, 0.23, 0.06] + 1.0) + np.sin(p @ [0.2, -0.11, -0.21])
     return np.asarray(0.625 + 0.125 * waves)
+
+
+def _white(scanner: Scanner, count: int, rng: np.random.Generator) -> Array:
+    """(count,) numbers of variance 1."""
+    if not scanner.tail:
+        return rng.standard_normal(count)
+    return np.asarray(rng.standard_t(scanner.tail, count) * np.sqrt(1 - 2 / scanner.tail))
+
+
+def _beside_an_edge(image: Array, scanner: Scanner) -> NDArray[np.bool_]:
+    """Pixels within two of a jump or of the background, along rows and columns."""
+    missing = ~np.isfinite(image)
+    edge = missing | _edges(image, scanner)
+    return np.asarray(binary_dilation(edge, iterations=2) & ~missing)
 
 
 def _mix(image: Array, scanner: Scanner, rng: np.random.Generator, blocks: list[slice]) -> None:

@@ -47,14 +47,20 @@ def part_mesh(scene: Scene) -> trimesh.Trimesh:
     return build_shape(scene.part.shape, **scene.part.parameters)
 
 
-def simulate(scene: Scene, hidden: dict[str, float], seed: int, views: int | None = None) -> Measured:
+def simulate(
+    scene: Scene, hidden: dict[str, float], seed: int, views: int | None = None,
+    planned: tuple[Plan, Array] | None = None,
+) -> Measured:  # fmt: skip
     """Run one session. Independent streams of chance for plan, cell, nature and every view.
+
+    Args:
+        planned: joint angles and the rail's positions (V,), instead of those planned for scene and seed.
 
     Raises ValueError for an unknown law, NoResultError for a plan that cannot be driven.
     """
     mesh = part_mesh(scene)
-    count = views or scene.plan.views
-    plan, rail = plan_views(scene, mesh, count, np.random.default_rng([seed, 1]))
+    plan, rail = planned or plan_views(scene, mesh, views or scene.plan.views, np.random.default_rng([seed, 1]))
+    count = len(plan.joints)
     laws, told = nature.draw(hidden, scene.small, plan, np.random.default_rng([seed, 2]))
     cell = np.random.default_rng([seed, 3])
     times, covariates = _climate(scene, count, cell)

@@ -11,6 +11,7 @@ from stitch.effects.chain import Term
 from stitch.effects.columns import PointGram
 from stitch.effects.contract import EFFECTS, Effect, Parameter
 from stitch.effects.empirical import empirical_effects
+from stitch.effects.groups import by_joint, one_by_one
 from stitch.frames import Array
 
 
@@ -91,18 +92,10 @@ def _forms(evidence: PoseEvidence, term: Term, parameters: Sequence[Parameter], 
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Indices of the parameters of one joint; links in single numbers too: one row seldom is wrong altogether."""
-    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
-        return []
-    letters = sorted(effect.specs, key=len, reverse=True)
-    joints: dict[str, list[int]] = {}
-    for i, parameter in enumerate(parameters):
-        letter = next(name for name in letters if parameter.name.startswith(name))
-        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
-    groups = list(joints.values())
-    if effect.place == "links" and len(effect.specs) > 1:
-        groups += [[i] for i in range(len(parameters))]
-    return groups
+    """Parameters of one joint; links in single numbers too."""
+    joints = by_joint(effect, parameters)
+    single = effect.place == "links" and len(effect.specs) > 1
+    return joints + one_by_one(effect, parameters) if joints and single else joints
 
 
 def with_values(form: Form, values: Array) -> Term:

@@ -100,9 +100,9 @@ def checked(selection: Selection, suspects: list[Suspect], implausible: bool) ->
     if left.steadiness < _STEADY:
         note = f"{first.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
         verdict = "unknown_effect" if implausible or first.adjusted < _BEYOND_CHANCE else "adequate"
-    elif left.heldout > 1 - left.heldout_sigma:
-        share = f"{left.heldout:.2f} ± {left.heldout_sigma:.2f}"
-        note = f"{first.name} would not help on views left out (mean square {share} of now)"
+    elif left.poses > 1 - left.poses_sigma:
+        share = f"{left.poses:.2f} ± {left.poses_sigma:.2f}"
+        note = f"{first.name} would not help on views left out (mean square pose error {share} of now)"
         verdict = "unknown_effect" if implausible else "adequate"
     else:
         return selection, ()

@@ -17,7 +17,8 @@ class Left:
 
     inside: float  # fitted on all views
     heldout: float  # each fold judged by a fit without it
-    heldout_sigma: float  # standard error of `heldout` over folds
+    poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
+    poses_sigma: float  # standard error of `poses` over folds
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
 
 
@@ -41,10 +42,36 @@ def left_by(evidence: PoseEvidence, scored: Score, points: PointGram | None) -> 
         without = _squares(evidence, evidence.model, _solve(evidence, evidence.model, fold), None)[touched].sum()
         shares.append(with_it / max(without, 1e-300))
         weights.append(without)
-    shares_, weights_ = np.array(shares), np.array(weights) / np.sum(weights)
-    mean = float(shares_ @ weights_)
-    sigma = float(np.sqrt(weights_**2 @ (shares_ - mean) ** 2 * len(shares) / max(len(shares) - 1, 1)))
-    return Left(float(inside), mean, sigma, _steadiness(evidence, X, whole))
+    return Left(
+        float(inside), float(np.average(shares, weights=weights)), *_poses_left(evidence, X),
+        _steadiness(evidence, X, whole),
+    )  # fmt: skip
+
+
+def _poses_left(evidence: PoseEvidence, X: Array) -> tuple[float, float]:
+    """How far left-out views lie from the prediction with X over that without, squared, and its standard error.
+
+    What a model says of left-out views is judged in the directions of the whitened channel that they alone move.
+    """
+    with_it, without = list[float](), list[float]()
+    for fold in evidence.folds():
+        own = _orthonormal(evidence.white_left[:, _columns_of(fold)])
+        for columns, out in ((X, with_it), (evidence.model, without)):
+            rest = evidence.raw_white_z - evidence.white_left @ (columns @ _solve(evidence, columns, fold))
+            out.append(float(np.sum((own.T @ rest) ** 2)))
+    a, b = np.array(with_it), np.array(without)
+    share = float(a.sum() / max(b.sum(), 1e-300))
+    spread = np.sum((a - share * b) ** 2) * len(a) / max(len(a) - 1, 1)
+    return share, float(np.sqrt(spread) / max(b.sum(), 1e-300))
+
+
+def _orthonormal(columns: Array) -> Array:
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > 1e-9 * s[0]])
+
+
+def _columns_of(views: Array) -> Array:
+    return np.asarray((6 * np.asarray(views)[:, None] + np.arange(6)).ravel())
 
 
 def _own(points: PointGram, scored: Score) -> PointGram:
@@ -54,18 +81,12 @@ def _own(points: PointGram, scored: Score) -> PointGram:
 
 def _solve(evidence: PoseEvidence, X: Array, left_out: Array | None) -> Array:
     """Coefficients of the columns X (6V, k) by generalised least squares without some views."""
-    channel, covariance = evidence.channel, evidence.covariance
-    left, z = channel.left, channel.z
+    white = evidence.white_left @ X
     if left_out is not None:
         # A view is left out by letting it move freely: six more columns each.
-        views = left.shape[1] // 6
-        free = np.eye(6 * views)[:, (6 * np.asarray(left_out)[:, None] + np.arange(6)).ravel()]
-        X = np.hstack([X, free])
-    columns = left @ X
-    white = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([columns, z]))
-    scale = np.maximum(np.linalg.norm(white[:, :-1], axis=0), 1e-300)
-    solution = np.linalg.lstsq(white[:, :-1] / scale, white[:, -1], rcond=1e-10)[0] / scale
-    return np.asarray(solution[: X.shape[1] if left_out is None else X.shape[1] - 6 * len(left_out)])
+        white = np.hstack([white, evidence.white_left[:, _columns_of(left_out)]])
+    scale = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
+    return np.asarray((np.linalg.lstsq(white / scale, evidence.raw_white_z, rcond=1e-10)[0] / scale)[: X.shape[1]])
 
 
 def _moved(evidence: PoseEvidence, X: Array, coefficients: Array) -> Array:

@@ -50,6 +50,16 @@ class PoseEvidence:
         return np.asarray(np.linalg.cholesky(self.covariance))
 
     @cached_property
+    def white_left(self) -> Array:
+        """(n, 6V) twists of the views in units of the null's scatter."""
+        return np.asarray(np.linalg.solve(self.half, self.channel.left))
+
+    @cached_property
+    def raw_white_z(self) -> Array:
+        """(n,) what was seen in those units, with all that hand-eye and model explain."""
+        return np.asarray(np.linalg.solve(self.half, self.channel.z))
+
+    @cached_property
     def white_model(self) -> Array:
         """(n, a) hand-eye and model in units of the null's scatter."""
         return np.asarray(np.linalg.solve(self.half, self.channel.left @ self.model))

@@ -11,16 +11,24 @@ from stitch.repeatability import covariance_of, estimate, pose_channel
 
 
 def whitened(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Columns of the hand-eye (N, 6) and of effects (N, P) in units of the pose scatter, all captures stacked."""
-    own, further = [], []
+    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Sequence[Array], values: Array,
+    free: Array,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """In units of the pose scatter, all captures stacked: columns of the hand-eye (N, 6) and of effects (N, P), z (N,).
+
+    Args:
+        values: (P,) of the effects at which the views were freed; z is what was seen without them.
+        free: (P,) bool: effects that explain scatter.
+    """
+    out = []
     for capture, f, extra in zip(captures, freed, columns, strict=True):
         channel = pose_channel(f.overlaps.gram, f.twists, capture.carriers(T_mount), capture.T_reference_flange)
-        half = np.linalg.cholesky(covariance_of(channel, estimate(channel)))
-        own.append(np.linalg.solve(half, channel.hand_eye))
-        further.append(np.linalg.solve(half, channel.left @ extra))
-    return np.concatenate(own), np.concatenate(further)
+        further = channel.left @ extra
+        half = np.linalg.cholesky(covariance_of(channel, estimate(channel, further[:, free])))
+        stack = np.column_stack([channel.hand_eye, further, channel.z + further @ values])
+        out.append(np.linalg.solve(half, stack))
+    everything = np.concatenate(out)
+    return everything[:, :6], everything[:, 6:-1], everything[:, -1]
 
 
 def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Array:

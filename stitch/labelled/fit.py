@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from stitch.effects.chain import Chain, Term, corrected
-from stitch.effects.visible import independent
 from stitch.errors import NoResultError
 from stitch.folds import grouped_folds, places
 from stitch.frames import Array, exp
@@ -14,12 +14,10 @@ from stitch.labelled.gross import Outlier, gross, outside
 from stitch.labelled.landmarks import Drawing, Landmarks, settled
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
 from stitch.labelled.solve import Blocks, whitener
-from stitch.stages.refine import UNSEEN, WEAK, with_values
+from stitch.stages.refine import CHOOSING, WEAK, fitted_parameters, with_values
 from stitch.variance import fit_variances
 
 _MAXIMUM_ITERATIONS = 12
-# Which parameters the views can know is settled early: a choice that changes with every step never ends.
-_CHOOSING = 3
 # Settled when no unknown moves by this share of its sigma.
 _SETTLED = 0.02
 
@@ -66,7 +64,7 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
     terms, history = list(terms), []
     parameters = [p for term in terms for p in chain.parameters(term.effect)]
     sizes, held = np.array([p.typical for p in parameters]), np.array([bool(p.grid) for p in parameters], bool)
-    variances = None
+    seen, variances = np.zeros(len(parameters), bool), None
     for index in range(_MAXIMUM_ITERATIONS):
         own = corrected(chain, terms, T_mount)
         rows = rows_of(own, T_mount, landmarks)
@@ -76,11 +74,12 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
         )
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
         base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
-        variances = fit_variances(evidence_of_rows(rows, np.concatenate([base, columns], axis=2)), start=variances,
-                                  both_starts=variances is None).variances  # fmt: skip
-        if index < _CHOOSING:
-            seen = _seen(rows, base, columns, sizes, variances)
-        blocks = _blocks(rows, np.concatenate([base, columns[..., seen]], axis=2), sizes[seen], values[seen], variances)
+        if index < CHOOSING:
+            whiten = partial(_whitened, rows, base, columns, values, variances)
+            seen = fitted_parameters(chain, terms, seen, sizes, whiten)
+        X = np.concatenate([base, columns[..., seen]], axis=2)
+        variances = _variances(rows, X, variances)
+        blocks = _blocks(rows, X, sizes[seen], values[seen], variances)
         x, covariance = blocks.solve(), blocks.estimates_covariance()
         a = base.shape[2]
         T_mount, landmarks = T_mount @ exp(x[:6]), landmarks.moved(x[6:a])
@@ -103,11 +102,25 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
     )  # fmt: skip
 
 
-def _seen(rows: Rows, base: Array, columns: Array, sizes: Array, variances: Array) -> Array:
-    """(P,) bool: parameters that the views can know beside hand-eye, landmarks and each other."""
-    half = whitener(evidence_of_rows(rows, base), variances)
-    own, further = ((half @ c).reshape(rows.left.size, c.shape[2]) for c in (base, columns))
-    return independent(own, further, sizes, 1 / UNSEEN)
+def _variances(rows: Rows, A: Array, start: Array | None) -> Array:
+    """(3,) by REML with the columns A (B, m, a) as free mean."""
+    return fit_variances(evidence_of_rows(rows, A), start=start, both_starts=start is None).variances
+
+
+def _whitened(
+    rows: Rows, base: Array, columns: Array, values: Array, start: Array | None, free: Array
+) -> tuple[Array, Array, Array]:
+    """In units of the scatter: columns of hand-eye and landmarks (N, a), of effects (N, P), and z (N,) without these.
+
+    Args:
+        values: (P,) of the effects at which the rows were taken.
+        free: (P,) bool: effects that explain scatter.
+    """
+    evidence = evidence_of_rows(rows, base)
+    half = whitener(evidence, _variances(rows, np.concatenate([base, columns[..., free]], axis=2), start))
+    z = evidence.z + columns @ values
+    own, further, seen = ((half @ c).reshape(rows.left.size, c.shape[2]) for c in (base, columns, z[..., None]))
+    return own, further, seen[:, 0]
 
 
 def _blocks(rows: Rows, X: Array, sizes: Array, values: Array, variances: Array) -> Blocks:

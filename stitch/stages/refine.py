@@ -1,13 +1,16 @@
 """Fit the hand-eye and the effects in use together: match anew, free the views, generalised least squares, repeat."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from stitch.capture import Capture
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import all_columns
+from stitch.effects.groups import one_by_one
+from stitch.effects.supported import supported
 from stitch.effects.visible import independent, whitened
 from stitch.frames import Array
 from stitch.free_poses import FreePoses, free_poses
@@ -19,6 +22,8 @@ from stitch.stages.correct import Correction
 _MAXIMUM_ITERATIONS = 6
 # Settled when no parameter moves by a twentieth of its sigma.
 _SETTLED = 0.05
+# Iterations in which it is still open what is fitted.
+CHOOSING = 2
 # A parameter that these views know worse than this many times its plausible size stays at zero: it would
 # only borrow from the hand-eye.
 UNSEEN = 4.0
@@ -58,12 +63,15 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
     parameters = [p for term in terms for p in chains[0].parameters(term.effect)]
     sizes = np.array([p.typical for p in parameters])
     held = np.array([bool(p.grid) for p in parameters], bool)
-    for _ in range(_MAXIMUM_ITERATIONS):
+    seen = np.zeros(len(parameters), bool)
+    for iteration in range(_MAXIMUM_ITERATIONS):
         captures, freed = _free(chains, terms, T_mount, gate)
         columns = [np.hstack([np.zeros((6 * len(c.scans), 0)), *all_columns(chain, terms, terms, T_mount, f)[0]])
                    for chain, c, f in zip(chains, captures, freed, strict=True)]  # fmt: skip
-        seen = independent(*whitened(captures, freed, T_mount, columns), sizes, 1 / UNSEEN)
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
+        if iteration < CHOOSING:
+            whiten = partial(whitened, captures, freed, T_mount, columns, values)
+            seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
         fitted = fit_hand_eye(
             captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen])
         )
@@ -83,6 +91,33 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
     cuts = np.cumsum([len(t.values) for t in terms], dtype=int)
     own = tuple(np.split(sigmas, cuts)[: len(terms)])
     return Refinement(fitted, tuple(terms), own, captures, tuple(freed), overlaps, tuple(history))
+
+
+def fitted_parameters(
+    chain: Chain, terms: Sequence[Term], before: Array, sizes: Array, whiten: Callable[[Array], tuple[Array, ...]]
+) -> Array:
+    """(P,) bool: parameters that the views support and can tell apart.
+
+    Args:
+        before: (P,) bool: what explained scatter so far.
+        sizes: (P,) plausible sizes.
+        whiten: from what explains scatter to whitened columns of the hand-eye (and landmarks), of the effects, and z.
+    """
+    groups, effects, at = list[list[int]](), list[int](), 0
+    for number, term in enumerate(terms):
+        own = one_by_one(term.effect, chain.parameters(term.effect))
+        groups += [[at + i for i in group] for group in own]
+        effects += [number] * len(own)
+        at += len(term.values)
+    if not groups:
+        return before
+    free = before
+    for _ in range(CHOOSING):
+        # What is found explains scatter, and less scatter shows more.
+        own_columns, further, z = whiten(free)
+        free = supported(own_columns, further, z, sizes, groups, effects)
+    own_columns, further, _ = whiten(free)
+    return np.logical_and(free, independent(own_columns, further * free, sizes, 1 / UNSEEN))
 
 
 def _free(

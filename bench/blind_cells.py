@@ -1,0 +1,110 @@
+"""Simulated cells of the blind benchmark: small clouds, plans kept, sizes that can be seen at the least."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from data_synth import kinematics, nature
+from data_synth.moment import Plan
+from data_synth.planning import plan_views
+from data_synth.scene import Scene, load_scene
+from data_synth.simulate import Measured, part_mesh, simulate
+from stitch import frames
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.effects import EFFECTS
+from stitch.effects.user_file import load
+from stitch.frames import Array
+
+# Evidence counts in views: a few thousand points a view show what millions would.
+_PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80}
+_FACTOR = 3.86 + 0.84  # z for 0.05 over two sides and about 20 tests, and for power 0.8
+_USER = Path(__file__).parents[1] / "examples" / "effects"
+# Laws without a counterpart in the library, and what a user would write for them.
+OUTSIDE = {"third_harmonic": "third_harmonic", "knock": "knock", "covariate_bias": "humidity_bias"}
+# Noise that the model does not have, each about as large as the scanner's own.
+HARD = {
+    "correlated field": {"field_error": 0.02},
+    "heavy tails": {"tail": 3.0},
+    "edge bias": {"edge_bias": 0.1},
+    "three times the repeatability": {"repeatability": 3.0},
+}
+HARD["all four"] = {key: value for kind in HARD.values() for key, value in kind.items()}
+LAST_JOINT = "the last joint alone"
+
+
+def scene_of(name: str, hard: str = "", useful: tuple[int, ...] = ()) -> Scene:
+    """A scene with small clouds; harder noise; joints whose errors nature may draw."""
+    scene = load_scene(name)
+    changes = dict(HARD[hard]) if hard else {}
+    factor = changes.pop("repeatability", 1.0)
+    scanner = replace(scene.scanner, columns=_PIXELS[name], rows=_PIXELS[name], **changes)
+    repeatability = (scene.repeatability[0] * factor, scene.repeatability[1] * factor)
+    return replace(scene, scanner=scanner, repeatability=repeatability, useful=useful or scene.useful)
+
+
+@cache
+def _planned(name: str, seed: int) -> tuple[Plan, Array]:
+    scene = load_scene(name)
+    return plan_views(scene, part_mesh(scene), scene.plan.views, np.random.default_rng([seed, 1]))
+
+
+def _last_joint_only(name: str, seed: int) -> tuple[Plan, Array]:
+    """The first view's joints, and the last joint turning on by 360° in all."""
+    plan, rail = _planned(name, seed)
+    joints = np.repeat(plan.joints[:1], len(plan.joints), axis=0)
+    joints[:, -1] += np.linspace(0, 2 * np.pi, len(joints), endpoint=False)
+    torque = kinematics.gravity_torques(plan.arm, joints)
+    return replace(plan, joints=joints, torque=torque), np.full_like(rail, rail[0])
+
+
+def measure(name: str, seed: int, hidden: dict[str, float], how: str = "", useful: tuple[int, ...] = ()) -> Measured:
+    """One session; `how` names hard noise or LAST_JOINT."""
+    alone = how == LAST_JOINT
+    planned = _last_joint_only(name, seed) if alone else _planned(name, seed)
+    planned = (replace(planned[0], useful=useful or planned[0].useful), planned[1])
+    return simulate(scene_of(name, "" if alone else how, useful), hidden, seed, planned=planned)
+
+
+def drawn(measured: Measured, laws: Sequence[str], seed: int) -> dict[str, dict[str, float]]:
+    """What nature draws for these laws, in this order, at amplitude 1 in this very cell."""
+    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, measured.plan, np.random.default_rng([seed, 2]))[1]
+
+
+def user_effect(law: str) -> str:
+    """Load the example that describes a law outside the library; its effect's name."""
+    return load(_USER / f"{OUTSIDE[law]}.py")[0]
+
+
+def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> float | None:
+    """Factor on the parameters `true` that is detectable at the least; None where cell or belief cannot hold it."""
+    if evidence.chain.lacks(EFFECTS[effect]) or not true:
+        return None
+    candidate = candidate_of(evidence, EFFECTS[effect])
+    if candidate is None:
+        return None
+    # The grid value nearest to the truth.
+    form = min(
+        (f for f in candidate.forms if f.keep.sum() == candidate.forms[0].keep.sum()),
+        key=lambda f: sum(
+            abs(v - true.get(p.name, v)) for p, v in zip(candidate.parameters, f.term.values, strict=True) if p.grid
+        ),
+    )
+    kept = [p for p, k in zip(candidate.parameters, form.keep, strict=True) if k]
+    theta = np.array([true.get(p.name, 0.0) for p in kept])
+    strength = float(np.linalg.norm(evidence.whiten_channel(form.columns) @ theta))
+    amplitude = _FACTOR / max(strength, 1e-12)
+    # Four times that must still be of a size that somebody would believe.
+    return amplitude if all(abs(t) * 4 * amplitude < p.limit for t, p in zip(theta, kept, strict=True)) else None
+
+
+def hand_eye_error(measured: Measured, T_mount: Array) -> float:
+    """Rms displacement (mm) of points of the field, half of it wide, by the error of the hand-eye."""
+    scanner = measured.scene.scanner
+    half = scanner.standoff * np.tan(np.radians(scanner.field_of_view / 4))
+    field = np.array([[x, y, scanner.standoff] for x in (-half, half) for y in (-half, half)])
+    moved = frames.transform(T_mount, field) - frames.transform(measured.T_mount, field)
+    return float(np.sqrt((moved**2).sum(axis=1).mean()))

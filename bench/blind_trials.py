@@ -1,0 +1,168 @@
+"""Trials of the blind benchmark: one simulated session each, a flat row of what came of it."""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from blind_cells import OUTSIDE, drawn, hand_eye_error, measure, smallest, user_effect
+
+from data_synth.nature import LAWS
+from data_synth.simulate import Measured
+from stitch.diagnosis.diagnose import Diagnosis, diagnose
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.start import evidence_of_state
+from stitch.diagnosis.suggest import suggest
+from stitch.effects import EFFECTS
+from stitch.errors import StitchError
+from stitch.pipeline import change, run
+from stitch.result import Run
+from stitch.state import State, state_of
+from stitch.threads import library_threads_off
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from in_memory import session_of
+
+Row = dict[str, Any]
+LIBRARY = tuple(name for name in LAWS if name in EFFECTS)
+
+
+def pin(core: int) -> None:
+    """One core a worker: a trial is too small to share out."""
+    os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[core % len(os.sched_getaffinity(0))]})
+    library_threads_off()
+
+
+def trial(job: Row) -> Row:
+    """Run one job {"part", "scene", "seed", …}; its row holds the job too."""
+    start = time.perf_counter()
+    try:
+        row = _PARTS[job["part"]](job)
+    except StitchError as error:
+        row = {"verdict": f"no result: {error}", "named": [], "follows": []}
+    return {**job, **row, "seconds": round(time.perf_counter() - start, 2)}
+
+
+@cache
+def _empty_cell(scene: str, seed: int, useful: tuple[int, ...] = ()) -> tuple[Measured, Run, PoseEvidence]:
+    """The same cell with nothing hidden: what can be seen in it, and its floor."""
+    measured = measure(scene, seed, {}, useful=useful)
+    calm = run(session_of(measured))
+    return measured, calm, evidence_of_state(state_of(calm))
+
+
+def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
+    """Amplitudes of the laws at the job's multiple of their smallest detectable size."""
+    measured, _, evidence = _empty_cell(job["scene"], job["seed"], tuple(job.get("useful", ())))
+    true = drawn(measured, laws, job["seed"])
+    out = {}
+    for law in laws:
+        effect = user_effect(law) if law in OUTSIDE else law
+        found = smallest(evidence, effect, true[law])
+        if law in OUTSIDE:
+            del EFFECTS[effect]
+        if found is None:
+            return None
+        out[law] = found * job["multiple"]
+    return out
+
+
+def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measured, Run, Diagnosis, Row]:
+    measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())))
+    first = run(session_of(measured))
+    found = diagnose(state_of(first))
+    ranked = [s.name for s in found.suspects if s.ranked.score.observable]
+    row = {
+        "hidden": {name: measured.hidden[name] for name in hidden}, "verdict": found.verdict,
+        "named": list(found.effects), "first": ranked[0] if ranked else None,
+        "p": min((s.ranked.adjusted for s in found.suspects if s.name in found.effects), default=1.0),
+        "follows": [d.covariate for d in found.depends_on[:3] if d.p_value < 0.05], "notes": list(found.notes),
+        "scatter": [found.rotation * 1e6, found.translation * 1e3],
+        "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.suspects[:3]],
+    }  # fmt: skip
+    return measured, first, found, row
+
+
+def _effect(job: Row) -> Row:
+    """One effect of the library; where it is named alone and clear, it is added too."""
+    hidden = _sizes(job, [job["effect"]])
+    if hidden is None:
+        return {"verdict": "not shown"}
+    measured, first, found, row = _diagnosed(job, hidden)
+    if job["multiple"] >= 2 and job["effect"] in found.effects:
+        row["added"] = _added(measured, first, change(state_of(first), [job["effect"]]), job)
+        if job["multiple"] == 4:
+            knowing = run(session_of(measured), effects=[job["effect"]])
+            row["added"]["knowing"] = knowing.heldout_rms
+    return row
+
+
+def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
+    """What the change brought: held-out residual, hand-eye against the truth, amplitudes in sigmas."""
+    true = measured.hidden[job["effect"]]
+    names = [p.name for p in added.chain.parameters(added.terms[0].effect) if not p.grid]
+    values = dict(zip([p.name for p in added.chain.parameters(added.terms[0].effect)], added.terms[0].values,
+                      strict=True))  # fmt: skip
+    sigmas = dict(zip([p.name for p in added.chain.parameters(added.terms[0].effect)], added.sigmas[0], strict=True))
+    return {
+        "heldout": [first.heldout_rms, added.heldout_rms],
+        "hand_eye": [hand_eye_error(measured, first.T_mount), hand_eye_error(measured, added.T_mount)],
+        "z": {n: (values[n] - true.get(n, 0.0)) / sigmas[n] for n in names if n in true and np.isfinite(sigmas[n])},
+        "unseen": [n for n in names if n in true and not np.isfinite(sigmas[n])],
+    }
+
+
+def _empty(job: Row) -> Row:
+    """Nothing hidden."""
+    return _diagnosed(job, {}, job["noise"])[3]
+
+
+def _alias(job: Row) -> Row:
+    """What these views cannot tell from the hand-eye, at a size of nature's own."""
+    _, _, found, row = _diagnosed(job, {job["effect"]: job["amplitude"]}, job["how"])
+    suspect = next((s for s in found.suspects if s.name == job["effect"]), None)
+    return {**row, "observable": bool(suspect and suspect.ranked.score.observable)}
+
+
+def _outside(job: Row) -> Row:
+    """A law without a name in the library; then its user writes it down."""
+    hidden = _sizes(job, [job["effect"]])
+    if hidden is None:
+        return {"verdict": "not shown"}
+    _, first, found, row = _diagnosed(job, hidden)
+    if found.verdict == "unknown_effect":
+        name = user_effect(job["effect"])
+        try:
+            again = diagnose(state_of(first))
+            added = change(state_of(first), [name])
+        finally:
+            del EFFECTS[name]
+        floor = _empty_cell(job["scene"], job["seed"])[1]
+        row["user"] = {
+            "named": list(again.effects), "heldout": [first.heldout_rms, added.heldout_rms, floor.heldout_rms],
+            "residual": [first.residual_rms, added.residual_rms, floor.residual_rms],
+        }  # fmt: skip
+    return row
+
+
+def _pair(job: Row) -> Row:
+    """Two effects at once."""
+    hidden = _sizes(job, job["effects"])
+    if hidden is None:
+        return {"verdict": "not shown"}
+    measured = measure(job["scene"], job["seed"], hidden)
+    state: State = state_of(run(session_of(measured)))
+    result, lines, last = suggest(state, 4)
+    return {
+        "hidden": dict(measured.hidden), "verdict": last.verdict, "named": list(last.effects),
+        "found": [] if result is None else list(result.effects), "lines": lines,
+    }  # fmt: skip
+
+
+_PARTS: dict[str, Callable[[Row], Row]] = {
+    "effects": _effect, "empty": _empty, "aliases": _alias, "outside": _outside, "pairs": _pair,
+}  # fmt: skip

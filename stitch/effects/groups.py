@@ -1,0 +1,25 @@
+"""Which parameters of an effect belong together: those of one joint, one number of a link, or all of them."""
+
+from collections.abc import Sequence
+
+from stitch.effects.contract import Effect, Parameter
+
+
+def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Indices of the parameters of each joint; empty for an effect without joints."""
+    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
+        return []
+    letters = sorted(effect.specs, key=len, reverse=True)
+    joints: dict[str, list[int]] = {}
+    for i, parameter in enumerate(parameters):
+        letter = next(name for name in letters if parameter.name.startswith(name))
+        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
+    return list(joints.values())
+
+
+def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """A partition into the smallest parts that can be true without the others."""
+    if effect.place == "links":
+        # One row of a table seldom is wrong altogether.
+        return [[i] for i in range(len(parameters))]
+    return by_joint(effect, parameters) or [list(range(len(parameters)))]
