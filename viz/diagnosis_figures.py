@@ -5,7 +5,6 @@ from matplotlib.figure import Figure
 
 from stitch.diagnosis.compare import Comparison, Table
 from stitch.diagnosis.diagnose import Diagnosis, Suspect
-from stitch.diagnosis.unknown import displacements
 from stitch.result import Step
 from viz.units import to_micrometres
 
@@ -151,7 +150,7 @@ def _against(ax, table: Table, um: float) -> None:
 def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     """How far every view sits from where the model puts it."""
     um = to_micrometres(length_unit)
-    moved = displacements(found.evidence) * um
+    moved = found.evidence.displaced() * um
     figure = Figure(figsize=(7, 2.3), layout="constrained")
     axes = figure.subplots()
     for i, (axis, colour) in enumerate(zip("xyz", (_RED, _GREEN, _BLUE), strict=True)):

@@ -66,7 +66,7 @@ def propose(evidence: PoseEvidence, selection: Selection) -> list[Proposal]:
     if pair is None:
         return []
     out = []
-    pose = _best_pose(evidence, *pair) if _can_move(evidence.chain) else None
+    pose = _best_pose(evidence, *pair) if _can_move(evidence.chain) and isinstance(evidence, PoseEvidence) else None
     names = (pair[0].name, pair[1].name)
     if pose is not None:
         joints, count = pose

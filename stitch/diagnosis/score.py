@@ -13,7 +13,7 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.frames import Array
 from stitch.variance import VarianceFit, fit_variances
 
@@ -25,6 +25,8 @@ _SEEN = 0.5
 _FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
 _HOPELESS = -4.0
+# With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do.
+_REFITTED, _FEWEST = 20_000, 2
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Score:
         return self.candidate.name
 
 
-def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
+def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     """Try all forms of a candidate.
 
     Args:
@@ -57,7 +59,12 @@ def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
     white = evidence.whiten(candidate.twists)[:, full.keep]
     seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
     detectable = _detectable(candidate, white, tests)
-    tried = [_try(evidence, form) for form in candidate.forms]
+    quick = np.array([_null_gain(evidence, form) for form in candidate.forms])
+    worth = np.argsort(-quick, kind="stable")[: max(_REFITTED // evidence.evidence.size, _FEWEST)]
+    tried = [
+        _try(evidence, form) if i in worth and quick[i] >= _HOPELESS else (float(quick[i]), 1.0, evidence.null)
+        for i, form in enumerate(candidate.forms)
+    ]
     singles = len(candidate.forms)
     best = max(range(singles), key=lambda i: tried[i][0])
     # The full forms share one half of the prior, the single joints the other.
@@ -70,13 +77,10 @@ def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
     return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain, detectable)
 
 
-def _try(evidence: PoseEvidence, form: Form) -> tuple[float, float, VarianceFit]:
+def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]:
     """Log evidence over the null, p-value and free fit of one form."""
     e = evidence.evidence
-    G = form.columns[None]
-    quick = _null_gain(evidence, form)
-    if quick < _HOPELESS:
-        return quick, 1.0, evidence.null
+    G = evidence.in_blocks(form.columns)
     integrated = fit_variances(e, G, form.sizes, start=evidence.null.variances)
     gain = 0.5 * (evidence.null.deviance - integrated.deviance)
     free = fit_variances(e, G, _FREE * form.sizes, start=integrated.variances)
@@ -87,7 +91,7 @@ def _try(evidence: PoseEvidence, form: Form) -> tuple[float, float, VarianceFit]
     return gain, float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest)), free
 
 
-def _null_gain(evidence: PoseEvidence, form: Form) -> float:
+def _null_gain(evidence: ViewEvidence, form: Form) -> float:
     """Log evidence gained at the null's variances: cheap, and an upper hand for what cannot help."""
     white = evidence.whiten_channel(form.columns) * form.sizes
     information = np.eye(white.shape[1]) + white.T @ white
@@ -112,7 +116,7 @@ def _detectable(candidate: Candidate, white: Array, tests: int) -> dict[str, flo
 
 
 def _fill(
-    evidence: PoseEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
+    evidence: ViewEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
     p: float, gain: float, detectable: dict[str, float],
 ) -> Score:  # fmt: skip
     a, size = evidence.evidence.A.shape[2], form.columns.shape[1]

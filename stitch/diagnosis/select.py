@@ -1,16 +1,14 @@
 """From scores to an answer: which effects are named, which cannot be told apart, whether something unknown is there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.score import ALPHA, Score, score
-from stitch.frames import Array
-from stitch.variance import fit_variances
 
 # Prior shares: nothing is missing, one effect of the library, something without a name.
 _NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
@@ -53,13 +51,13 @@ class Selection:
     second: Ranked | None = None  # a further effect that the views show beside the first
 
 
-def score_all(evidence: PoseEvidence, candidates: Sequence[Candidate]) -> list[Score]:
+def score_all(evidence: ViewEvidence, candidates: Sequence[Candidate]) -> list[Score]:
     """Scores in the order of the candidates."""
     tests = sum(c.effect.tier != "empirical" for c in candidates)
     return [score(evidence, c, tests) for c in candidates]
 
 
-def select(evidence: PoseEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
+def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = rank(score_all(evidence, candidates))
     best = next((r for r in ranked if _nameable(r)), None)
@@ -98,7 +96,7 @@ def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...
     return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
 
 
-def implausible(evidence: PoseEvidence, length_unit: str) -> bool:
+def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     """True if the poses scatter as no arm does."""
     rotation, translation = np.sqrt(evidence.null.variances[:2])
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
@@ -116,24 +114,11 @@ def _nameable(r: Ranked) -> bool:
     return r.physical and r.score.observable and likely and believable
 
 
-def _pair(evidence: PoseEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
+def _pair(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
     """The best effect and the one that explains most beside it; of the two the stronger comes first."""
     others = [c for c in candidates if c.name != best.name and c.effect.tier != "empirical"]
-    ranked, _ = rank(score_all(with_columns(evidence, best.score.form.columns), others))
+    ranked, _ = rank(score_all(evidence.beside(best.score.form.columns), others))
     second = next((r for r in ranked if _nameable(r)), None)
     if second is None:
         return best, None
     return best, second
-
-
-def with_columns(evidence: PoseEvidence, columns: Array) -> PoseEvidence:
-    """The evidence with further free columns (n, p) of the channel in its model."""
-    e = evidence.evidence
-    A = np.concatenate([e.A, columns[None]], axis=2)
-    more = replace(e, A=A)
-    # Twists of the model are read through `left`: the pseudo-inverse carries channel columns back to twists.
-    back = np.linalg.pinv(evidence.channel.left) @ columns
-    return replace(
-        evidence, model=np.hstack([evidence.model, back]), evidence=more,
-        null=fit_variances(more, start=evidence.null.variances),
-    )  # fmt: skip

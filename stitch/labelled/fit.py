@@ -89,7 +89,7 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
         terms = with_values(terms, values)
         if np.max(np.abs(x) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))) < _SETTLED:
             break
-    inflation = blocks.inflation(places(rows.capture.T_reference_mount, _lever(rows)), covariance)
+    inflation = blocks.inflation(places(rows.capture.T_reference_mount, rows.reach), covariance)
     covariance = covariance * inflation
     sigmas = np.full(len(values), np.nan)
     sigmas[seen] = np.sqrt(np.diag(covariance)[a:])
@@ -138,18 +138,12 @@ def _blocks(rows: Rows, X: Array, sizes: Array, values: Array, variances: Array)
 def _heldout(rows: Rows, blocks: Blocks) -> Array:
     """(V, S) distances of targets whose views were left out with their neighbours in time or pose."""
     square, count = np.zeros((2, *rows.distances(rows.left).shape))
-    for fold in grouped_folds(rows.capture.T_reference_mount, _lever(rows)):
+    for fold in grouped_folds(rows.capture.T_reference_mount, rows.reach):
         left = rows.left + blocks.X @ blocks.solve(fold)
         square[fold] += rows.distances(left)[fold] ** 2
         count[fold] += 1
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.sqrt(square / count)
-
-
-def _lever(rows: Rows) -> float:
-    """Distance of the targets from the flange: what a turn of it moves them by."""
-    away = np.linalg.norm(rows.centre - rows.capture.T_reference_flange[:, :3, 3], axis=1)
-    return float(max(np.median(away), 1e-9))
 
 
 def robust_fit(

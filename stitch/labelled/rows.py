@@ -40,6 +40,12 @@ class Rows:
         """(V, m) bool: rows of the views that were measured."""
         return np.asarray(self.noise[: len(self.lever)] > 0)
 
+    @property
+    def reach(self) -> float:
+        """Distance of the targets from the flange: what a turn of it moves them by."""
+        away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
+        return float(max(np.median(away), 1e-9))
+
     def by_twists(self, moved: Array) -> Array:
         """(B, m, P) of left twists (6V, P) of the views about the centre."""
         out = np.zeros((*self.left.shape, moved.shape[1]))

@@ -1,0 +1,50 @@
+"""A model of labelled points tried in the linear approximation."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.labelled.rows import Rows
+from stitch.labelled.solve import Blocks
+
+# Views of largest influence on the estimates: if one alone carries them, it is among these.
+_CARRIERS = 20
+
+
+@dataclass(frozen=True)
+class TargetTrial:
+    """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
+
+    rows: Rows
+    half: Array  # (B, m, m) inverse Cholesky factors of the blocks' covariance
+    covariance: Array  # (B, m, m)
+    X: Array
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        k = self.X.shape[2]
+        return Blocks(-self.rows.left, self.X, self.covariance, np.zeros(k), np.zeros(k))
+
+    def solve(self, left_out: Array | None) -> Array:
+        """Coefficients (k,) without some views."""
+        return self.blocks.solve(left_out)
+
+    def squares(self, coefficients: Array) -> Array:
+        """(V,) squares of the 3D distances of a view's targets."""
+        return np.asarray(np.nansum(self.rows.distances(self.rows.left + self.X @ coefficients) ** 2, axis=1))
+
+    def scatter(self, left_out: Array, coefficients: Array) -> float:
+        """Over the rows of the left-out views."""
+        rest = (self.rows.left + self.X @ coefficients)[left_out]
+        return float(np.sum(np.einsum("bij,bj->bi", self.half[left_out], rest) ** 2))
+
+    def carriers(self, coefficients: Array) -> Array:
+        """The views without which the coefficients would move most, to first order."""
+        b = self.blocks
+        pulls = b.vector - b.information @ coefficients
+        moves = pulls * b.scale @ np.linalg.pinv(
+            b.information.sum(axis=0) * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True
+        )
+        return np.argsort(-np.linalg.norm(moves[: len(self.rows.lever)], axis=1), kind="stable")[:_CARRIERS]
