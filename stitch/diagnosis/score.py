@@ -5,6 +5,7 @@ the Wald F test under the form's own REML; forms are counted (Bonferroni). The e
 integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,12 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     p_values = np.array([p for _, p, _ in tried])
     p = float(min(1.0, np.min(p_values / weights)))
     return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain, detectable)
+
+
+def promising(evidence: ViewEvidence, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """The candidates that gain most at the null's variances, with all their parameters or those of one joint."""
+    gains = [max(_null_gain(evidence, form) for form in c.forms) for c in candidates]
+    return [candidates[k] for k in np.argsort(-np.array(gains), kind="stable")[:count]]
 
 
 def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]:

@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.evidence import ViewEvidence
-from stitch.diagnosis.score import ALPHA, Score, score
+from stitch.diagnosis.score import ALPHA, Score, promising, score
 
 # Prior shares: nothing is missing, one effect of the library, something without a name.
 _NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
@@ -18,6 +18,10 @@ ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
 _ODDS = float(np.log(20.0))
 # Log evidence over "nothing is missing" that a name needs: 12 to 1.
 _GAIN = 2.5
+# Hundreds of views show several missing effects at once; among few, one is all that can be told.
+MANY = 100
+# Effects that are sought together, and candidates tried in earnest for each of them.
+_AT_ONCE, _TRIED = 5, 5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
@@ -68,15 +72,50 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
     if best is None:
         return Selection("unknown_effect", (), ranked, empirical)
     second = None
-    if stray is not None and stray.log_posterior > best.log_posterior + _ODDS:
+    if evidence.chain.views.count >= MANY:
+        chain, explained = _together(evidence, candidates, best)
+        best, second = chain[0], chain[1] if len(chain) > 1 else None
+        if stray is not None and stray.log_posterior > explained + _ODDS:
+            return Selection("unknown_effect", (), ranked, empirical)
+    elif stray is not None and stray.log_posterior > best.log_posterior + _ODDS:
         # Two known effects at once may look like none of them: try the best with a second one.
         best, second = _pair(evidence, candidates, best)
         together = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(_PHYSICAL / len(ranked)))
         if stray.log_posterior > together + _ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
-    group = tuple(r for r in ranked if _nameable(r) and r.log_posterior > best.log_posterior - _ODDS)
+    group = tuple(r for r in ranked if second is None and _nameable(r) and r.log_posterior > best.log_posterior - _ODDS)
     group = (best, *(r for r in group if r.name != best.name))
     return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second)
+
+
+def _together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[list[Ranked], float]:
+    """Effects that are missing at once, first the one without which most would stay unexplained; their log posterior.
+
+    One effect alone may explain more than each of two that are there, because it imitates a part of both. So
+    effects are added one by one as long as one can be named beside those before; then each must hold its
+    place beside all the others.
+    """
+    chain = [best]
+    while len(chain) < _AT_ONCE:
+        beside = _beside(evidence, chain)
+        others = [c for c in candidates if c.name not in {r.name for r in chain} and c.effect.tier != "empirical"]
+        ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
+        following = next((r for r in ranked if _nameable(r)), None)
+        if following is None:
+            break
+        chain.append(following)
+    explained = sum(r.log_posterior for r in chain)
+    for name in [r.name for r in chain]:
+        others_in = [r for r in chain if r.name != name]
+        candidate = next(c for c in candidates if c.name == name)
+        own = rank(score_all(_beside(evidence, others_in), [candidate]))[0][0]
+        chain = [*others_in, own] if _nameable(own) else others_in
+    return sorted(chain, key=lambda r: -r.log_posterior) or [best], explained
+
+
+def _beside(evidence: ViewEvidence, chain: Sequence[Ranked]) -> ViewEvidence:
+    columns = [r.score.form.columns for r in chain]
+    return evidence.beside(np.hstack(columns)) if columns else evidence
 
 
 def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:

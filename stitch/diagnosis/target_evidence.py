@@ -87,7 +87,7 @@ class TargetEvidence:
     def trial(self, response: Array, points: PointGram | None = None) -> TargetTrial:
         """A model with the columns of rows (n, k)."""
         covariance = self.evidence.covariance(self.null.variances)
-        return TargetTrial(self.rows, self.half, covariance, self.in_blocks(response))
+        return TargetTrial(self.rows, covariance, self.in_blocks(response))
 
     def touched(self, views: Array) -> Array:
         """(V,) bool."""

@@ -18,7 +18,6 @@ class TargetTrial:
     """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
 
     rows: Rows
-    half: Array  # (B, m, m) inverse Cholesky factors of the blocks' covariance
     covariance: Array  # (B, m, m)
     X: Array
 
@@ -36,9 +35,10 @@ class TargetTrial:
         return np.asarray(np.nansum(self.rows.distances(self.rows.left + self.X @ coefficients) ** 2, axis=1))
 
     def scatter(self, left_out: Array, coefficients: Array) -> float:
-        """Over the rows of the left-out views."""
-        rest = (self.rows.left + self.X @ coefficients)[left_out]
-        return float(np.sum(np.einsum("bij,bj->bi", self.half[left_out], rest) ** 2))
+        """Of the distances at the left-out views' targets, in units of the sensor's noise: each is seen as it is."""
+        own = self.rows.used[left_out, : self.rows.positions]
+        rest = (self.rows.left + self.X @ coefficients)[left_out, : self.rows.positions]
+        return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out, : self.rows.positions][own]))
 
     def carriers(self, coefficients: Array) -> Array:
         """The views without which the coefficients would move most, to first order."""
