@@ -73,6 +73,10 @@ class ViewEvidence(Protocol):
         """(B, m, P) columns as the variance components take them."""
         ...
 
+    def whiten_raw(self, columns: Array) -> Array:
+        """(n, P) columns in units of the null's scatter."""
+        ...
+
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns in units of the null's scatter, what the model explains projected out."""
         ...

@@ -70,9 +70,13 @@ class PoseEvidence:
         """(n,) what was seen, in the same units, without what hand-eye and model explain."""
         return self.whiten_channel(self.channel.z[:, None])[:, 0]
 
+    def whiten_raw(self, columns: Array) -> Array:
+        """(n, P) columns of the channel in those units."""
+        return np.asarray(np.linalg.solve(self.half, columns), float)
+
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns of the channel in those units, what hand-eye and model explain projected out."""
-        return project_out(self.white_model, np.asarray(np.linalg.solve(self.half, columns), float))
+        return project_out(self.white_model, self.whiten_raw(columns))
 
     def whiten(self, twists: Array) -> Array:
         """The same from twists (6V, P)."""

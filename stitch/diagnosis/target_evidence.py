@@ -12,7 +12,7 @@ from stitch.effects.columns import PointGram
 from stitch.effects.visible import independent
 from stitch.folds import grouped_folds
 from stitch.frames import Array
-from stitch.labelled.landmarks import Drawing, settled
+from stitch.labelled.landmarks import Drawing, Landmarks, settled
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
 from stitch.labelled.solve import whitener
 from stitch.stages.refine import UNSEEN
@@ -27,6 +27,7 @@ class TargetEvidence:
     terms: tuple[Term, ...]
     T_mount: Array
     rows: Rows
+    landmarks: Landmarks
     model: Array  # (n, a) of hand-eye, landmarks and effects in use that the views can see
     evidence: Evidence
     null: VarianceFit
@@ -52,7 +53,7 @@ class TargetEvidence:
     @cached_property
     def white_model(self) -> Array:
         """(n, a) hand-eye, landmarks and model in units of the null's scatter."""
-        return self._white(self.model)
+        return self.whiten_raw(self.model)
 
     @cached_property
     def _explained(self) -> Array:
@@ -66,12 +67,13 @@ class TargetEvidence:
         """(n,) what was seen, in the same units, without what the model explains."""
         return self.whiten_channel(-self.rows.left.reshape(-1, 1))[:, 0]
 
-    def _white(self, columns: Array) -> Array:
+    def whiten_raw(self, columns: Array) -> Array:
+        """(n, P) columns in those units."""
         return np.asarray((self.half @ self.in_blocks(columns)).reshape(columns.shape))
 
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns in those units, what the model explains projected out."""
-        white = self._white(columns)
+        white = self.whiten_raw(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
     def whiten(self, response: Array) -> Array:
@@ -117,7 +119,8 @@ def target_evidence(chain: Chain, terms: Sequence[Term], T_mount: Array, drawing
         chain: with the sightings that count.
     """
     own = corrected(chain, terms, T_mount)
-    rows = rows_of(own, T_mount, settled(own, T_mount, drawing))
+    landmarks = settled(own, T_mount, drawing)
+    rows = rows_of(own, T_mount, landmarks)
     base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
     extra = np.concatenate([base[..., :0], *(effect_rows(rows, chain, terms, t) for t in terms)], axis=2)
     sizes = np.array([p.typical for t in terms for p in chain.parameters(t.effect)])
@@ -132,4 +135,4 @@ def target_evidence(chain: Chain, terms: Sequence[Term], T_mount: Array, drawing
     A = np.concatenate([base, extra[..., seen]], axis=2)
     evidence = evidence_of_rows(rows, A)
     null = fit_variances(evidence, both_starts=True)
-    return TargetEvidence(chain, tuple(terms), T_mount, rows, A.reshape(n, -1), evidence, null)
+    return TargetEvidence(chain, tuple(terms), T_mount, rows, landmarks, A.reshape(n, -1), evidence, null)
