@@ -28,6 +28,8 @@ def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> t
             of the scanner is not mistaken for the translation it causes at the part.
     """
     size = 2 * float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets])) / 2
+    # A probe is a point: a tenth of its distance stands in for its size.
+    size = size or 0.1 * float(np.linalg.norm(centre))
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
     total, views = np.zeros((6, 6)), 0

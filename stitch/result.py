@@ -13,9 +13,9 @@ from stitch.repeatability import Repeatability
 from stitch.session import Session
 
 if TYPE_CHECKING:
+    from stitch.diagnosis.diagnose import Diagnosis
     from stitch.labelled.fit import LabelledFit
     from stitch.labelled.gross import Outlier
-    from stitch.diagnosis.diagnose import Diagnosis
 
 
 @dataclass(frozen=True)

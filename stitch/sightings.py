@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices
+from stitch.frames import Array, Indices, Mask
 from stitch.robot import METRES
 from stitch.session import Session
 
@@ -24,14 +24,14 @@ class Sightings:
     target: Indices  # (V, S) which target sits in a slot; −1 in an empty one
     points: Array  # (V, S, 3); zero in an empty slot
     sigma: Array  # (V, S) of a coordinate
-    used: Array  # (V, S) bool: seen, and not an outlier
+    used: Mask  # (V, S): seen, and not an outlier
     rotation: Array | None = None  # (V, 3, 3) of a 6D probe, R_sensor_probe
     sigma_rotation: Array | None = None  # (V,)
 
     @property
-    def seen(self) -> Array:
+    def seen(self) -> Indices:
         """(K,) number of views that use each target."""
-        return np.bincount(self.target[self.used], minlength=len(self.targets))
+        return np.asarray(np.bincount(self.target[self.used], minlength=len(self.targets)), np.int64)
 
     @property
     def everything(self) -> "Sightings":

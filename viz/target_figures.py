@@ -30,7 +30,7 @@ def sticks(run: Run) -> Figure:
 
 
 def errors(run: Run) -> Figure:
-    """3D distance of the targets under the model, in the order of views, and as a distribution with the left-out one."""
+    """3D distance of the targets under the model, in the order of views and as a distribution."""
     assert run.labelled is not None
     um, rows = to_micrometres(run.session.length_unit), run.labelled.rows
     distances = rows.distances(rows.left) * um

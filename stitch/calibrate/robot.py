@@ -90,7 +90,7 @@ def poses_to_add(run: Run) -> Array:
     if found is None or not run.terms:
         return np.zeros((0, run.chain.views.joints.shape[1]))
     joints = nearby(run.chain)[:_TRIED]
-    rows, columns, covariance = imagined_rows(
+    _, columns, covariance = imagined_rows(
         imagined_chain(run.chain, joints), found.rows, found.landmarks, found.variances, run.terms
     )
     keep = np.concatenate([np.isfinite(s) for s in run.sigmas])

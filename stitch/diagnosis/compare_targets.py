@@ -53,9 +53,7 @@ def _offsets(state: State) -> _Offsets:
     diagonal = np.zeros((*rows.left.shape, rows.left.shape[1]))
     diagonal[:, np.arange(rows.left.shape[1]), np.arange(rows.left.shape[1])] = rows.noise + rows.fixed
     k = rows.landmarks.shape[2]
-    left = rows.left + rows.landmarks @ Blocks(
-        -rows.left, rows.landmarks, diagonal, np.zeros(k), np.zeros(k)
-    ).solve()
+    left = rows.left + rows.landmarks @ Blocks(-rows.left, rows.landmarks, diagonal, np.zeros(k), np.zeros(k)).solve()
     v, slot = np.nonzero(s.used)
     offset = left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
     return _Offsets(v, s.target[v, slot], offset, s.points[v, slot], len(s.used))
@@ -70,26 +68,37 @@ def _table(
     rows: _Offsets, name: str, unit: str, bins: Indices, edges: tuple[Array, Array], labels: Sequence[str]
 ) -> Table:
     size = len(edges[0])
-    count = np.bincount(bins, minlength=size)
+    count = np.asarray(np.bincount(bins, minlength=size), float)
     share = np.maximum(count, 1)
     mean = np.stack([np.bincount(bins, rows.offset[:, i], size) for i in range(3)], axis=1) / share[:, None]
     square = np.bincount(bins, np.sum(rows.offset**2, axis=1), size) / share
     direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
     along = rows.offset @ direction
-    views = np.array([len(np.unique(rows.view[bins == b])) for b in range(size)])
+    views = np.array([len(np.unique(rows.view[bins == b])) for b in range(size)], float)
     signed = np.bincount(bins, along, size) / share
     # The sample is a view: the mean of its targets in the bin, spread about the bin's mean.
     key = bins * rows.views + rows.view
     n = np.bincount(key, minlength=size * rows.views).reshape(size, rows.views)
     of_view = np.bincount(key, along, size * rows.views).reshape(n.shape) / np.maximum(n, 1)
-    distance = np.bincount(key, np.linalg.norm(rows.offset, axis=1), size * rows.views).reshape(n.shape) / np.maximum(n, 1)
+    distance = np.bincount(key, np.linalg.norm(rows.offset, axis=1), size * rows.views).reshape(n.shape) / np.maximum(
+        n, 1
+    )
     sigmas = [
         np.sqrt(np.where(n > 0, (x - m[:, None]) ** 2, 0).sum(axis=1) / np.maximum(views - 1, 1) / np.maximum(views, 1))
         for x, m in ((of_view, signed), (distance, np.sqrt(square)))
     ]
     unknown = np.where(views > 1, 1.0, np.nan)
     return Table(
-        name, unit, *edges, tuple(labels), signed, sigmas[0] * unknown, np.sqrt(square), sigmas[1] * unknown, count, views
+        name,
+        unit,
+        *edges,
+        tuple(labels),
+        signed,
+        sigmas[0] * unknown,
+        np.sqrt(square),
+        sigmas[1] * unknown,
+        count,
+        views,
     )
 
 

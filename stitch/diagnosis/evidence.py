@@ -9,7 +9,7 @@ from typing import Protocol
 
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.variance import Evidence, VarianceFit
 
 
@@ -28,7 +28,7 @@ class Trial(Protocol):
         """Sum of squares by which left-out views lie off, in units of their scatter."""
         ...
 
-    def carriers(self, coefficients: Array) -> Array:
+    def carriers(self, coefficients: Array) -> Indices:
         """Views of which one alone could carry the coefficients."""
         ...
 

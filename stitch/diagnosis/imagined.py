@@ -46,8 +46,8 @@ def imagine_poses(evidence: PoseEvidence, a: Score, b: Score) -> Imagined | None
     carrier = placed(chain, ())[0] @ evidence.T_mount
     own = frames.adjoint(frames.make(np.eye(3), -evidence.freed.overlaps.gram.centre) @ carrier)
     extra = np.zeros((len(joints), 6, evidence.white_model.shape[1] - 6))
-    rows = [_rows(evidence, chain, s) for s in (a, b)]
-    return Imagined(joints, np.concatenate([own, extra], axis=2), *rows, _view_scatter(evidence, chain))
+    model, of_a, of_b = np.concatenate([own, extra], axis=2), _rows(evidence, chain, a), _rows(evidence, chain, b)
+    return Imagined(joints, model, of_a, of_b, _view_scatter(evidence, chain))
 
 
 def imagine_targets(evidence: TargetEvidence, a: Score, b: Score) -> Imagined:
@@ -55,13 +55,11 @@ def imagine_targets(evidence: TargetEvidence, a: Score, b: Score) -> Imagined:
     joints = nearby(evidence.chain)[:_TRIED]
     chain = imagined_chain(evidence.chain, joints)
     terms = [with_values(s.form, np.zeros(len(s.values))) for s in (a, b)]
-    rows, columns, covariance = imagined_rows(
-        chain, evidence.rows, evidence.landmarks, evidence.null.variances, terms
-    )
+    rows, columns, covariance = imagined_rows(chain, evidence.rows, evidence.landmarks, evidence.null.variances, terms)
     extra = np.zeros((*rows.left.shape, evidence.model.shape[1] - 6 - rows.landmarks.shape[2]))
     model = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
     free = [c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True)]
-    return Imagined(joints, model, free[0], free[1], np.linalg.cholesky(covariance))
+    return Imagined(joints, model, free[0], free[1], np.asarray(np.linalg.cholesky(covariance), float))
 
 
 # The two kinds of evidence, and how each imagines a view.

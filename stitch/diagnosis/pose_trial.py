@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stitch.effects.columns import PointGram
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.solve import pair_squares
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ class PoseTrial:
         own = _orthonormal(e.white_left[:, _columns_of(left_out)])
         return float(np.sum((own.T @ (e.raw_white_z - e.white_left @ (self.X @ coefficients))) ** 2))
 
-    def carriers(self, coefficients: Array) -> Array:
+    def carriers(self, coefficients: Array) -> Indices:
         """All views."""
-        return np.arange(self.evidence.freed.overlaps.gram.views)
+        return np.arange(self.evidence.freed.overlaps.gram.views, dtype=np.int64)
 
     def _moved(self, X: Array, coefficients: Array) -> Array:
         return np.asarray((X @ coefficients).reshape(-1, 6) - self.evidence.freed.twists)

@@ -21,7 +21,7 @@ _GAIN = 2.5
 # Hundreds of views show several missing effects at once; among few, one is all that can be told.
 MANY = 100
 # Effects that are sought together, and candidates tried in earnest for each of them.
-_AT_ONCE, _TRIED = 5, 5
+_AT_ONCE, _TRIED = 6, 5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.labelled.rows import Rows
 from stitch.labelled.solve import Blocks
 
@@ -40,11 +40,14 @@ class TargetTrial:
         rest = (self.rows.left + self.X @ coefficients)[left_out, : self.rows.positions]
         return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out, : self.rows.positions][own]))
 
-    def carriers(self, coefficients: Array) -> Array:
+    def carriers(self, coefficients: Array) -> Indices:
         """The views without which the coefficients would move most, to first order."""
         b = self.blocks
         pulls = b.vector - b.information @ coefficients
-        moves = pulls * b.scale @ np.linalg.pinv(
-            b.information.sum(axis=0) * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True
+        moves = (
+            pulls
+            * b.scale
+            @ np.linalg.pinv(b.information.sum(axis=0) * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
         )
-        return np.argsort(-np.linalg.norm(moves[: len(self.rows.lever)], axis=1), kind="stable")[:_CARRIERS]
+        sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
+        return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)

@@ -90,7 +90,7 @@ def chain_of(session: Session, capture: Capture) -> Chain:
         gravity = session.robot.gravity / np.linalg.norm(session.robot.gravity)
     down = frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0] if eye_to_hand else None
     intensity = _intensities(session)
-    size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets]))
+    size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     scan_views = tuple(
         ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v],
                  gravity if down is None else down[v], size)
@@ -242,9 +242,7 @@ def target_shifts(chain: Chain, terms: Sequence[Term], term: Term, poses: Array)
     return _slopes(chain, terms, term, lambda with_step: shift_targets(chain, with_step, poses))
 
 
-def _slopes(
-    chain: Chain, terms: Sequence[Term], term: Term, moved: Callable[[Sequence[Term]], Array]
-) -> Array:
+def _slopes(chain: Chain, terms: Sequence[Term], term: Term, moved: Callable[[Sequence[Term]], Array]) -> Array:
     """Central differences of `moved` in each parameter of `term`."""
     others = [t for t in terms if t.effect.name != term.effect.name]
     out = []

@@ -31,8 +31,9 @@ EVERY_VIEW = (-1.0,)
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Units are written for millimetres; a session in metres has the same unit with m.
 _PER_MM = {"mm": 1.0, "m": 1e-3}
-# What a link and all that it carries may well weigh, kg, where nobody states it.
-_LINK_MASS = 10.0
+# What a link and all that it carries may well weigh, kg, where nobody states it; and how much more than is
+# believable for a known mass the product of mass and compliance may be, for light and soft arms too.
+_LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,11 @@ class Effect:
                 names = {"number": [key], "joint": [f"{key}{i + 1}" for i in range(joints)],
                          "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
                 # A torque between two joints is that of 1 kg there; the link's mass is in the coefficient.
-                mass = [_LINK_MASS if spec.kind == "torque" and "_" in n[len(key) :] else 1.0 for n in names]
-                out += [_in_unit(n, spec.unit, m * spec.typical, m * spec.limit, spec.grid, length_unit)
-                        for n, m in zip(names, mass, strict=True)]  # fmt: skip
+                for name in names:
+                    massless = spec.kind == "torque" and "_" in name[len(key) :]
+                    typical, limit = (_LINK_MASS, _LINK_MASS_LIMIT) if massless else (1.0, 1.0)
+                    out.append(_in_unit(name, spec.unit, typical * spec.typical, limit * spec.limit, spec.grid,
+                                        length_unit))  # fmt: skip
         return tuple(out)
 
     def arguments(self, values: Array, joints: int, torques: int) -> dict[str, Any]:

@@ -64,7 +64,8 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
     terms, history = list(terms), []
     parameters = [p for term in terms for p in chain.parameters(term.effect)]
     sizes, held = np.array([p.typical for p in parameters]), np.array([bool(p.grid) for p in parameters], bool)
-    seen, variances = np.zeros(len(parameters), bool), None
+    seen: Array = np.zeros(len(parameters), bool)
+    start: Array | None = None
     for index in range(_MAXIMUM_ITERATIONS):
         own = corrected(chain, terms, T_mount)
         rows = rows_of(own, T_mount, landmarks)
@@ -75,16 +76,16 @@ def fit(chain: Chain, terms: Sequence[Term], T_mount: Array, landmarks: Landmark
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
         base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
         if index < CHOOSING:
-            whiten = partial(_whitened, rows, base, columns, values, variances)
+            whiten = partial(_whitened, rows, base, columns, values, start)
             seen = fitted_parameters(chain, terms, seen, sizes, whiten)
         X = np.concatenate([base, columns[..., seen]], axis=2)
-        variances = _variances(rows, X, variances)
+        variances = start = _variances(rows, X, start)
         blocks = _blocks(rows, X, sizes[seen], values[seen], variances)
         x, covariance = blocks.solve(), blocks.estimates_covariance()
         a = base.shape[2]
         T_mount, landmarks = T_mount @ exp(x[:6]), landmarks.moved(x[6:a])
         # What the views cannot see stays at zero; the time of an event stays where it was found.
-        values[~held & ~seen] = 0.0
+        values[np.logical_not(held | seen)] = 0.0
         values[seen] += x[a:]
         terms = with_values(terms, values)
         if np.max(np.abs(x) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))) < _SETTLED:
@@ -143,7 +144,7 @@ def _heldout(rows: Rows, blocks: Blocks) -> Array:
         square[fold] += rows.distances(left)[fold] ** 2
         count[fold] += 1
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(square / count)
+        return np.asarray(np.sqrt(square / count))
 
 
 def robust_fit(
@@ -165,9 +166,7 @@ def robust_fit(
     return without_gross(chain, examine)
 
 
-def without_gross(
-    chain: Chain, examine: Callable[[Chain], LabelledFit]
-) -> tuple[LabelledFit, Chain, list[Outlier]]:
+def without_gross(chain: Chain, examine: Callable[[Chain], LabelledFit]) -> tuple[LabelledFit, Chain, list[Outlier]]:
     """Examine a chain, take out what is off, and again, until nothing is.
 
     Raises:

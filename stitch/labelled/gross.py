@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices, Mask
 from stitch.labelled.rows import Rows, evidence_of_rows
 
 # Six times the usual deviation: one in a thousand million of honest Gaussian errors, and still outside the
@@ -35,7 +35,7 @@ def gross(rows: Rows, variances: Array) -> list[Outlier]:
     sightings = rows.capture.sightings
     assert sightings is not None
     V, S = sightings.used.shape
-    P = np.linalg.inv(evidence_of_rows(rows, rows.hand_eye).covariance(variances)[:V])
+    P = np.asarray(np.linalg.inv(evidence_of_rows(rows, rows.hand_eye).covariance(variances)[:V]), float)
     left = rows.left[:V]
     slots, apart = _slot_deviations(P, left, S)
     slots[~sightings.used] = np.nan
@@ -69,7 +69,7 @@ def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
     return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
 
 
-def outside(used: Array, found: list[Outlier], targets: tuple[str, ...], target: Array) -> Array:
+def outside(used: Mask, found: list[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
     """(V, S) bool: what is in use without the outliers."""
     used = used.copy()
     for o in found:

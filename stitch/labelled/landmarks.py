@@ -36,7 +36,7 @@ class Landmarks:
         return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
 
     def moved(self, by: Array) -> "Landmarks":
-        """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing about the origin."""
+        """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing."""
         split = self.positions.size
         orientation, T, at = self.orientation, self.T_reference_part, split
         if orientation is not None:

@@ -15,7 +15,7 @@ from stitch import frames
 from stitch.capture import Capture
 from stitch.effects.chain import Chain, Term, target_shifts, twists
 from stitch.effects.columns import POINTS
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.labelled.landmarks import Landmarks
 from stitch.variance import Evidence
 
@@ -36,7 +36,7 @@ class Rows:
     positions: int  # the first 3S rows of a view are coordinates
 
     @property
-    def used(self) -> Array:
+    def used(self) -> Mask:
         """(V, m) bool: rows of the views that were measured."""
         return np.asarray(self.noise[: len(self.lever)] > 0)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.capture import Capture
-from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.chain import Chain, Term
 from stitch.effects.terms import empty_term, known, terms_of
 from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of, robust_fit, without_gross
@@ -86,7 +86,9 @@ def finish_labelled(
     corrections = frames.log(poses @ frames.inverse(poses_model))
     stages = [
         before,
-        StageResult("correct", found.rms, count, len(found.history), seconds, "3D distance of targets from their place"),
+        StageResult(
+            "correct", found.rms, count, len(found.history), seconds, "3D distance of targets from their place"
+        ),
         StageResult("register", rms_of(after), count, 1, clock.lap(), "each view moved by its own most likely error"),
     ]
     recorder.stage(stages[1], poses_model, list(distances))
@@ -95,8 +97,7 @@ def finish_labelled(
     scatter = scatter_from(found.variances)
     with_joints = session.robot is not None and all(view.joints is not None for view in session.views)
     joints = np.array([view.joints for view in session.views]) if with_joints else None
-    with np.errstate(invalid="ignore"):
-        per_view = np.sqrt(np.nanmean(np.where(np.isfinite(distances), distances, np.nan) ** 2, axis=1))
+    per_view = np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(np.isfinite(distances).sum(axis=1), 1))
     return Run(
         session=session, chain=chain, T_mount=found.T_mount, T_mount_coarse=T_coarse, mount_covariance=found.covariance,
         unobservable=unobservable([own], found.T_mount, session.robot, joints),

@@ -45,11 +45,12 @@ class Blocks:
         """(B, k) XᵀWz of every block."""
         return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z))
 
-    def solve(self, left_out: Indices | None = None) -> Array:
+    def solve(self, left_out: Array | Indices | None = None) -> Array:
         """(k,) estimates, without some blocks."""
         M, b = self.information.sum(axis=0), self.vector.sum(axis=0)
         if left_out is not None:
-            M, b = M - self.information[left_out].sum(axis=0), b - self.vector[left_out].sum(axis=0)
+            out = np.asarray(left_out, np.int64)
+            M, b = M - self.information[out].sum(axis=0), b - self.vector[out].sum(axis=0)
         inverse = _inverse(M + np.diag(self.precision), self.scale)
         return np.asarray(inverse @ (b + self.pull))
 

@@ -11,7 +11,7 @@ from stitch import frames
 from stitch.calibrate.axzb import shah
 from stitch.capture import Capture
 from stitch.errors import NoResultError
-from stitch.frames import Array
+from stitch.frames import Array, Indices, Mask
 
 _REWEIGHTED = 12
 # Singular values of the equilibrated system below this share of the largest: the motions do not show it all.
@@ -27,7 +27,7 @@ def closed_form(capture: Capture) -> Array:
     s = capture.sightings
     assert s is not None
     if s.rotation is not None:
-        return _from_probe(capture, s.points[:, 0], s.rotation, s.used.any(axis=1))
+        return _from_probe(capture, s.points[:, 0], s.rotation, np.asarray(s.used.any(axis=1)))
     v, slot = np.nonzero(s.used)
     L, p, target = capture.T_reference_mount[v], s.points[v, slot], s.target[v, slot]
     scale = float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()) or 1.0
@@ -37,7 +37,7 @@ def closed_form(capture: Capture) -> Array:
     return frames.make(R, t - R @ offset)
 
 
-def _solve(L: Array, p: Array, target: Array, targets: int, R: Array | None) -> Array:
+def _solve(L: Array, p: Array, target: Indices, targets: int, R: Array | None) -> Array:
     """The rotation (3, 3) from all unknowns, or the translation (3, 1) with the rotation known.
 
     Args:
@@ -77,9 +77,7 @@ def _solve(L: Array, p: Array, target: Array, targets: int, R: Array | None) -> 
     return np.asarray(x[:3, None])
 
 
-def _from_probe(capture: Capture, points: Array, rotation: Array, used: Array) -> Array:
-    """T_mount·T_sensor_probe = (T_reference_mount)⁻¹·T_reference_probe, which is A·X = Z·B for A the mount's inverse."""
+def _from_probe(capture: Capture, points: Array, rotation: Array, used: Mask) -> Array:
+    """T_mount·T_sensor_probe = T_reference_mount⁻¹·T_reference_probe is A·X = Z·B for A = T_reference_mount⁻¹."""
     A = frames.inverse(capture.T_reference_mount[used])
-    X, Z = shah(A, frames.make(rotation[used], points[used]))
-    del X
-    return Z
+    return shah(A, frames.make(rotation[used], points[used]))[1]

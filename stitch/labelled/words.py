@@ -22,8 +22,9 @@ def sentence(found: LabelledFit, after: float, floor: float, scatter: Repeatabil
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (
-        f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; the sensor's "
-        f"own noise would leave {noise}. The robot's poses scatter by {scatter.translation * to_um:.3g} µm and "
+        f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; "
+        f"the sensor's own noise would leave {noise}. The robot's poses scatter by "
+        f"{scatter.translation * to_um:.3g} µm and "
         f"{scatter.rotation * 1e3:.2g} mrad; moving each view by its own correction leaves {after * to_um:.3g} µm."
     )
 
@@ -43,8 +44,8 @@ def notes_of(found: LabelledFit, outliers: Sequence[Outlier], session: Session) 
         notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(once)}.")
     if found.inflation > 2.5:
         notes.append(
-            f"Views near each other err alike: all sigmas are {np.sqrt(found.inflation):.1f} times those of independent "
-            "pose errors."
+            f"Views near each other err alike: all sigmas are {np.sqrt(found.inflation):.1f} times those of "
+            "independent pose errors."
         )
     return tuple(notes)
 
