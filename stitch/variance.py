@@ -159,4 +159,5 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
 
 def _gram(X: Array, Y: Array) -> Array:
     """(a, c) Σ over blocks of XᵀY, for (B, m, a) and (B, m, c)."""
-    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
+    rows = X.shape[0] * X.shape[1]
+    return np.asarray(X.reshape(rows, X.shape[2]).T @ Y.reshape(rows, Y.shape[2]))

@@ -57,7 +57,7 @@ def cell(
     rng = np.random.default_rng(seed)
     joints = rng.uniform(-1.2, 1.2, (views, 6))
     T_mount = pose(rng, 2000 if mount == "eye_to_hand" else 60)
-    places = targets if mount == "eye_to_hand" else targets + [450.0, 100.0, 200.0]
+    places = targets if mount == "eye_to_hand" else targets + np.array([450.0, 100.0, 200.0])
     turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
     rows = []
     for v, q in enumerate(joints):
