@@ -1,4 +1,4 @@
-"""Scans of one session with the robot's poses: what every stage after reading works on."""
+"""Scans and labelled points of one session with the robot's poses: what every stage after reading works on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +9,7 @@ from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.scan import Scan, prepare
 from stitch.session import Session
+from stitch.sightings import Sightings, sightings_of
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,14 @@ class Capture:
     T_reference_mount: Array  # (V, 4, 4) from the robot
     T_reference_flange: Array  # (V, 4, 4) carries a twist of the flange into the reference frame
     T_behind_mount: Array | None = None  # (V, 4, 4) what moves the scanner on its mount; None: nothing does
+    sightings: Sightings | None = None  # labelled points; scans may be empty then
+
+    @property
+    def point_sets(self) -> list[Array]:
+        """Per view the points (N, 3) that it shows, scanner frame: of its scan, or its labelled ones."""
+        if self.scans or self.sightings is None:
+            return [scan.points for scan in self.scans]
+        return self.sightings.sets()
 
     @property
     def spacing(self) -> float:
@@ -48,18 +57,26 @@ class Capture:
             T_reference_mount=self.T_reference_mount[keep],
             T_reference_flange=self.T_reference_flange[keep],
             T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],
+            sightings=None if self.sightings is None else self.sightings.without(left_out),
         )
 
 
 def capture(session: Session) -> Capture:
-    """Prepare the scans of a cloud session and place them on the chain of frames."""
+    """Prepare the scans and labelled points of a session and place them on the chain of frames.
+
+    Raises:
+        NoResultError: labelled points of which no target is seen twice.
+    """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    return place(session.name, prepare(session), T_base_flange, session.mount)
+    scans = prepare(session) if session.has_clouds else ()
+    return place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
 
 
-def place(name: str, scans: Sequence[Scan], T_base_flange: Array, mount: str) -> Capture:
-    """A capture from scans and flange poses (V, 4, 4)."""
+def place(
+    name: str, scans: Sequence[Scan], T_base_flange: Array, mount: str, sightings: Sightings | None = None
+) -> Capture:
+    """A capture from scans, labelled points and flange poses (V, 4, 4)."""
     if mount == "eye_in_hand":
-        return Capture(name, tuple(scans), T_base_flange, T_base_flange)
+        return Capture(name, tuple(scans), T_base_flange, T_base_flange, sightings=sightings)
     still = np.broadcast_to(np.eye(4), T_base_flange.shape)
-    return Capture(name, tuple(scans), frames.inverse(T_base_flange), still)
+    return Capture(name, tuple(scans), frames.inverse(T_base_flange), still, sightings=sightings)

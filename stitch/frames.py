@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 # Positions in other arrays.
 Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 # Below this angle (rad) the closed forms lose digits; their Taylor series to θ⁴ are exact there.
 _SMALL_ANGLE = 1e-3

@@ -28,6 +28,15 @@ class Fitted:
 
 
 @dataclass(frozen=True)
+class Target:
+    """A labelled point in the reference frame, or a probe with its orientation."""
+
+    position: Array  # (3,) length_unit
+    sigma: Array  # (3,)
+    orientation: Array | None = None  # (3, 3) R_reference_probe
+
+
+@dataclass(frozen=True)
 class Model:
     """Hand-eye (4, 4) in length_unit with its covariance, and the effects with their parameters."""
 
@@ -38,6 +47,7 @@ class Model:
     covariance: Array  # (6, 6)
     effects: dict[str, dict[str, Fitted]] = field(default_factory=dict)
     effects_file: str | None = None  # Python file with effects of the user's own
+    targets: dict[str, Target] = field(default_factory=dict)  # of a session with labelled points
 
 
 def write_model(model: Model, path: Path) -> None:
@@ -55,6 +65,8 @@ def write_model(model: Model, path: Path) -> None:
         },
         "effects": {name: {p: _written(f) for p, f in fitted.items()} for name, fitted in model.effects.items()},
     }
+    if model.targets:
+        document["targets"] = {name: _told(target) for name, target in model.targets.items()}
     if model.effects_file:
         document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
@@ -86,7 +98,28 @@ def read_model(path: Path) -> Model:
     return Model(
         str(document.get("length_unit")), str(document.get("mount")), corrected, coarse, covariance,
         _effects(path, document.get("effects", {})), document.get("effects_file"),
+        _targets(path, document.get("targets", {})),
     )  # fmt: skip
+
+
+def _told(target: Target) -> dict[str, Any]:
+    told = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
+    return told if target.orientation is None else told | {"orientation": target.orientation.tolist()}
+
+
+def _targets(path: Path, table: Any) -> dict[str, Target]:
+    out = {}
+    try:
+        for name, t in table.items():
+            orientation = np.array(t["orientation"], float) if "orientation" in t else None
+            out[str(name)] = Target(np.array(t["position"], float), np.array(t["sigma"], float), orientation)
+            if out[name].position.shape != (3,) or (orientation is not None and orientation.shape != (3, 3)):
+                raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{path}: targets must be tables such as [targets.ball1] with position and sigma, three numbers each"
+        ) from None
+    return out
 
 
 def _written(fitted: Fitted) -> dict[str, Any]:
@@ -136,6 +169,7 @@ def in_unit(model: Model, length_unit: str) -> Model:
     return Model(
         length_unit, model.mount, moved[0], moved[1], model.covariance * np.outer(scale, scale), effects,
         model.effects_file,
+        {name: Target(t.position * factor, t.sigma * factor, t.orientation) for name, t in model.targets.items()},
     )  # fmt: skip
 
 

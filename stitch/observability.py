@@ -27,7 +27,9 @@ def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> t
         centre: (3,) of the part in the scanner frame; twists are taken about it, so that a rotation
             of the scanner is not mistaken for the translation it causes at the part.
     """
-    size = 2 * float(np.median([np.sqrt(s.points.var(axis=0).sum()) for c in captures for s in c.scans])) / 2
+    size = 2 * float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets])) / 2
+    # A probe is a point: a tenth of its distance stands in for its size.
+    size = size or 0.1 * float(np.linalg.norm(centre))
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
     total, views = np.zeros((6, 6)), 0
@@ -46,7 +48,7 @@ def unobservable(
     captures: Sequence[Capture], T_mount: Array, robot: Robot | None = None, joints: Array | None = None
 ) -> tuple[str, ...]:
     """One phrase per direction of the hand-eye that these motions cannot show."""
-    centre = np.mean([s.points.mean(axis=0) for c in captures for s in c.scans], axis=0)
+    centre = np.mean([p.mean(axis=0) for c in captures for p in c.point_sets], axis=0)
     gains, directions = motion_gain(captures, T_mount, centre)
     hidden = directions[:, gains < _VISIBLE]
     axes = _named_axes(captures, robot, joints)

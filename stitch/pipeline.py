@@ -9,6 +9,7 @@ from stitch.effects.chain import Chain, Term, chain_of, corrected
 from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.labelled.run import change_labelled, run_labelled
 from stitch.match import sample
 from stitch.model import Model, in_unit
 from stitch.overlaps import collect
@@ -55,6 +56,10 @@ def run_rig(
         for chain in chains:
             for name in effects:
                 require(chain, known(name))
+        if not sessions[0].has_clouds:
+            own = in_unit(model, sessions[0].length_unit) if model else None
+            found = run_labelled(sessions[0], chains[0], own, effects, recorders[0])
+            return [_in_ledger(found, (), model.effects_file if model else None, recorders[0])]
         start = _start(sessions, chains, model)
         seconds = clock.lap()
         before = [_begin(c, start, seconds, r) for c, r in zip(chains, recorders, strict=True)]
@@ -85,6 +90,10 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         kept = [t for t in state.terms if t.effect.name in effects]
         used = [t.effect.name for t in kept]
         terms = [*kept, *start_values(state, [known(name) for name in effects if name not in used])]
+        if not state.session.has_clouds:
+            found = change_labelled(state.session, chain, terms, state.T_mount, state.T_mount_coarse, recorder)
+            found = replace(found, poses_before=corrected(chain, state.terms, state.T_mount).poses(state.T_mount))
+            return _in_ledger(found, state.ledger, state.effects_file, recorder)
         start = Coarse(state.T_mount_coarse, part_size([chain.capture]) * COARSE_GATE, "of the first run", ())
         before = _begin(chain, start, clock.lap(), recorder)
         clock.lap()
@@ -143,8 +152,13 @@ def _finish(
     poses_before: Array | None = None,
 ) -> Run:  # fmt: skip
     result = finish(session, chain, index, place.start, place.correction, before, recorder, seconds)
+    return _in_ledger(replace(result, poses_before=poses_before), place.ledger, place.effects_file, recorder)
+
+
+def _in_ledger(result: Run, ledger: Sequence[Step], effects_file: str | None, recorder: Recorder) -> Run:
+    """The result with its own line in the history, shown to the recorder."""
     step = Step(tuple(result.effects), result.residual_rms, result.heldout_rms, result.noise_floor, result.T_mount)
-    result = replace(result, ledger=(*place.ledger, step), effects_file=place.effects_file, poses_before=poses_before)
+    result = replace(result, ledger=(*ledger, step), effects_file=effects_file)
     recorder.finish(result)
     return result
 
@@ -162,7 +176,9 @@ def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:
             f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
         )
     for session in sessions:
-        if any(view.cloud is None for view in session.views):
-            raise InputError(f"{session.path}: views without clouds; `stitch run` stitches cloud sessions")
+        if not session.has_clouds and not session.has_sightings:
+            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
+        if not session.has_clouds and len(sessions) > 1:
+            raise InputError(f"{session.path}: sessions without clouds run one by one; use --hand-eye for the next")
         if len(session.views) < 2:
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 # Working distances of scanners on robots, in metres: from a borescope to a hall.
 _RANGE_M = (0.01, 20.0)
+# Trackers see as far as a hall is long.
+_SIGHT_M = (0.01, 100.0)
 # Reach of robots, in metres.
 _REACH_M = (0.03, 60.0)
 _OTHER = {"mm": "m", "m": "mm"}
@@ -31,6 +33,10 @@ def check_scale(session: "Session", cloud_unit: str) -> None:
             _refuse(
                 distance * metres, _RANGE_M, f"{toml}: the points of view {view.name} lie", "cloud_unit", cloud_unit
             )
+        if view.sighting is not None:
+            distance = float(np.median(np.linalg.norm(view.sighting.points, axis=1)))
+            what = f"{toml}: the targets of view {view.name} lie"
+            _refuse(distance * metres, _SIGHT_M, what, "length_unit", session.length_unit)
     reach = float(np.max([np.linalg.norm(view.T_base_flange[:3, 3]) for view in session.views]))
     _refuse(reach * metres, _REACH_M, f"{toml}: the flange stands at most", "length_unit", session.length_unit)
     _compare(session, cloud_unit)

@@ -14,6 +14,8 @@ from stitch.session import Session
 
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnose import Diagnosis
+    from stitch.labelled.fit import LabelledFit
+    from stitch.labelled.gross import Outlier
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Run:
     noise_floor: float
     fused: FusedCloud
     repeatability: Repeatability  # of the flange poses, as the overlaps show it
-    overlaps: Overlaps  # correspondences of the model, before register moves single views
+    overlaps: Overlaps | None  # correspondences of the model, before register moves single views; None without clouds
     verdict: str  # one plain sentence
     terms: tuple[Term, ...] = ()  # effects in use
     sigmas: tuple[Array, ...] = ()  # per term (P,); NaN where the views cannot see a parameter
@@ -78,6 +80,8 @@ class Run:
     poses_before: Array | None = None  # (V, 4, 4) poses_model before the last change of the model
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
+    labelled: LabelledFit | None = None  # what the labelled points say, where there are any
+    outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
 
     def diagnose(self) -> Diagnosis:
         """Which effect is missing."""

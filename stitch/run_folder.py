@@ -18,8 +18,10 @@ from plyfile import PlyData, PlyElement
 from stitch.effects.terms import fitted_of
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.labelled.document import labelled_facts, residual_columns, target_rows, targets_of
 from stitch.model import Model, write_model
 from stitch.result import FusedCloud, Run
+from stitch.session import View
 
 FORMAT = "stitch-run/1"
 _VERSIONS = ("stitch", "numpy", "scipy", "open3d-cpu", "open3d", "pykdtree", "rerun-sdk", "kiss-icp", "trimesh")
@@ -92,7 +94,7 @@ def model_of(run: Run) -> Model:
     """The model that a run fitted."""
     return Model(
         run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance,
-        fitted_of(run.chain, run.terms, run.sigmas), run.effects_file,
+        fitted_of(run.chain, run.terms, run.sigmas), run.effects_file, targets_of(run.labelled),
     )  # fmt: skip
 
 
@@ -125,16 +127,23 @@ def result_document(run: Run) -> dict[str, Any]:
         },
         "views": [
             {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),
-             "points": 0 if view.cloud is None else len(view.cloud.points)}
+             "points": points_of(view)}
             for view, pose, correction, rms in zip(
                 run.session.views, run.poses, run.corrections, run.view_rms, strict=True)
         ],
-        "targets": [],
+        "targets": target_rows(run.labelled),
+        **labelled_facts(run),
         "convergence": run.convergence,
         "verdict": run.verdict,
         "notes": list(run.notes),
         "versions": _versions(),
     }  # fmt: skip
+
+
+def points_of(view: View) -> int:
+    """Number of points that a view shows, of its cloud and by name."""
+    labelled = 0 if view.sighting is None else len(view.sighting.targets)
+    return labelled + (0 if view.cloud is None else len(view.cloud.points))
 
 
 def ledger(run: Run) -> list[dict[str, Any]]:
@@ -198,7 +207,7 @@ def write_residuals(run: Run, path: Path) -> None:
     def add(key: str, values: Array | Sequence[str]) -> None:
         table.setdefault(key, []).append(values)
 
-    for m in run.overlaps.matches:
+    for m in () if run.overlaps is None else run.overlaps.matches:
         size = len(m.residual)
         add("view", np.repeat(names[m.v], size))
         add("partner", np.repeat(names[m.w], size))
@@ -211,6 +220,9 @@ def write_residuals(run: Run, path: Path) -> None:
             add(key, np.full(size, run.session.views[m.v].covariates.get(key, np.nan)))
         if run.session.views[m.v].time_s is not None:
             add("time_s", np.full(size, run.session.views[m.v].time_s))
+    if run.labelled is not None:
+        for key, values in residual_columns(run.labelled, run.session).items():
+            add(key, values)
     columns = {key: np.concatenate(parts) for key, parts in table.items()}
     arrays = {
         key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()

@@ -13,7 +13,9 @@ from stitch.cloud import Cloud
 from stitch.clouds import read_cloud
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.frames_csv import read_frames
 from stitch.plausible import check_scale
+from stitch.points_csv import Nominal, Sighting, read_points, read_targets
 from stitch.robot import METRES, Robot, robot_from_dh
 from stitch.urdf import robot_from_urdf
 from stitch.views_csv import Row, read_views
@@ -42,6 +44,7 @@ class View:
     approach: Array | None  # (n,) -1, 0, +1
     time_s: float | None
     covariates: dict[str, float]
+    sighting: Sighting | None = None  # labelled points or a measured probe
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,17 @@ class Session:
     cad_unit: str | None
     views: tuple[View, ...]
     warnings: tuple[str, ...] = field(default=())
+    nominal: Nominal | None = None  # targets in the part frame
+
+    @property
+    def has_clouds(self) -> bool:
+        """True if every view has a cloud."""
+        return all(view.cloud is not None for view in self.views)
+
+    @property
+    def has_sightings(self) -> bool:
+        """True if some view shows labelled points or a probe."""
+        return any(view.sighting is not None for view in self.views)
 
 
 def load_session(path: Path | str) -> Session:
@@ -87,7 +101,8 @@ def load_session(path: Path | str) -> Session:
     robot = _robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot)
     cloud_unit = _choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
-    views = _views(path, rows, METRES[cloud_unit] / METRES[unit])
+    sightings = _sightings(path, [row.name for row in rows])
+    views = _views(path, rows, METRES[cloud_unit] / METRES[unit], sightings)
     part, sphere = document.get("part", {}), document.get("sphere", {})
     cad = path / part["cad"] if "cad" in part else None
     if cad is not None and not cad.is_file():
@@ -95,7 +110,7 @@ def load_session(path: Path | str) -> Session:
     session = Session(
         path, str(document.get("name", path.name)), unit, mount,  # type: ignore[arg-type]
         _scanner(file, document.get("scanner", {})), robot, _positive(file, sphere, "sphere", "radius"),
-        cad, part.get("cad_unit"), views,
+        cad, part.get("cad_unit"), views, nominal=_nominal(path, sightings),
     )  # fmt: skip
     check_scale(session, cloud_unit)
     return session
@@ -183,8 +198,35 @@ def _robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
         raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
 
 
-def _views(path: Path, rows: list[Row], scale: float) -> tuple[View, ...]:
-    labelled = any((path / name).is_file() for name in ("points.csv", "frames.csv"))
+def _sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
+    """By view, from points.csv or frames.csv."""
+    points, frames_file = path / "points.csv", path / "frames.csv"
+    if points.is_file() and frames_file.is_file():
+        raise InputError(f"{path}: has points.csv and frames.csv; keep one of them: a session has one kind of target")
+    if points.is_file():
+        return read_points(points, known)
+    if not frames_file.is_file():
+        return {}
+    measured = read_frames(frames_file, known)
+    unknown = np.full(len(measured.views), np.nan)
+    sigma = unknown if measured.sigma is None else measured.sigma
+    turn = unknown if measured.sigma_rotation is None else measured.sigma_rotation
+    return {
+        view: Sighting(("probe",), T[None, :3, 3], sigma[v : v + 1], T[:3, :3], float(turn[v]))
+        for v, (view, T) in enumerate(zip(measured.views, measured.T_sensor_probe, strict=True))
+    }
+
+
+def _nominal(path: Path, sightings: dict[str, Sighting]) -> Nominal | None:
+    file = path / "targets.csv"
+    if not file.is_file():
+        return None
+    if not (path / "points.csv").is_file():
+        raise InputError(f"{file}: there is no points.csv that names its targets; write it, or remove targets.csv")
+    return read_targets(file, sorted({name for s in sightings.values() for name in s.targets}))
+
+
+def _views(path: Path, rows: list[Row], scale: float, sightings: dict[str, Sighting]) -> tuple[View, ...]:
     views = []
     for row in rows:
         cloud = None
@@ -193,10 +235,13 @@ def _views(path: Path, rows: list[Row], scale: float) -> tuple[View, ...]:
                 cloud = read_cloud(path / row.cloud, scale)
             except InputError as error:
                 raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-        elif not labelled:
+        elif not sightings:
             raise InputError(
                 f"{path / 'views.csv'} line {row.line}: view {row.name} names no cloud; fill the column "
                 "cloud, or put points.csv or frames.csv beside it"
             )
-        views.append(View(row.name, cloud, row.T_base_flange, row.joints, row.approach, row.time_s, row.covariates))
+        views.append(
+            View(row.name, cloud, row.T_base_flange, row.joints, row.approach, row.time_s, row.covariates,
+                 sightings.get(row.name))
+        )  # fmt: skip
     return tuple(views)

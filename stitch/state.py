@@ -13,6 +13,7 @@ from stitch.effects.terms import terms_of
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.labelled.document import without_outliers
 from stitch.model import read_model
 from stitch.result import Run, Step
 from stitch.session import Session, load_session
@@ -31,7 +32,7 @@ class State:
     terms: tuple[Term, ...]
     T_mount: Array  # (4, 4)
     T_mount_coarse: Array  # (4, 4)
-    gate: float  # largest distance between partners, length_unit
+    gate: float  # largest distance between partners, length_unit; NaN without clouds
     residual_rms: float
     noise_floor: float
     ledger: tuple[Step, ...]
@@ -41,8 +42,9 @@ class State:
 def state_of(run: Run) -> State:
     """The state of a run in memory."""
     return State(
-        run.session, run.chain, run.terms, run.T_mount, run.T_mount_coarse, run.overlaps.gate, run.residual_rms,
-        run.noise_floor, run.ledger, run.effects_file,
+        run.session, run.chain, run.terms, run.T_mount, run.T_mount_coarse,
+        float("nan") if run.overlaps is None else run.overlaps.gate, run.residual_rms, run.noise_floor, run.ledger,
+        run.effects_file,
     )  # fmt: skip
 
 
@@ -65,10 +67,11 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         session, scans = thinned(session) if thin else (session, capture(session))
         chain = chain_of(session, scans)
         terms = tuple(terms_of(model, chain))
+        chain = without_outliers(chain, session, document.get("outliers", ()))
         own = corrected(chain, terms, model.T_mount)
-        overlaps = settle(own, model.T_mount, REUSE_GATE * part_size([own]))
+        gate = settle(own, model.T_mount, REUSE_GATE * part_size([own])).gate if own.scans else float("nan")
     return State(
-        session, chain, terms, model.T_mount, model.T_mount_coarse, overlaps.gate, document["residual_rms"],
+        session, chain, terms, model.T_mount, model.T_mount_coarse, gate, document["residual_rms"],
         document["noise_floor"], steps, file,
     )  # fmt: skip
 

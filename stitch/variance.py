@@ -30,11 +30,18 @@ class Evidence:
     z: Array  # (B, m)
     A: Array  # (B, m, a) columns of the free mean
     components: Array  # (3, B, m, m) covariance of unit rotation scatter, translation scatter, sensor noise
+    fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
+    independent: int | None = None  # numbers that could err independently, if that is not all of them
 
     @property
     def size(self) -> int:
         """Numbers in all."""
-        return int(self.z.size)
+        return int(self.z.size) if self.independent is None else self.independent
+
+    def covariance(self, variances: Array) -> Array:
+        """(B, m, m) for variances (3,)."""
+        V = np.einsum("c,cbij->bij", variances, self.components)
+        return np.asarray(V if self.fixed is None else V + self.fixed)
 
 
 @dataclass(frozen=True)
@@ -80,35 +87,34 @@ def at_variances(
     """The same without searching: mean, covariance and deviance for given variances (3,)."""
     problem = _problem(evidence, G, prior)
     deviance, _ = _deviance(np.log(variances), problem)
-    V = np.tensordot(variances, problem.components, 1)
+    V = evidence.covariance(variances)
     X = problem.X
-    weighted = np.linalg.solve(V, np.concatenate([X, problem.z[..., None]], axis=2))
+    weighted = np.linalg.solve(V, np.concatenate([X, evidence.z[..., None]], axis=2))
     M = _summed(X, weighted[..., :-1]) + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     covariance = np.linalg.pinv(M * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
-    mean = covariance @ np.einsum("bma,bm->a", X, weighted[..., -1])
+    mean = covariance @ _summed(X, weighted[..., -1:])[:, 0]
     return VarianceFit(np.asarray(variances), deviance, mean, covariance)
 
 
 @dataclass(frozen=True)
 class _Problem:
-    z: Array  # (B, m)
+    evidence: Evidence
     X: Array  # (B, m, a + g)
     precision: Array  # (a + g,) of the prior
-    components: Array
     offset: float  # log det of the prior covariance
 
 
 def _problem(evidence: Evidence, G: Array | None, prior: Array | None) -> _Problem:
     a = evidence.A.shape[2]
     if G is None:
-        return _Problem(evidence.z, evidence.A, np.zeros(a), evidence.components, 0.0)
+        return _Problem(evidence, evidence.A, np.zeros(a), 0.0)
     X = np.concatenate([evidence.A, G], axis=2)
     if prior is None:
-        return _Problem(evidence.z, X, np.zeros(X.shape[2]), evidence.components, 0.0)
+        return _Problem(evidence, X, np.zeros(X.shape[2]), 0.0)
     precision = np.concatenate([np.zeros(a), 1 / prior**2])
-    return _Problem(evidence.z, X, precision, evidence.components, float(2 * np.log(prior).sum()))
+    return _Problem(evidence, X, precision, float(2 * np.log(prior).sum()))
 
 
 def _guess(evidence: Evidence) -> Array:
@@ -120,7 +126,8 @@ def _guess(evidence: Evidence) -> Array:
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     variances = np.exp(log_variances)
-    V = np.tensordot(variances, problem.components, 1)
+    evidence = problem.evidence
+    V = evidence.covariance(variances)
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:
@@ -132,14 +139,14 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = WX.reshape(-1, WX.shape[2]).T @ problem.z.ravel()
+    b = WX.reshape(-1, WX.shape[2]).T @ evidence.z.ravel()
     beta = half @ (half.T @ b)
-    rest = problem.z - problem.X @ beta
+    rest = evidence.z - problem.X @ beta
     Wr = np.matmul(inverse, rest[..., None])
     WXh = WX @ half
     # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
     against = inverse - WXh @ WXh.transpose(0, 2, 1) - Wr @ Wr.transpose(0, 2, 1)
-    slope = variances * (problem.components.reshape(len(variances), -1) @ against.ravel())
+    slope = variances * (evidence.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())

@@ -59,7 +59,9 @@ def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     assert after.residual_rms == pytest.approx(before.residual_rms * np.sqrt(left.inside), rel=0.15)
     # The truth, which no overlap knows, comes nearer too: a fit that borrows from the hand-eye would not show above.
     errors = [frames.log(frames.inverse(measured.T_mount) @ r.T_mount)[3:] for r in (before, after)]
-    assert np.linalg.norm(errors[1]) < max(np.linalg.norm(errors[0]), 3 * np.sqrt(np.trace(after.mount_covariance[3:, 3:])))
+    assert np.linalg.norm(errors[1]) < max(
+        np.linalg.norm(errors[0]), 3 * np.sqrt(np.trace(after.mount_covariance[3:, 3:]))
+    )
     term, sigmas = after.terms[0], after.sigmas[0]
     z = [
         (value - measured.hidden[name].get(p.name, 0.0)) / sigma

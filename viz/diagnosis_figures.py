@@ -5,11 +5,13 @@ from matplotlib.figure import Figure
 
 from stitch.diagnosis.compare import Comparison, Table
 from stitch.diagnosis.diagnose import Diagnosis, Suspect
-from stitch.diagnosis.unknown import displacements
 from stitch.result import Step
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, covariate, plain
 from viz.units import to_micrometres
+
+# More names of views than these cannot be read along an axis.
+_NAMED = 40
 
 
 def waterfall(ledger: tuple[Step, ...], length_unit: str) -> Figure:
@@ -161,14 +163,15 @@ def _against(ax, table: Table, um: float) -> None:
 def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     """How far every view sits from where the model puts it."""
     um = to_micrometres(length_unit)
-    moved = displacements(found.evidence) * um
+    moved = found.evidence.displaced() * um
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots()
     for i, (axis, colour, marker) in enumerate(zip("xyz", (ORANGE, GREEN, BLUE), "osv", strict=True)):
         axes.plot(moved[:, i], marker=marker, ms=4, lw=0.8, color=colour, label=axis)
     axes.axhline(0, color="k", lw=0.6)
     names = [scan.name for scan in found.evidence.capture.scans]
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    if 0 < len(names) <= _NAMED:
+        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     axes.set_ylabel("displaced (µm)")
     above(axes)
     return plain(figure)

@@ -7,9 +7,10 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.result import Run, StageResult
-from stitch.session import Session
+from stitch.session import Session, View
 from viz.blueprint import blueprint
 from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
+from viz.target_figures import residual_vectors
 from viz.units import to_micrometres
 from viz.words import run_markdown
 
@@ -44,7 +45,7 @@ class RerunRecorder:
         rec.log("scans", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         colours = view_colours(len(self.names))
         for view, colour in zip(session.views, colours, strict=True):
-            points = view.cloud.points if view.cloud else np.zeros((0, 3))
+            points = shown_points(view)
             pick = np.linspace(0, len(points) - 1, min(len(points), _POINTS_PER_VIEW)).astype(int)
             self.picked.append(pick)
             self.clouds.append(points[pick].astype(np.float32))
@@ -85,11 +86,23 @@ class RerunRecorder:
         colours = unsigned_colours(fused.residual[pick], robust_limit(fused.residual))
         points = rr.Points3D(fused.points[pick].astype(np.float32), colors=colours)
         rec.log("fused", points, static=True)
+        if run.labelled is not None:
+            self._sticks(run)
         rec.log("views/rms_um", rr.BarChart(run.view_rms * self.to_um), static=True)
         shift = np.linalg.norm(view_shifts(run), axis=1) * self.to_um
         rec.log("views/correction_um", rr.BarChart(shift), static=True)
         rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)
         rec.disconnect()
+
+    def _sticks(self, run: Run) -> None:
+        """Offsets of the targets under the model, magnified, beside the targets."""
+        target, left = residual_vectors(run)
+        start = run.fused.points[target]
+        longest = max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
+        factor = 0.25 * (float(np.ptp(run.fused.points, axis=0).max()) or 1.0) / longest
+        strips = np.stack([start, start + factor * left], axis=1).astype(np.float32)
+        self.recording.log("fused/sticks", rr.LineStrips3D(strips, colors=[(72, 120, 168)]), static=True)
+        self.recording.log("log", rr.TextLog(f"sticks at the targets are {factor:.0f} times longer than they are"))
 
     def _snapshot(self, stage: str, poses: Array, residuals: list[Array], limit: float) -> None:
         """The whole set as it stood at the end of a stage, on a static entity for side-by-side views."""
@@ -114,10 +127,18 @@ class RerunRecorder:
         self.recording.set_time("step", sequence=self.step)
 
 
+def shown_points(view: View) -> Array:
+    """(N, 3) of the view's cloud, or its labelled points, scanner frame."""
+    if view.cloud is not None:
+        return view.cloud.points
+    return np.zeros((0, 3)) if view.sighting is None else view.sighting.points
+
+
 def view_shifts(run: Run) -> Array:
     """(V, 3) how far register moved the middle of each view, reference frame, length_unit."""
     out = []
     for view, T_before, T_after in zip(run.session.views, run.poses_model, run.poses, strict=True):
-        middle = view.cloud.points.mean(axis=0) if view.cloud else np.zeros(3)
+        points = shown_points(view)
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
         out.append((T_after - T_before)[:3, :3] @ middle + (T_after - T_before)[:3, 3])
     return np.array(out)

@@ -11,10 +11,13 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from stitch.result import Run
-from viz import figures
+from viz import figures, target_figures
 from viz.diagnosis_figures import waterfall
-from viz.recording import view_shifts
+from viz.recording import shown_points, view_shifts
 from viz.units import to_micrometres, to_millimetres
+
+# Of more views than this the page lists the worst.
+_VIEWS = 60
 
 
 def write_report(run: Run, path: Path) -> None:
@@ -28,21 +31,45 @@ def _content(run: Run) -> dict[str, object]:
     um = to_micrometres(run.session.length_unit)
     shift = view_shifts(run)
     rows = [
-        {"view": view.name, "points": len(view.cloud.points) if view.cloud else 0, "rms": rms * um,
+        {"view": view.name, "points": len(shown_points(view)), "rms": rms * um,
          "shift": np.linalg.norm(moved) * um, "turn": np.linalg.norm(twist[:3]) * 1e3}
         for view, rms, moved, twist in zip(run.session.views, run.view_rms, shift, run.corrections, strict=True)
     ]  # fmt: skip
+    if len(rows) > _VIEWS:
+        rows = sorted(rows, key=lambda row: -row["rms"])[:_VIEWS]
     return {
         "run": run, "um": um, "views": rows, "hand_eye": _hand_eye(run),
         "effects": _effects(run), "history": _history(run),
         "largest": max((row["shift"] for row in rows), default=1.0) or 1.0,
-        "pictures": [
-            ("Steps between the views", png(figures.residual_maps(run), 130)),
-            ("Convergence", svg(figures.convergence(run))),
-            ("Views", svg(figures.per_view(run))),
-        ],
+        "all_views": len(run.session.views), "pictures": _pictures(run),
+        "targets": _targets(run),
         "version": version("stitch"),
     }  # fmt: skip
+
+
+def _pictures(run: Run) -> list[tuple[str, str]]:
+    """What the views have in common decides what can be drawn: overlaps or targets."""
+    out = []
+    if run.overlaps is not None:
+        out += [("Steps between the views", png(figures.residual_maps(run), 130)),
+                ("Convergence", svg(figures.convergence(run))), ("Views", svg(figures.per_view(run)))]  # fmt: skip
+    if run.labelled is not None:
+        out += [("Targets, as every view puts them", png(target_figures.sticks(run), 130)),
+                ("Distance of the targets", svg(target_figures.errors(run)))]  # fmt: skip
+    return out
+
+
+def _targets(run: Run) -> list[dict[str, object]]:
+    """Rows of the table of targets; their places stand where a cloud would."""
+    sightings = run.chain.capture.sightings
+    if run.labelled is None or sightings is None:
+        return []
+    um = to_micrometres(run.session.length_unit)
+    return [
+        {"name": name, "seen": int(n), "rms": rms * um, "position": position}
+        for name, n, rms, position in zip(
+            sightings.targets, sightings.seen, run.fused.residual, run.fused.points, strict=True)
+    ]  # fmt: skip
 
 
 def _effects(run: Run) -> list[dict[str, str]]:
@@ -62,7 +89,7 @@ def _history(run: Run) -> list[tuple[str, str]]:
     if len(run.ledger) < 2:
         return []
     out = [("The error over the history of the model", svg(waterfall(run.ledger, run.session.length_unit)))]
-    if run.poses_before is not None:
+    if run.poses_before is not None and run.overlaps is not None:
         out.append(("Steps between the views before and after the last change", png(figures.change_maps(run), 130)))
     return out
 

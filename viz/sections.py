@@ -50,10 +50,8 @@ def write_comparison(found: Comparison, state: State, folder: Path) -> None:
     _save(folder / "pictures", {"compare": figure})
     um = to_micrometres(state.session.length_unit)
     worst = []
-    for name in ("view", "pair", "place on the part"):
-        table = found.table(name)
-        order = sorted(range(len(table.count)), key=lambda i: -table.rms[i] if table.count[i] > 50 else 0.0)[:5]
-        worst.append((name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in order)))
+    for table in found.labelled:
+        worst.append((table.name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in table.worst(5))))
     html = _render("comparison.html.j2", picture=svg(figure), worst=worst, rms=found.rms * um)
     _insert(folder / "report.html", "comparison", html)
 

@@ -1,4 +1,4 @@
-"""`stitch calibrate …`: hand-eyes from known objects and from trackers."""
+"""`stitch calibrate …`: hand-eyes from known objects and from trackers, and the arm itself."""
 
 import json
 from pathlib import Path
@@ -9,14 +9,26 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from stitch import run_folder
+from stitch.calibrate.robot import calibrated
+from stitch.calibrate.robot_report import beyond_sentence, write_robot
+from stitch.calibrate.robot_report import document_of as robot_document
 from stitch.calibrate.sphere import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
 from stitch.calibrate.tracker import calibrate_tracker
 from stitch.calibrate.tracker import document_of as tracker_document
+from stitch.cli.change import show_ledger
+from stitch.cli.diagnose import write_diagnosis
+from stitch.diagnosis.suggest import suggest
+from stitch.pipeline import run
+from stitch.result import Run
 from stitch.session import load_session
+from stitch.state import state_of
 
 calibrate = typer.Typer(
-    help="Find hand-eyes from known objects and from trackers.", no_args_is_help=True, rich_markup_mode=None
+    help="Find hand-eyes from known objects and from trackers, and an arm's own errors.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
 )
 _SESSION = Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")]
 _JSON = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
@@ -63,6 +75,56 @@ def tracker(session: _SESSION, as_json: _JSON = False) -> None:
         ("rotation error", f"{document['heldout_rotation_error_deg']['mean']:.4f} ° mean of views left out"),
     ]
     show(document, facts)
+
+
+@calibrate.command()
+def robot(
+    session: _SESSION,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT", help="Run folder; default runs/NAME-robot.")
+    ] = None,
+    at_most: Annotated[int, typer.Option("--at-most", help="Largest number of effects.")] = 8,
+    as_json: _JSON = False,
+) -> None:
+    """Kinematic calibration: what the arm's nominal model lacks, as model, corrected DH rows and URDF."""
+    loaded = load_session(session)
+    first = run(loaded)
+    calibrated(first)
+    found, lines, diagnosis = suggest(state_of(first), at_most)
+    result = found or first
+    target = output or Path("runs") / f"{loaded.name}-robot"
+    with run_folder.new_folder(target) as scratch:
+        run_folder.write_run(result, scratch)
+        run_folder.extend("stitch.reports", result, scratch / "report.html")
+        write_robot(result, calibrated(result), scratch)
+        write_diagnosis(diagnosis, state_of(result), scratch)
+    document = robot_document(result, lines, diagnosis.sentence)
+    if as_json:
+        print(run_folder.to_json(document))
+    else:
+        _show_robot(result, document, lines, target)
+
+
+def _show_robot(result: Run, document: dict[str, Any], lines: list[str], target: Path) -> None:
+    """The way, the history, the rows, the poses to add."""
+    console = Console(stderr=True)
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False)
+    show_ledger(result)
+    table = Table(title="Corrected DH rows", title_justify="left")
+    for heading in ("joint", "a", "alpha (°)", "d", "theta (°)"):
+        table.add_column(heading, justify="right")
+    for i, row in enumerate(document["robot"] or ()):
+        table.add_row(str(i + 1), *(f"{row[key]:.5f}" for key in ("a", "alpha_deg", "d", "theta_deg")))
+    if document["robot"]:
+        console.print(table)
+    console.print(beyond_sentence(calibrated(result)), soft_wrap=True, highlight=False)
+    for pose in document["next"]:
+        told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(pose))
+        console.print(f"A pose that would tell most of the rest: {told}.", soft_wrap=True, highlight=False)
+    for name in ("model.toml", "robot.toml", "robot.urdf", "report.html"):
+        if (target / name).exists():
+            console.print(f"  {target / name}", soft_wrap=True, highlight=False)
 
 
 def show(document: dict[str, Any], facts: list[tuple[str, str]]) -> None:

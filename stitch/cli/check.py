@@ -38,13 +38,16 @@ def check(
 def summary(session: Session) -> dict[str, object]:
     """What a session holds, in plain numbers."""
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
-    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds]
+    sighted = [view.sighting.points for view in session.views if view.sighting is not None]
+    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds or sighted]
     return {
         "session": session.name,
         "mount": session.mount,
         "length_unit": session.length_unit,
         "views": len(session.views),
         "points": int(sum(len(points) for points in clouds)),
+        "targets": len({name for view in session.views if view.sighting for name in view.sighting.targets}),
+        "sightings": sum(len(view.sighting.targets) for view in session.views if view.sighting),
         "median_range": round(float(np.median(ranges)), 3) if ranges else None,
         "joints": session.views[0].joints is not None,
         "robot": session.robot.name if session.robot else None,

@@ -10,6 +10,7 @@ from rich.table import Table as Printed
 
 from stitch.cli.progress import MICROMETRES
 from stitch.diagnosis.compare import Table, compare, comparison_document
+from stitch.diagnosis.compare_targets import compare_targets
 from stitch.run_folder import extend, to_json, write_json
 from stitch.state import load_state
 
@@ -21,9 +22,9 @@ def compare_run(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print all tables as JSON.")] = False,
 ) -> None:
-    """Show the residual by view, pair, joint, range, incidence, field, time, covariate and place on the part."""
+    """Show the residual by view, pair, target, joint, range, incidence, field, time, covariate and place."""
     state = load_state(run, thin=True)
-    found = compare(state)
+    found = compare(state) if state.chain.capture.scans else compare_targets(state)
     write_json(comparison_document(found), run / "compare.json")
     extend("stitch.comparison_reports", found, state, run)
     if as_json:
@@ -31,9 +32,10 @@ def compare_run(
         return
     to_um = MICROMETRES[state.session.length_unit]
     console = Console(stderr=True)
-    console.print(f"{found.rms * to_um:.1f} µm rms between the views under the model.", highlight=False)
-    for name in ("view", "pair", "place on the part"):
-        _worst(console, found.table(name), to_um)
+    what = "between the views" if state.chain.capture.scans else "from the targets to their place (3D)"
+    console.print(f"{found.rms * to_um:.1f} µm rms {what} under the model.", highlight=False)
+    for table in found.labelled:
+        _worst(console, table, to_um)
     for table in found.places[:_SHOWN]:
         _one(console, table, to_um)
     rest = ", ".join(f"{t.name} ({t.clearest:.1f})" for t in found.places[_SHOWN:])
@@ -44,11 +46,10 @@ def compare_run(
 
 
 def _worst(console: Console, table: Table, to_um: float) -> None:
-    order = [i for i in np.argsort(-np.nan_to_num(table.rms)) if table.count[i] > 50][:_WORST]
     told = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"
         + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
-        for i in order
+        for i in table.worst(_WORST)
     )
     console.print(f"Worst by {table.name} (µm rms): {told}", soft_wrap=True, highlight=False)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
 
@@ -20,7 +20,7 @@ class Alias:
     correlation: float  # of this one's fitted pattern with the best that the other can do
 
 
-def pattern(evidence: PoseEvidence, scored: Score) -> Array:
+def pattern(evidence: ViewEvidence, scored: Score) -> Array:
     """(n,) what the fitted candidate does to the views, in units of their scatter."""
     white = evidence.whiten_channel(scored.form.columns)
     if np.any(scored.values):
@@ -30,7 +30,7 @@ def pattern(evidence: PoseEvidence, scored: Score) -> Array:
     return np.asarray(U[:, 0] * s[0])
 
 
-def alias_matrix(evidence: PoseEvidence, scores: Sequence[Score]) -> Array:
+def alias_matrix(evidence: ViewEvidence, scores: Sequence[Score]) -> Array:
     """(K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
 
     The other effect may use all its parameters, but none beyond ten times its plausible size.

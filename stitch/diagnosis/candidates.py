@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.effects.chain import Term
 from stitch.effects.columns import PointGram
 from stitch.effects.contract import EFFECTS, Effect, Parameter
@@ -21,7 +21,7 @@ class Form:
 
     term: Term  # at zero, gridded parameters at their value
     keep: Array  # (P,) bool: parameters that are free in this form
-    twists: Array  # (6V, p) of the free ones
+    twists: Array  # (·, p) of the free ones: the response of the views
     columns: Array  # (n, p) of the free ones in the channel
     sizes: Array  # (p,) plausible sizes
 
@@ -33,7 +33,7 @@ class Candidate:
     effect: Effect
     parameters: tuple[Parameter, ...]
     forms: tuple[Form, ...]
-    twists: Array  # (6V, P) of the first form
+    twists: Array  # (·, P) of the first form
     points: slice | None  # of the first form's columns in the PointGram
 
     @property
@@ -41,7 +41,7 @@ class Candidate:
         return self.effect.name
 
 
-def candidates_of(evidence: PoseEvidence) -> tuple[list[Candidate], PointGram | None, dict[str, tuple[str, ...]]]:
+def candidates_of(evidence: ViewEvidence) -> tuple[list[Candidate], PointGram | None, dict[str, tuple[str, ...]]]:
     """Physical, user and empirical effects that are not in the model, and what each unavailable one lacks."""
     chain = evidence.chain
     used = {term.effect.name for term in evidence.terms}
@@ -64,7 +64,7 @@ def candidates_of(evidence: PoseEvidence) -> tuple[list[Candidate], PointGram | 
     return out, sums, missing
 
 
-def candidate_of(evidence: PoseEvidence, effect: Effect) -> Candidate | None:
+def candidate_of(evidence: ViewEvidence, effect: Effect) -> Candidate | None:
     """One effect as a candidate."""
     parameters = evidence.chain.parameters(effect)
     terms = _grid_terms(effect, parameters)
@@ -79,11 +79,11 @@ def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
     return [Term(effect, np.array(values)) for values in product(*grids)]
 
 
-def _forms(evidence: PoseEvidence, term: Term, parameters: Sequence[Parameter], twists: Array) -> list[Form]:
+def _forms(evidence: ViewEvidence, term: Term, parameters: Sequence[Parameter], twists: Array) -> list[Form]:
     """All parameters together, then joint by joint where there are several."""
     free = np.array([not p.grid for p in parameters])
     sizes = np.array([p.typical for p in parameters])
-    channel = evidence.channel.left @ twists
+    channel = evidence.in_channel(twists)
     keeps = [free]
     groups = _groups(term.effect, parameters)
     if len(groups) > 1:

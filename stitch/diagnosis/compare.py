@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.effects.chain import corrected
+from stitch.effects.views import Views
 from stitch.frames import Array, Indices
 from stitch.match import Match, sample
 from stitch.overlaps import FINE_SAMPLES, collect
@@ -21,6 +22,7 @@ from stitch.threads import library_threads_off
 _BINS = 6
 # Correspondences of a view in a bin that make a sample.
 _ENOUGH = 30
+_FAIR = 50  # correspondences of a bin that may be called the worst
 _PLACES = 4  # cells along each axis of the part
 
 
@@ -47,6 +49,11 @@ class Table:
             z = np.abs(self.mean) / self.mean_sigma
         return float(np.nanmax(np.where(np.isfinite(z), z, 0.0), initial=0.0))
 
+    def worst(self, at_most: int) -> list[int]:
+        """Numbers of the bins of largest rms, of those with a fair count."""
+        fair = self.count > np.minimum(_FAIR, np.median(self.count) / 4)
+        return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -59,6 +66,11 @@ class Comparison:
     def table(self, name: str) -> Table:
         """One table by its name."""
         return next(t for t in self.tables if t.name == name)
+
+    @property
+    def labelled(self) -> tuple[Table, ...]:
+        """Tables by name: views, pairs, places, targets."""
+        return tuple(t for t in self.tables if t.label)
 
     @property
     def places(self) -> tuple[Table, ...]:
@@ -163,23 +175,30 @@ def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
         ("field b = y/z", "", rows.points[:, 1] / rows.points[:, 2]),
         ("field ρ", "", np.hypot(rows.points[:, 0], rows.points[:, 1]) / rows.points[:, 2]),
     ]  # fmt: skip
-    of_view = [(f"j{i + 1}", "deg", np.degrees(views.joints[:, i])) for i in range(views.joints.shape[1])]
-    of_view += [(f"approach of j{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
-    of_view += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
+    return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if np.ptp(values) > 1e-9]
+
+
+def view_properties(views: Views) -> list[tuple[str, str, Array]]:
+    """Name, unit and value (V,) of everything that is known of the views."""
+    out = [(f"j{i + 1}", "deg", np.degrees(views.joints[:, i])) for i in range(views.joints.shape[1])]
+    out += [(f"approach of j{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
+    out += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
     if views.has("time"):
-        of_view.append(("time", "s", views.time))
-    of_view += [(name, "", values) for name, values in views.covariates.items()]
-    out += [(name, u, values[rows.view]) for name, u, values in of_view if np.ptp(values) > 1e-9]
-    return out
+        out.append(("time", "s", views.time))
+    return out + [(name, "", values) for name, values in views.covariates.items()]
 
 
 def _binned(rows: _Rows, name: str, unit: str, values: Array) -> Table:
     """Bins with about equal counts; equal values stay together."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-    if len(edges) < 2:
-        edges = np.array([edges[0] - 0.5, edges[0] + 0.5])
+    edges = edges_of(values)
     bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
     return Table(name, unit, edges[:-1], edges[1:], (), *_statistics(rows, bins, len(edges) - 1))
+
+
+def edges_of(values: Array) -> Array:
+    """(B + 1,) edges of bins with about equal counts."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+    return edges if len(edges) > 1 else np.array([edges[0] - 0.5, edges[0] + 0.5])
 
 
 def _regions(rows: _Rows) -> Table:

@@ -6,9 +6,9 @@ import numpy as np
 
 from stitch.diagnosis.aliases import Alias, alias_matrix, aliases_of
 from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.heldout import Left, left_by
 from stitch.diagnosis.next_view import Proposal, propose
-from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.select import Ranked, Selection, implausible, select
 from stitch.diagnosis.start import evidence_of_state
 from stitch.diagnosis.unknown import Dependence, dependences
@@ -53,7 +53,7 @@ class Diagnosis:
     depends_on: tuple[Dependence, ...]
     next: tuple[Proposal, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
-    evidence: PoseEvidence
+    evidence: ViewEvidence
     notes: tuple[str, ...] = ()
 
 

@@ -5,26 +5,18 @@ of the scatter. A further view adds six rows to both patterns; among poses that 
 the scanner would see the part as it has before, the one that adds most is proposed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from stitch import frames
-from stitch import robot as kinematics
 from stitch.diagnosis.aliases import SIMILAR, alias_matrix
-from stitch.diagnosis.candidates import with_values
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
+from stitch.diagnosis.imagined import IMAGINE
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.select import Ranked, Selection
-from stitch.effects.chain import Chain, placed, twists
-from stitch.effects.columns import POINTS
-from stitch.effects.views import torques_of
+from stitch.effects.chain import Chain
 from stitch.frames import Array
 
-_SAMPLES = 6000
-_TRIED = 250
-_SPREAD = np.radians(40.0)  # about joint angles that were driven before
-_LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they were beyond already
 # P(correct) = Φ(√(λ/2)) = 0.95.
 _ENOUGH = 5.4
 
@@ -60,7 +52,7 @@ class Proposal:
     views: int | None = None  # how many such views are needed
 
 
-def propose(evidence: PoseEvidence, selection: Selection) -> list[Proposal]:
+def propose(evidence: ViewEvidence, selection: Selection) -> list[Proposal]:
     """What would tell the named group apart; without a group, the clearest suspect from what resembles it."""
     pair = _pair(evidence, selection)
     if pair is None:
@@ -77,7 +69,7 @@ def propose(evidence: PoseEvidence, selection: Selection) -> list[Proposal]:
     return out
 
 
-def _pair(evidence: PoseEvidence, selection: Selection) -> tuple[Score, Score] | None:
+def _pair(evidence: ViewEvidence, selection: Selection) -> tuple[Score, Score] | None:
     """The two to separate: the first of the group, or the best suspect and its nearest alias."""
     if len(selection.named) > 1:
         return selection.named[0].score, selection.named[1].score
@@ -94,30 +86,21 @@ def _can_move(chain: Chain) -> bool:
     return chain.robot is not None and chain.views.joints.shape[1] > 0
 
 
-def _best_pose(evidence: PoseEvidence, a: Score, b: Score) -> tuple[Array, int] | None:
+def _best_pose(evidence: ViewEvidence, a: Score, b: Score) -> tuple[Array, int] | None:
     """Joint angles (n,) in degrees and the number of such views; None if poses cannot separate them."""
-    if a.candidate.effect.place in POINTS or b.candidate.effect.place in POINTS:
+    imagined = IMAGINE[type(evidence)](evidence, a, b)
+    if imagined is None:
         return None
-    joints = _reachable(evidence)
-    if not len(joints):
-        return None
-    chain = _imagined(evidence.chain, joints)
-    carrier = placed(chain, ())[0] @ evidence.T_mount
-    to_centre = frames.make(np.eye(3), -evidence.freed.overlaps.gram.centre)
-    own = frames.adjoint(to_centre @ carrier)
-    rows = {s.name: _rows(evidence, chain, s) for s in (a, b)}
-    half = _view_scatter(evidence, chain)
     # What is known already, as normal equations of [hand-eye and model | b] against a's pattern.
-    X = np.hstack([evidence.white_model, np.linalg.solve(evidence.half, b.form.columns) * b.form.sizes])
-    y = np.linalg.solve(evidence.half, a.form.columns) @ a.values
+    X = np.hstack([evidence.white_model, evidence.whiten_raw(b.form.columns) * b.form.sizes])
+    y = evidence.whiten_raw(a.form.columns) @ a.values
     ridge = np.diag(np.concatenate([np.zeros(evidence.white_model.shape[1]), np.full(len(b.form.sizes), 0.01)]))
     M, c, square = X.T @ X + ridge, X.T @ y, float(y @ y)
     known = square - float(c @ np.linalg.lstsq(M, c, rcond=1e-12)[0])
     best, chosen = 0.0, None
-    extra = evidence.white_model.shape[1] - 6
-    for k in range(len(joints)):
-        base = np.hstack([own[k], np.zeros((6, extra)), rows[b.name][k] * b.form.sizes])
-        Xn, yn = (np.linalg.solve(half[k], v) for v in (base, rows[a.name][k] @ a.values))
+    for k in range(len(imagined.joints)):
+        base = np.hstack([imagined.model[k], imagined.b[k] * b.form.sizes])
+        Xn, yn = (np.linalg.solve(imagined.half[k], v) for v in (base, imagined.a[k] @ a.values))
         cn = c + Xn.T @ yn
         gain = square + float(yn @ yn) - float(cn @ np.linalg.lstsq(M + Xn.T @ Xn, cn, rcond=1e-12)[0]) - known
         if gain > best:
@@ -125,58 +108,4 @@ def _best_pose(evidence: PoseEvidence, a: Score, b: Score) -> tuple[Array, int] 
     if chosen is None or best < 1e-3 * _ENOUGH:
         return None
     count = int(np.ceil(max(_ENOUGH - known, best) / best))
-    return np.degrees(joints[chosen]), min(count, 99)
-
-
-def _rows(evidence: PoseEvidence, chain: Chain, scored: Score) -> Array:
-    """(K, 6, p) twists of imagined views per unit of the form's free parameters."""
-    term = with_values(scored.form, np.zeros(len(scored.values)))
-    found = twists(chain, (), term, evidence.T_mount, evidence.freed.overlaps.gram.centre)
-    return np.asarray(found[scored.form.keep].transpose(1, 2, 0))
-
-
-def _reachable(evidence: PoseEvidence) -> Array:
-    """(K, n) joint angles in which the scanner sees the part about as it has before."""
-    chain = evidence.chain
-    assert chain.robot is not None
-    rng = np.random.default_rng(0)
-    seen = chain.views.joints
-    joints = seen[rng.integers(0, len(seen), _SAMPLES)] + rng.uniform(-_SPREAD, _SPREAD, (_SAMPLES, seen.shape[1]))
-    limit = np.maximum(_LIMIT, np.abs(seen).max(axis=0))
-    joints = joints[(np.abs(joints) < limit).all(axis=1)]
-    T = kinematics.forward(chain.robot, joints)
-    poses = (frames.inverse(T) if chain.eye_to_hand else T) @ evidence.T_mount
-    centre = evidence.freed.overlaps.gram.centre[None]
-    place = frames.transform(frames.inverse(poses), centre)[:, 0]
-    before = frames.transform(frames.inverse(evidence.capture.poses(evidence.T_mount)), centre)[:, 0]
-    margin = 0.15 * np.linalg.norm(before, axis=1).mean()
-    inside = ((place > before.min(axis=0) - margin) & (place < before.max(axis=0) + margin)).all(axis=1)
-    # A view direction far from all others would share no surface with them.
-    towards, known = poses[:, :3, 2], evidence.capture.poses(evidence.T_mount)[:, :3, 2]
-    inside &= (towards @ known.T).max(axis=1) > np.cos(np.radians(50.0))
-    return np.asarray(joints[inside][:_TRIED])
-
-
-def _imagined(chain: Chain, joints: Array) -> Chain:
-    """The chain with views that nobody has taken yet, right after the last one, each approached from there."""
-    assert chain.robot is not None
-    views, count = chain.views, len(joints)
-    last = np.repeat(views.joints[-1:], count, axis=0)
-    torques = torques_of(chain.robot, np.vstack([joints, views.joints]))
-    pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
-    imagined = replace(
-        views, count=count, joints=joints, previous=last, approach=np.sign(joints - last),
-        time=np.full(count, views.time[-1] + pause), velocity=None,
-        torques=replace(torques, values=torques.values[:count]),
-        covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
-    )  # fmt: skip
-    return replace(chain, views=imagined, T_base_flange=kinematics.forward(chain.robot, joints), scan_views=())
-
-
-def _view_scatter(evidence: PoseEvidence, chain: Chain) -> Array:
-    """(K, 6, 6) Cholesky factors of the pose scatter of one view about the centre."""
-    to_centre = frames.make(np.eye(3), -evidence.freed.overlaps.gram.centre)
-    T = np.broadcast_to(np.eye(4), chain.T_base_flange.shape) if chain.eye_to_hand else chain.T_base_flange
-    carried = frames.adjoint(to_centre @ T)
-    variances = np.repeat(np.maximum(evidence.null.variances[:2], 1e-300), 3)
-    return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))
+    return np.degrees(imagined.joints[chosen]), min(count, 99)

@@ -1,13 +1,14 @@
 """What the overlaps say about the views, beside hand-eye and model, ready for every candidate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from stitch.capture import Capture
 from stitch.capture_evidence import jacobian
+from stitch.diagnosis.pose_trial import PoseTrial
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
 from stitch.effects.visible import independent, project_out
@@ -69,13 +70,57 @@ class PoseEvidence:
         """(n,) what was seen, in the same units, without what hand-eye and model explain."""
         return self.whiten_channel(self.channel.z[:, None])[:, 0]
 
+    def whiten_raw(self, columns: Array) -> Array:
+        """(n, P) columns of the channel in those units."""
+        return np.asarray(np.linalg.solve(self.half, columns), float)
+
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns of the channel in those units, what hand-eye and model explain projected out."""
-        return project_out(self.white_model, np.asarray(np.linalg.solve(self.half, columns), float))
+        return project_out(self.white_model, self.whiten_raw(columns))
 
     def whiten(self, twists: Array) -> Array:
         """The same from twists (6V, P)."""
         return self.whiten_channel(self.channel.left @ twists)
+
+    def in_channel(self, response: Array) -> Array:
+        """(n, P) of twists (6V, P)."""
+        return np.asarray(self.channel.left @ response)
+
+    def in_blocks(self, columns: Array) -> Array:
+        """(1, n, P): all views are one block."""
+        return columns[None]
+
+    def beside(self, columns: Array) -> "PoseEvidence":
+        """The evidence with further free columns (n, p) of the channel in its model."""
+        more = replace(self.evidence, A=np.concatenate([self.evidence.A, columns[None]], axis=2))
+        # Twists of the model are read through `left`: the pseudo-inverse carries channel columns back to twists.
+        back = np.linalg.pinv(self.channel.left) @ columns
+        null = fit_variances(more, start=self.null.variances)
+        return replace(self, model=np.hstack([self.model, back]), evidence=more, null=null)
+
+    def trial(self, response: Array, points: PointGram | None = None) -> PoseTrial:
+        """A model with the columns of twists (6V, k)."""
+        return PoseTrial(self, response, points)
+
+    def touched(self, views: Array) -> Array:
+        """(pairs,) bool: pairs with one of the views."""
+        return np.asarray(np.isin(self.freed.overlaps.gram.pairs, views).any(axis=1))
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
+        out = (np.linalg.pinv(self.channel.left) @ numbers).reshape(-1, 6)[:, 3:]
+        return np.asarray(out - out.mean(axis=0))
+
+    def displaced(self) -> Array:
+        """(V, 3) how far every view sits from where the model puts it, at the part, reference frame.
+
+        Directions that the overlaps cannot see are at zero, the common motion of all views is taken out.
+        """
+        columns = self.channel.left @ self.model
+        white = np.linalg.solve(self.half, np.column_stack([columns, self.channel.z]))
+        scale = np.maximum(np.linalg.norm(white[:, :-1], axis=0), 1e-300)
+        x = np.linalg.lstsq(white[:, :-1] / scale, white[:, -1], rcond=1e-10)[0] / scale
+        return self.at_part(self.channel.z - columns @ x)
 
     def folds(self) -> list[Array]:
         """Groups of views to leave out."""

@@ -5,6 +5,7 @@ the Wald F test under the form's own REML; forms are counted (Bonferroni). The e
 integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.stats import f as f_distribution
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.detectable import smallest_sizes
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.frames import Array
 from stitch.variance import VarianceFit, fit_variances
 
@@ -23,6 +24,8 @@ _SEEN = 0.5
 _FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
 _HOPELESS = -4.0
+# With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do.
+_REFITTED, _FEWEST = 20_000, 2
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Score:
         return self.candidate.name
 
 
-def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
+def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     """Try all forms of a candidate.
 
     Args:
@@ -54,7 +57,12 @@ def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
     full = candidate.forms[0]
     white = evidence.whiten(candidate.twists)[:, full.keep]
     seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
-    tried = [_try(evidence, form) for form in candidate.forms]
+    quick = np.array([_null_gain(evidence, form) for form in candidate.forms])
+    worth = np.argsort(-quick, kind="stable")[: max(_REFITTED // evidence.evidence.size, _FEWEST)]
+    tried = [
+        _try(evidence, form) if i in worth and quick[i] >= _HOPELESS else (float(quick[i]), 1.0, evidence.null)
+        for i, form in enumerate(candidate.forms)
+    ]
     singles = len(candidate.forms)
     best = max(range(singles), key=lambda i: tried[i][0])
     gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
@@ -65,13 +73,16 @@ def score(evidence: PoseEvidence, candidate: Candidate, tests: int) -> Score:
     return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain, detectable)
 
 
-def _try(evidence: PoseEvidence, form: Form) -> tuple[float, float, VarianceFit]:
+def promising(evidence: ViewEvidence, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """The candidates that gain most at the null's variances, with all their parameters or those of one joint."""
+    gains = [max(_null_gain(evidence, form) for form in c.forms) for c in candidates]
+    return [candidates[k] for k in np.argsort(-np.array(gains), kind="stable")[:count]]
+
+
+def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]:
     """Log evidence over the null, p-value and free fit of one form."""
     e = evidence.evidence
-    G = form.columns[None]
-    quick = _null_gain(evidence, form)
-    if quick < _HOPELESS:
-        return quick, 1.0, evidence.null
+    G = evidence.in_blocks(form.columns)
     integrated = fit_variances(e, G, form.sizes, start=evidence.null.variances)
     gain = 0.5 * (evidence.null.deviance - integrated.deviance)
     free = fit_variances(e, G, _FREE * form.sizes, start=integrated.variances)
@@ -82,7 +93,7 @@ def _try(evidence: PoseEvidence, form: Form) -> tuple[float, float, VarianceFit]
     return gain, float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest)), free
 
 
-def _null_gain(evidence: PoseEvidence, form: Form) -> float:
+def _null_gain(evidence: ViewEvidence, form: Form) -> float:
     """Log evidence gained at the null's variances: cheap, and an upper hand for what cannot help."""
     white = evidence.whiten_channel(form.columns) * form.sizes
     information = np.eye(white.shape[1]) + white.T @ white
@@ -105,7 +116,7 @@ def form_weights(candidate: Candidate) -> Array:
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
 
 
-def _detectable(evidence: PoseEvidence, candidate: Candidate, weights: Array, tests: int) -> dict[str, float]:
+def _detectable(evidence: ViewEvidence, candidate: Candidate, weights: Array, tests: int) -> dict[str, float]:
     """Smallest detectable size of every free parameter."""
     e = evidence.evidence
     told = [
@@ -119,7 +130,7 @@ def _detectable(evidence: PoseEvidence, candidate: Candidate, weights: Array, te
 
 
 def _fill(
-    evidence: PoseEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
+    evidence: ViewEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
     p: float, gain: float, detectable: dict[str, float],
 ) -> Score:  # fmt: skip
     a, size = evidence.evidence.A.shape[2], form.columns.shape[1]

@@ -1,20 +1,22 @@
 """From scores to an answer: which effects are named, which cannot be told apart, whether something unknown is there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
-from stitch.diagnosis.pose_evidence import PoseEvidence
-from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.evidence import ViewEvidence
+from stitch.diagnosis.score import Score, promising, score
 from stitch.diagnosis.thresholds import ALPHA_NAME, ALPHA_UNKNOWN, GAIN, ODDS
-from stitch.frames import Array
-from stitch.variance import fit_variances
 
 # Prior shares: nothing is missing, one effect of the library, something without a name.
 _NOTHING, _PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
+# Hundreds of views show several missing effects at once; among few, one is all that can be told.
+MANY = 100
+# Effects that are sought together, and candidates tried in earnest for each of them.
+_AT_ONCE, _TRIED = 6, 5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
@@ -48,32 +50,67 @@ class Selection:
     second: Ranked | None = None  # a further effect that the views show beside the first
 
 
-def score_all(evidence: PoseEvidence, candidates: Sequence[Candidate]) -> list[Score]:
+def score_all(evidence: ViewEvidence, candidates: Sequence[Candidate]) -> list[Score]:
     """Scores in the order of the candidates."""
     tests = sum(c.effect.tier != "empirical" for c in candidates)
     return [score(evidence, c, tests) for c in candidates]
 
 
-def select(evidence: PoseEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
+def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = rank(score_all(evidence, candidates))
     contenders = [r for r in ranked if _contends(r)]
     stray = next((r for r in empirical[:1] if r.adjusted < ALPHA_UNKNOWN and r.score.gain > GAIN), None)
-    if stray is None and not any(r.score.gain > GAIN for r in contenders):
+    if stray is None and not any(_certain(r) for r in contenders):
         verdict = "unknown_effect" if implausible(evidence, length_unit) else "adequate"
         return Selection(verdict, (), ranked, empirical)
     if not contenders:
         return Selection("unknown_effect", (), ranked, empirical)
     best, second = contenders[0], None
-    if stray is not None and stray.log_posterior > best.log_posterior + ODDS:
+    if evidence.chain.views.count >= MANY:
+        chain, explained = _together(evidence, candidates, best)
+        best, second = chain[0], chain[1] if len(chain) > 1 else None
+        if stray is not None and stray.log_posterior > explained + ODDS:
+            return Selection("unknown_effect", (), ranked, empirical)
+    elif stray is not None and stray.log_posterior > best.log_posterior + ODDS:
         # Two known effects at once may look like none of them: try the best with a second one.
         best, second = _pair(evidence, candidates, best)
         together = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(_PHYSICAL / len(ranked)))
         if stray.log_posterior > together + ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
     others = (r for r in contenders if r.name != best.name and r.log_posterior > best.log_posterior - ODDS)
-    group = (best, *others)
+    group = (best, *(() if second is not None else others))
     return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second)
+
+
+def _together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[list[Ranked], float]:
+    """Effects that are missing at once, first the one without which most would stay unexplained; their log posterior.
+
+    One effect alone may explain more than each of two that are there, because it imitates a part of both. So
+    effects are added one by one as long as one can be named beside those before; then each must hold its
+    place beside all the others.
+    """
+    chain = [best]
+    while len(chain) < _AT_ONCE:
+        beside = _beside(evidence, chain)
+        others = [c for c in candidates if c.name not in {r.name for r in chain} and c.effect.tier != "empirical"]
+        ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
+        following = next((r for r in ranked if _certain(r)), None)
+        if following is None:
+            break
+        chain.append(following)
+    explained = sum(r.log_posterior for r in chain)
+    for name in [r.name for r in chain]:
+        others_in = [r for r in chain if r.name != name]
+        candidate = next(c for c in candidates if c.name == name)
+        own = rank(score_all(_beside(evidence, others_in), [candidate]))[0][0]
+        chain = [*others_in, own] if _certain(own) else others_in
+    return sorted(chain, key=lambda r: -r.log_posterior) or [best], explained
+
+
+def _beside(evidence: ViewEvidence, chain: Sequence[Ranked]) -> ViewEvidence:
+    columns = [r.score.form.columns for r in chain]
+    return evidence.beside(np.hstack(columns)) if columns else evidence
 
 
 def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
@@ -93,7 +130,7 @@ def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...
     return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
 
 
-def implausible(evidence: PoseEvidence, length_unit: str) -> bool:
+def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     """True if the poses scatter as no arm does."""
     rotation, translation = np.sqrt(evidence.null.variances[:2])
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
@@ -110,24 +147,16 @@ def _contends(r: Ranked) -> bool:
     return r.physical and r.score.observable and r.adjusted < ALPHA_NAME and r.score.gain > 0 and believable
 
 
-def _pair(evidence: PoseEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
+def _certain(r: Ranked) -> bool:
+    """Enough for an alarm."""
+    return _contends(r) and r.score.gain > GAIN
+
+
+def _pair(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
     """The best effect and the one that explains most beside it; of the two the stronger comes first."""
     others = [c for c in candidates if c.name != best.name and c.effect.tier != "empirical"]
-    ranked, _ = rank(score_all(with_columns(evidence, best.score.form.columns), others))
-    second = next((r for r in ranked if _contends(r) and r.score.gain > GAIN), None)
+    ranked, _ = rank(score_all(evidence.beside(best.score.form.columns), others))
+    second = next((r for r in ranked if _certain(r)), None)
     if second is None:
         return best, None
     return best, second
-
-
-def with_columns(evidence: PoseEvidence, columns: Array) -> PoseEvidence:
-    """The evidence with further free columns (n, p) of the channel in its model."""
-    e = evidence.evidence
-    A = np.concatenate([e.A, columns[None]], axis=2)
-    more = replace(e, A=A)
-    # Twists of the model are read through `left`: the pseudo-inverse carries channel columns back to twists.
-    back = np.linalg.pinv(evidence.channel.left) @ columns
-    return replace(
-        evidence, model=np.hstack([evidence.model, back]), evidence=more,
-        null=fit_variances(more, start=evidence.null.variances),
-    )  # fmt: skip

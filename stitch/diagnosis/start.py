@@ -5,17 +5,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.diagnosis.candidates import candidate_of, with_values
-from stitch.diagnosis.pose_evidence import PoseEvidence, pose_evidence
+from stitch.diagnosis.evidence import ViewEvidence
+from stitch.diagnosis.pose_evidence import pose_evidence
 from stitch.diagnosis.score import score
+from stitch.diagnosis.target_evidence import target_evidence
 from stitch.effects.chain import Term, corrected
 from stitch.effects.contract import Effect
 from stitch.effects.terms import empty_term
 from stitch.free_poses import free_poses
+from stitch.labelled.landmarks import drawing_of
 from stitch.state import State
 
 
-def evidence_of_state(state: State) -> PoseEvidence:
-    """Free the views under the model and reduce them to evidence."""
+def evidence_of_state(state: State) -> ViewEvidence:
+    """Free the views under the model and reduce them to evidence; labelled points are evidence as they are."""
+    sightings = state.chain.capture.sightings
+    if not state.chain.capture.scans and sightings is not None:
+        return target_evidence(state.chain, state.terms, state.T_mount, drawing_of(state.session.nominal, sightings))
     own = corrected(state.chain, state.terms, state.T_mount)
     freed = free_poses(own, own.poses(state.T_mount), state.gate)
     return pose_evidence(state.chain, state.terms, own, state.T_mount, freed)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.select import Ranked
 from stitch.effects.views import Views
 from stitch.frames import Array
@@ -26,7 +26,7 @@ class Dependence:
     shape: str  # the empirical form that fits best, in words
 
 
-def dependences(evidence: PoseEvidence, empirical: Sequence[Ranked]) -> list[Dependence]:
+def dependences(evidence: ViewEvidence, empirical: Sequence[Ranked]) -> list[Dependence]:
     """The best empirical form of every covariate, clearest first."""
     views = evidence.chain.views
     best: dict[str, Ranked] = {}
@@ -51,15 +51,15 @@ def course_of(views: Views, name: str) -> Array | None:
     return views.covariates.get(name)
 
 
-def _dependence(evidence: PoseEvidence, ranked: Ranked, course: Array) -> Dependence:
+def _dependence(evidence: ViewEvidence, ranked: Ranked, course: Array) -> Dependence:
     scored = ranked.score
     white = evidence.whiten_channel(scored.form.columns)
     basis, s, _ = np.linalg.svd(white, full_matrices=False)
     basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
     share = float(np.sum((basis.T @ evidence.white_z) ** 2) / max(float(np.sum(evidence.white_z**2)), 1e-300))
-    displacement = displacements(evidence)
+    displacement = evidence.displaced()
     # The direction in which the displacements follow the fitted shape most.
-    fitted = _predicted(evidence, scored.form.columns, scored.values)
+    fitted = evidence.at_part(scored.form.columns @ scored.values)
     direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
     y = displacement @ direction
     if np.dot(y, fitted @ direction) < 0:
@@ -69,30 +69,6 @@ def _dependence(evidence: PoseEvidence, ranked: Ranked, course: Array) -> Depend
         scored.candidate.effect.group if scored.candidate.effect.group != "an event" else "view order", share,
         ranked.adjusted, centres, mean, sigma, scored.candidate.effect.formula,
     )  # fmt: skip
-
-
-def displacements(evidence: PoseEvidence) -> Array:
-    """(V, 3) how far every view sits from where the model puts it, at the part, reference frame.
-
-    Directions that the overlaps cannot see are at zero, the common motion of all views is taken out.
-    """
-    half = evidence.half
-    columns = evidence.channel.left @ evidence.model
-    white = np.linalg.solve(half, np.column_stack([columns, evidence.channel.z]))
-    scale = np.maximum(np.linalg.norm(white[:, :-1], axis=0), 1e-300)
-    x = np.linalg.lstsq(white[:, :-1] / scale, white[:, -1], rcond=1e-10)[0] / scale
-    rest = evidence.channel.z - columns @ x
-    return _at_part(evidence, rest)
-
-
-def _predicted(evidence: PoseEvidence, columns: Array, values: Array) -> Array:
-    return _at_part(evidence, columns @ values)
-
-
-def _at_part(evidence: PoseEvidence, z: Array) -> Array:
-    twists = (np.linalg.pinv(evidence.channel.left) @ z).reshape(-1, 6)
-    out = twists[:, 3:]
-    return np.asarray(out - out.mean(axis=0))
 
 
 def binned(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:

@@ -6,7 +6,7 @@ A capture keeps this form: `T_reference_mount` holds what stands left of the han
 what stands right of it, and the points are those that sensor and part would have shown without effects.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from stitch.session import Session
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 _SMALLEST_COSINE = 0.1
+_EVENT_PLACES = 50
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Chain:
     views: Views
     scan_views: tuple[ScanView, ...]
     length_unit: str
+    target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
 
     def parameters(self, effect: Effect) -> tuple[Parameter, ...]:
         """The parameters of an effect in this session."""
@@ -45,10 +47,12 @@ class Chain:
         return tuple(replace(p, grid=self._grid(p)) for p in found)
 
     def _grid(self, parameter: Parameter) -> tuple[float, ...]:
+        if parameter.grid != EVERY_VIEW:
+            return parameter.grid
         # An event can come before any view but the first two and the last: one view alone shows no event.
-        return (
-            tuple(float(v) for v in range(2, self.views.count - 1)) if parameter.grid == EVERY_VIEW else parameter.grid
-        )
+        places = range(2, self.views.count - 1)
+        # Among hundreds of views the place of an event matters less than the time to try them all.
+        return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
 
     def arguments(self, effect: Effect, values: Array) -> dict[str, float | Array]:
         """Keyword arguments of the effect's function."""
@@ -65,7 +69,7 @@ class Chain:
     @property
     def has_intensity(self) -> bool:
         """True if every point has an intensity."""
-        return all(view.intensity is not None for view in self.scan_views)
+        return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
 
 
 @dataclass(frozen=True)
@@ -86,13 +90,22 @@ def chain_of(session: Session, capture: Capture) -> Chain:
         gravity = session.robot.gravity / np.linalg.norm(session.robot.gravity)
     down = frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0] if eye_to_hand else None
     intensity = _intensities(session)
-    size = float(np.median([np.ptp(scan.points, axis=0).max() for scan in capture.scans])) if capture.scans else 1.0
+    size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     scan_views = tuple(
         ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v],
                  gravity if down is None else down[v], size)
         for v, scan in enumerate(capture.scans)
     )  # fmt: skip
-    return Chain(capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit)
+    target_views: tuple[ScanView, ...] = ()
+    if capture.sightings is not None:
+        # Nobody knows at what slant a target was seen: an effect of incidence has nothing to say about it.
+        straight = np.ones(capture.sightings.used.shape[1])
+        target_views = tuple(
+            ScanView(v, views, straight, None, gravity if down is None else down[v], size) for v in range(views.count)
+        )
+    return Chain(
+        capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit, target_views
+    )
 
 
 def _intensities(session: Session) -> list[Array | None]:
@@ -136,15 +149,19 @@ def placed(chain: Chain, terms: Sequence[Term]) -> tuple[Array, Array]:
 
 
 def shift(chain: Chain, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice) -> Array:
-    """(N, 3) what must be added to the measured points of view v, scanner frame, to undo sensor and part effects.
+    """(N, 3) what must be added to the scanned points of view v, scanner frame, to undo sensor and part effects.
 
     Args:
         pose: (4, 4) T_reference_scanner of the view.
     """
-    points = chain.capture.scans[v].points[index]
     view = chain.scan_views[v]
     view = replace(view, cosine=view.cosine[index],
                    intensity=None if view.intensity is None else view.intensity[index])  # fmt: skip
+    return undone(chain, terms, chain.capture.scans[v].points[index], view, pose)
+
+
+def undone(chain: Chain, terms: Sequence[Term], points: Array, view: ScanView, pose: Array) -> Array:
+    """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects."""
     true = points
     for term in (t for t in terms if t.effect.place == "sensor"):
         # Corrections are thousandths of the range: one fixed-point step leaves millionths.
@@ -158,6 +175,21 @@ def shift(chain: Chain, terms: Sequence[Term], v: int, pose: Array, index: Indic
     return np.asarray(true - points)
 
 
+def shift_targets(chain: Chain, terms: Sequence[Term], poses: Array) -> Array:
+    """(V, S, 3) the same as `shift` for the labelled points of all views; zero in empty slots."""
+    sightings = chain.capture.sightings
+    assert sightings is not None
+    if not any(term.effect.place in ("sensor", "shape") for term in terms):
+        return np.zeros(sightings.points.shape)
+    # An empty slot borrows a point: its own zero has no ray.
+    first = sightings.points[np.arange(len(poses)), (sightings.target >= 0).argmax(axis=1)]
+    filled = np.where((sightings.target >= 0)[..., None], sightings.points, first[:, None])
+    blank = ~(sightings.target >= 0).any(axis=1)
+    filled[blank] = filled[~blank].mean(axis=0)
+    moved = [undone(chain, terms, filled[v], view, poses[v]) for v, view in enumerate(chain.target_views)]
+    return np.where((sightings.target >= 0)[..., None], np.array(moved), 0.0)
+
+
 def corrected(chain: Chain, terms: Sequence[Term], T_mount: Array) -> Capture:
     """The capture as it would be without the effects in `terms`."""
     left, right = placed(chain, terms)
@@ -166,6 +198,9 @@ def corrected(chain: Chain, terms: Sequence[Term], T_mount: Array) -> Capture:
         poses = capture.poses(T_mount)
         scans = [_moved(scan, shift(chain, terms, v, poses[v], slice(None))) for v, scan in enumerate(capture.scans)]
         capture = replace(capture, scans=tuple(scans))
+        if capture.sightings is not None:
+            points = capture.sightings.points + shift_targets(chain, terms, poses)
+            capture = replace(capture, sightings=replace(capture.sightings, points=points))
     return capture
 
 
@@ -199,10 +234,20 @@ def twists(chain: Chain, terms: Sequence[Term], term: Term, T_mount: Array, cent
 
 def shifts(chain: Chain, terms: Sequence[Term], term: Term, v: int, pose: Array, index: Indices | slice) -> Array:
     """(P, N, 3) slopes of `shift` for each parameter of `term`, scanner frame."""
+    return _slopes(chain, terms, term, lambda with_step: shift(chain, with_step, v, pose, index))
+
+
+def target_shifts(chain: Chain, terms: Sequence[Term], term: Term, poses: Array) -> Array:
+    """(P, V, S, 3) slopes of `shift_targets` for each parameter of `term`, sensor frame."""
+    return _slopes(chain, terms, term, lambda with_step: shift_targets(chain, with_step, poses))
+
+
+def _slopes(chain: Chain, terms: Sequence[Term], term: Term, moved: Callable[[Sequence[Term]], Array]) -> Array:
+    """Central differences of `moved` in each parameter of `term`."""
     others = [t for t in terms if t.effect.name != term.effect.name]
     out = []
     for i, parameter in enumerate(chain.parameters(term.effect)):
         step = 0.1 * parameter.typical * np.eye(len(term.values))[i]
-        both = [shift(chain, [*others, replace(term, values=term.values + s * step)], v, pose, index) for s in (1, -1)]
+        both = [moved([*others, replace(term, values=term.values + s * step)]) for s in (1, -1)]
         out.append((both[0] - both[1]) / (0.2 * parameter.typical))
     return np.array(out)

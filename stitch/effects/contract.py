@@ -31,6 +31,9 @@ EVERY_VIEW = (-1.0,)
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Units are written for millimetres; a session in metres has the same unit with m.
 _PER_MM = {"mm": 1.0, "m": 1e-3}
+# What a link and all that it carries may well weigh, kg, where nobody states it; and how much more than is
+# believable for a known mass the product of mass and compliance may be, for light and soft arms too.
+_LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,12 @@ class Effect:
             else:
                 names = {"number": [key], "joint": [f"{key}{i + 1}" for i in range(joints)],
                          "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
-                out += [_in_unit(n, spec.unit, spec.typical, spec.limit, spec.grid, length_unit) for n in names]
+                # A torque between two joints is that of 1 kg there; the link's mass is in the coefficient.
+                for name in names:
+                    massless = spec.kind == "torque" and "_" in name[len(key) :]
+                    typical, limit = (_LINK_MASS, _LINK_MASS_LIMIT) if massless else (1.0, 1.0)
+                    out.append(_in_unit(name, spec.unit, typical * spec.typical, limit * spec.limit, spec.grid,
+                                        length_unit))  # fmt: skip
         return tuple(out)
 
     def arguments(self, values: Array, joints: int, torques: int) -> dict[str, Any]:

@@ -29,11 +29,12 @@ def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequen
         effects: number of the effect that each group belongs to.
     """
     G, y = project_out(own, further * sizes), project_out(own, z[:, None])[:, 0]
+    M, v = G.T @ G, G.T @ y
 
     def gain(chosen: Sequence[int]) -> float:
-        white = G[:, [i for k in chosen for i in groups[k]]]
-        information = np.eye(white.shape[1]) + white.T @ white
-        b = white.T @ y
+        index = [i for k in chosen for i in groups[k]]
+        information = np.eye(len(index)) + M[np.ix_(index, index)]
+        b = v[index]
         return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
     chosen = _forward_and_back(gain, len(groups))

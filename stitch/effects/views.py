@@ -1,5 +1,6 @@
 """What effects may know of the views: all of them at once (`Views`), or one with its points (`ScanView`)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,6 +116,7 @@ def views_of(session: Session) -> Views:
 
 def _median_range(session: Session) -> float:
     ranges = [np.median(np.linalg.norm(v.cloud.points, axis=1)) for v in session.views if v.cloud]
+    ranges += [np.median(np.linalg.norm(v.sighting.points, axis=1)) for v in session.views if v.sighting]
     return float(np.median(ranges)) if ranges else 1.0
 
 
@@ -126,8 +128,23 @@ def torques_of(robot: Robot, joints: Array) -> Torques:
         return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
     # Without masses the shape of every torque follows from the geometry: 1 kg at each link's frame.
     unit = kinematics.unit_torques(robot, joints)
-    keep = [(i, k) for i in range(n) for k in range(i, n) if np.ptp(unit[:, i, k]) > 1e-3]
+    keep = [(i, k) for i in range(n) for k in _different(unit[:, i], range(i, n))]
     return Torques(
         tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep),
         np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep)),
     )  # fmt: skip
+
+
+def _different(torques: Array, links: Sequence[int]) -> list[int]:
+    """The links whose unit torque (V, n) about one joint changes and is no combination of those before it.
+
+    Frames of a wrist share their origin: a second torque from the same place would only make both unknown.
+    """
+    chosen, basis = list[int](), np.zeros((len(torques), 0))
+    for k in links:
+        own = torques[:, k]
+        rest = own - basis @ (basis.T @ own)
+        if np.ptp(own) > 1e-3 and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
+            chosen.append(k)
+            basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+    return chosen

@@ -23,11 +23,11 @@ _MAXIMUM_ITERATIONS = 6
 # Settled when no parameter moves by a twentieth of its sigma.
 _SETTLED = 0.05
 # Iterations in which it is still open what is fitted.
-_CHOOSING = 2
+CHOOSING = 2
 # A parameter that these views know worse than this many times its plausible size stays at zero: it would
 # only borrow from the hand-eye.
-_UNSEEN = 4.0
-_WEAK = 10.0
+UNSEEN = 4.0
+WEAK = 10.0
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,17 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
         columns = [np.hstack([np.zeros((6 * len(c.scans), 0)), *all_columns(chain, terms, terms, T_mount, f)[0]])
                    for chain, c, f in zip(chains, captures, freed, strict=True)]  # fmt: skip
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
-        if iteration < _CHOOSING:
+        if iteration < CHOOSING:
             whiten = partial(whitened, captures, freed, T_mount, columns, values)
-            seen = _fitted(chains[0], terms, seen, sizes, whiten)
+            seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
         fitted = fit_hand_eye(
-            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], _WEAK * sizes[seen])
+            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen])
         )
         T_mount, before = fitted.T_mount, values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[~held] = 0.0
         values[seen] = fitted.values
-        terms = _with_values(terms, values)
+        terms = with_values(terms, values)
         history.append(float(np.median([f.overlaps.gram.rms for f in freed])))
         sigma = np.sqrt(np.maximum(np.diag(fitted.values_covariance), 1e-300))
         if not len(values) or np.max(np.abs(values - before)[seen] / sigma, initial=0.0) < _SETTLED:
@@ -93,10 +93,16 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
     return Refinement(fitted, tuple(terms), own, captures, tuple(freed), overlaps, tuple(history))
 
 
-def _fitted(
+def fitted_parameters(
     chain: Chain, terms: Sequence[Term], before: Array, sizes: Array, whiten: Callable[[Array], tuple[Array, ...]]
 ) -> Array:
-    """(P,) bool: parameters that the views support and can tell apart."""
+    """(P,) bool: parameters that the views support and can tell apart.
+
+    Args:
+        before: (P,) bool: what explained scatter so far.
+        sizes: (P,) plausible sizes.
+        whiten: from what explains scatter to whitened columns of the hand-eye (and landmarks), of the effects, and z.
+    """
     groups, effects, at = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
         own = one_by_one(term.effect, chain.parameters(term.effect))
@@ -106,12 +112,12 @@ def _fitted(
     if not groups:
         return before
     free = before
-    for _ in range(_CHOOSING):
+    for _ in range(CHOOSING):
         # What is found explains scatter, and less scatter shows more.
         own_columns, further, z = whiten(free)
         free = supported(own_columns, further, z, sizes, groups, effects)
     own_columns, further, _ = whiten(free)
-    return np.logical_and(free, independent(own_columns, further * free, sizes, 1 / _UNSEEN))
+    return np.logical_and(free, independent(own_columns, further * free, sizes, 1 / UNSEEN))
 
 
 def _free(
@@ -128,7 +134,8 @@ def _settled_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps
     return collect(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples)
 
 
-def _with_values(terms: Sequence[Term], values: Array) -> list[Term]:
+def with_values(terms: Sequence[Term], values: Array) -> list[Term]:
+    """The terms with the values of all their parameters in one row."""
     out, at = [], 0
     for term in terms:
         out.append(replace(term, values=values[at : at + len(term.values)]))

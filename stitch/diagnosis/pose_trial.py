@@ -1,0 +1,71 @@
+"""A model of the views' twists tried on sums over pairs: no new matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stitch.effects.columns import PointGram
+from stitch.frames import Array, Indices
+from stitch.solve import pair_squares
+
+if TYPE_CHECKING:
+    from stitch.diagnosis.pose_evidence import PoseEvidence
+
+
+@dataclass(frozen=True)
+class PoseTrial:
+    """Columns X (6V, k) of twists; `points` are the sums of the last ones if these change the points themselves."""
+
+    evidence: PoseEvidence
+    X: Array
+    points: PointGram | None
+
+    def solve(self, left_out: Array | None) -> Array:
+        """Coefficients (k,) by generalised least squares without some views."""
+        e = self.evidence
+        white = e.white_left @ self.X
+        if left_out is not None:
+            # A view is left out by letting it move freely: six more columns each.
+            white = np.hstack([white, e.white_left[:, _columns_of(left_out)]])
+        scale = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
+        return np.asarray((np.linalg.lstsq(white / scale, e.raw_white_z, rcond=1e-10)[0] / scale)[: self.X.shape[1]])
+
+    def squares(self, coefficients: Array) -> Array:
+        """Σ w e² per pair after the model moved; point effects change e itself and do not move the views."""
+        g, points = self.evidence.freed.overlaps.gram, self.points
+        if points is None:
+            return pair_squares(g, self._moved(self.X, coefficients))
+        k = points.residual.shape[1]
+        theta, rest = coefficients[-k:], coefficients[:-k]
+        moved = self._moved(self.X[:, :-k], rest)
+        difference = moved[g.pairs[:, 0]] - moved[g.pairs[:, 1]]
+        cross = np.einsum("pi,pik,k->p", difference, points.vector, theta)
+        return np.asarray(
+            pair_squares(g, moved) + 2 * points.residual @ theta + 2 * cross
+            + np.einsum("k,pkl,l->p", theta, points.square, theta)
+        )  # fmt: skip
+
+    def scatter(self, left_out: Array, coefficients: Array) -> float:
+        """In the directions of the whitened channel that the left-out views alone move."""
+        e = self.evidence
+        own = _orthonormal(e.white_left[:, _columns_of(left_out)])
+        return float(np.sum((own.T @ (e.raw_white_z - e.white_left @ (self.X @ coefficients))) ** 2))
+
+    def carriers(self, coefficients: Array) -> Indices:
+        """All views."""
+        return np.arange(self.evidence.freed.overlaps.gram.views, dtype=np.int64)
+
+    def _moved(self, X: Array, coefficients: Array) -> Array:
+        return np.asarray((X @ coefficients).reshape(-1, 6) - self.evidence.freed.twists)
+
+
+def _orthonormal(columns: Array) -> Array:
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > 1e-9 * s[0]])
+
+
+def _columns_of(views: Array) -> Array:
+    return np.asarray((6 * np.asarray(views)[:, None] + np.arange(6)).ravel())

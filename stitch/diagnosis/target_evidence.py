@@ -1,0 +1,138 @@
+"""What labelled points say about the views, beside hand-eye, landmarks and model; every view is a block of its own."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from stitch.diagnosis.target_trial import TargetTrial
+from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.columns import PointGram
+from stitch.effects.visible import independent
+from stitch.folds import grouped_folds
+from stitch.frames import Array
+from stitch.labelled.landmarks import Drawing, Landmarks, settled
+from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
+from stitch.labelled.solve import whitener
+from stitch.stages.refine import UNSEEN
+from stitch.variance import Evidence, VarianceFit, fit_variances
+
+
+@dataclass(frozen=True)
+class TargetEvidence:
+    """One session under its model. A response counts rows: n = B·m of them, those of absent targets at zero."""
+
+    chain: Chain
+    terms: tuple[Term, ...]
+    T_mount: Array
+    rows: Rows
+    landmarks: Landmarks
+    model: Array  # (n, a) of hand-eye, landmarks and effects in use that the views can see
+    evidence: Evidence
+    null: VarianceFit
+
+    def columns(self, candidates: Sequence[Term]) -> tuple[list[Array], PointGram | None, list[slice | None]]:
+        """Rows (n, P) of each candidate; point effects need no sums over pairs here."""
+        found = [effect_rows(self.rows, self.chain, self.terms, c) for c in candidates]
+        return [c.reshape(self.rows.left.size, c.shape[2]) for c in found], None, [None] * len(found)
+
+    def in_channel(self, response: Array) -> Array:
+        """(n, P): the rows themselves."""
+        return response
+
+    def in_blocks(self, columns: Array) -> Array:
+        """(B, m, P)."""
+        return columns.reshape(*self.rows.left.shape, columns.shape[1])
+
+    @cached_property
+    def half(self) -> Array:
+        """(B, m, m) inverse Cholesky factors of the null's covariance."""
+        return whitener(self.evidence, self.null.variances)
+
+    @cached_property
+    def white_model(self) -> Array:
+        """(n, a) hand-eye, landmarks and model in units of the null's scatter."""
+        return self.whiten_raw(self.model)
+
+    @cached_property
+    def _explained(self) -> Array:
+        """(n, r) orthonormal basis of `white_model`."""
+        scaled = self.white_model / np.maximum(np.linalg.norm(self.white_model, axis=0), 1e-300)
+        U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+        return np.asarray(U[:, s > 1e-9 * s[0]])
+
+    @cached_property
+    def white_z(self) -> Array:
+        """(n,) what was seen, in the same units, without what the model explains."""
+        return self.whiten_channel(-self.rows.left.reshape(-1, 1))[:, 0]
+
+    def whiten_raw(self, columns: Array) -> Array:
+        """(n, P) columns in those units."""
+        return np.asarray((self.half @ self.in_blocks(columns)).reshape(columns.shape))
+
+    def whiten_channel(self, columns: Array) -> Array:
+        """(n, P) columns in those units, what the model explains projected out."""
+        white = self.whiten_raw(columns)
+        return np.asarray(white - self._explained @ (self._explained.T @ white))
+
+    def whiten(self, response: Array) -> Array:
+        """The same."""
+        return self.whiten_channel(response)
+
+    def beside(self, columns: Array) -> "TargetEvidence":
+        """The evidence with further free columns (n, p) in its model."""
+        more = replace(self.evidence, A=np.concatenate([self.evidence.A, self.in_blocks(columns)], axis=2))
+        null = fit_variances(more, start=self.null.variances)
+        return replace(self, model=np.hstack([self.model, columns]), evidence=more, null=null)
+
+    def trial(self, response: Array, points: PointGram | None = None) -> TargetTrial:
+        """A model with the columns of rows (n, k)."""
+        covariance = self.evidence.covariance(self.null.variances)
+        return TargetTrial(self.rows, covariance, self.in_blocks(response))
+
+    def touched(self, views: Array) -> Array:
+        """(V,) bool."""
+        return np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
+
+    def folds(self) -> list[Array]:
+        """Groups of views to leave out."""
+        return [np.asarray(f) for f in grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)]
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) mean displacement of the targets that a view shows; zero for one that shows none."""
+        V = len(self.rows.lever)
+        shown = self.rows.used[:, : self.rows.positions : 3]
+        moved = numbers.reshape(self.rows.left.shape)[:V, : self.rows.positions].reshape(V, -1, 3)
+        return np.asarray(moved.sum(axis=1) / np.maximum(shown.sum(axis=1), 1)[:, None])
+
+    def displaced(self) -> Array:
+        """(V, 3) how far the targets of every view sit from where the model puts them."""
+        trial = self.trial(self.model)
+        return self.at_part(-(self.rows.left + trial.X @ trial.solve(None)))
+
+
+def target_evidence(chain: Chain, terms: Sequence[Term], T_mount: Array, drawing: Drawing | None) -> TargetEvidence:
+    """Linearise the labelled points of a session about its model.
+
+    Args:
+        chain: with the sightings that count.
+    """
+    own = corrected(chain, terms, T_mount)
+    landmarks = settled(own, T_mount, drawing)
+    rows = rows_of(own, T_mount, landmarks)
+    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
+    extra = np.concatenate([base[..., :0], *(effect_rows(rows, chain, terms, t) for t in terms)], axis=2)
+    sizes = np.array([p.typical for t in terms for p in chain.parameters(t.effect)])
+    # Parameters that the fit left at zero are not in the model.
+    used = np.array([v != 0 and not p.discrete for t in terms
+                     for p, v in zip(chain.parameters(t.effect), t.values, strict=True)], bool)  # fmt: skip
+    whole = evidence_of_rows(rows, np.concatenate([base, extra[..., used]], axis=2))
+    half = whitener(whole, fit_variances(whole, both_starts=True).variances)
+    n = rows.left.size
+    own_columns, further = ((half @ c).reshape(n, c.shape[2]) for c in (base, extra))
+    seen = used & independent(own_columns, further * used, sizes, 1 / UNSEEN)
+    A = np.concatenate([base, extra[..., seen]], axis=2)
+    evidence = evidence_of_rows(rows, A)
+    null = fit_variances(evidence, both_starts=True)
+    return TargetEvidence(chain, tuple(terms), T_mount, rows, landmarks, A.reshape(n, -1), evidence, null)

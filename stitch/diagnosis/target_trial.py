@@ -1,0 +1,53 @@
+"""A model of labelled points tried in the linear approximation."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from stitch.frames import Array, Indices
+from stitch.labelled.rows import Rows
+from stitch.labelled.solve import Blocks
+
+# Views of largest influence on the estimates: if one alone carries them, it is among these.
+_CARRIERS = 20
+
+
+@dataclass(frozen=True)
+class TargetTrial:
+    """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
+
+    rows: Rows
+    covariance: Array  # (B, m, m)
+    X: Array
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        k = self.X.shape[2]
+        return Blocks(-self.rows.left, self.X, self.covariance, np.zeros(k), np.zeros(k))
+
+    def solve(self, left_out: Array | None) -> Array:
+        """Coefficients (k,) without some views."""
+        return self.blocks.solve(left_out)
+
+    def squares(self, coefficients: Array) -> Array:
+        """(V,) squares of the 3D distances of a view's targets."""
+        return np.asarray(np.nansum(self.rows.distances(self.rows.left + self.X @ coefficients) ** 2, axis=1))
+
+    def scatter(self, left_out: Array, coefficients: Array) -> float:
+        """Of the distances at the left-out views' targets, in units of the sensor's noise: each is seen as it is."""
+        own = self.rows.used[left_out, : self.rows.positions]
+        rest = (self.rows.left + self.X @ coefficients)[left_out, : self.rows.positions]
+        return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out, : self.rows.positions][own]))
+
+    def carriers(self, coefficients: Array) -> Indices:
+        """The views without which the coefficients would move most, to first order."""
+        b = self.blocks
+        pulls = b.vector - b.information @ coefficients
+        moves = (
+            pulls
+            * b.scale
+            @ np.linalg.pinv(b.information.sum(axis=0) * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
+        )
+        sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
+        return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)

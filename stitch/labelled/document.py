@@ -1,0 +1,98 @@
+"""What labelled points add to model.toml, result.json and residuals.parquet, and back."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from stitch.effects.chain import Chain
+from stitch.frames import Array
+from stitch.labelled.fit import LabelledFit
+from stitch.model import Target
+from stitch.result import Run
+from stitch.session import Session
+
+
+def targets_of(found: LabelledFit | None) -> dict[str, Target]:
+    """The targets that were seen, for model.toml."""
+    if found is None:
+        return {}
+    sightings = found.rows.capture.sightings
+    assert sightings is not None
+    K = len(sightings.targets)
+    sigma = np.sqrt(np.maximum(np.diag(found.landmarks_covariance)[: 3 * K], 0)).reshape(K, 3)
+    return {
+        name: Target(found.landmarks.positions[k], sigma[k], found.landmarks.orientation)
+        for k, name in enumerate(sightings.targets)
+        if np.isfinite(found.landmarks.positions[k]).all()
+    }
+
+
+def target_rows(found: LabelledFit | None) -> list[dict[str, Any]]:
+    """The list `targets` of result.json, reference frame."""
+    targets = targets_of(found)
+    if found is None:
+        return []
+    sightings = found.rows.capture.sightings
+    assert sightings is not None
+    seen = dict(zip(sightings.targets, sightings.seen, strict=True))
+    return [
+        {"target": name, "position": t.position.tolist(), "sigma": t.sigma.tolist(), "seen": int(seen[name])}
+        | ({} if t.orientation is None else {"orientation": t.orientation.tolist()})
+        for name, t in targets.items()
+    ]
+
+
+def labelled_facts(run: Run) -> dict[str, Any]:
+    """What the rms of a run on labelled points counts, the errors left out and inside, and the outliers."""
+    if run.labelled is None:
+        return {}
+    rows = run.labelled.rows
+    return {
+        "rms_of": "3D distances of the targets from their place",
+        "position_error": _sizes(rows.distances(rows.left)),
+        "heldout_position_error": _sizes(run.labelled.heldout),
+        "outliers": [
+            {"view": run.session.views[o.view].name, "target": o.target, "distance": o.distance, "times_usual": o.times}
+            for o in run.outliers
+        ],
+    }
+
+
+def _sizes(distances: Array) -> dict[str, float]:
+    d = distances[np.isfinite(distances)]
+    return {"mean": float(d.mean()), "median": float(np.median(d)), "max": float(d.max())}
+
+
+def residual_columns(found: LabelledFit, session: Session) -> dict[str, Array]:
+    """Columns of residuals.parquet, a row per target and view: `partner` is the target, `residual` the 3D distance."""
+    rows, s = found.rows, found.rows.capture.sightings
+    assert s is not None
+    v, slot = np.nonzero(s.used)
+    left = rows.left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
+    names = np.array([view.name for view in session.views])
+    out: dict[str, Array] = {"view": names[v], "partner": np.array(s.targets)[s.target[v, slot]]}
+    out |= dict(zip("xyz", found.landmarks.positions[s.target[v, slot]].T, strict=True))
+    distance = np.linalg.norm(left, axis=1)
+    out |= dict(zip(("nx", "ny", "nz"), (left / np.maximum(distance, 1e-300)[:, None]).T, strict=True))
+    out |= {"residual": distance, "heldout": found.heldout[v, slot]}
+    covariates = sorted({key for view in session.views for key in view.covariates})
+    out |= {key: np.array([view.covariates.get(key, np.nan) for view in session.views])[v] for key in covariates}
+    if all(view.time_s is not None for view in session.views):
+        out["time_s"] = np.array([view.time_s for view in session.views], float)[v]
+    return out
+
+
+def without_outliers(chain: Chain, session: Session, outliers: Iterable[dict[str, Any]]) -> Chain:
+    """The chain less the labelled points that result.json lists as outliers."""
+    s = chain.capture.sightings
+    if s is None:
+        return chain
+    number = {view.name: v for v, view in enumerate(session.views)}
+    used = s.used.copy()
+    for o in outliers:
+        v = number.get(o["view"])
+        if v is not None:
+            used[v] &= False if o["target"] is None else s.target[v] != s.targets.index(o["target"])
+    return replace(chain, capture=replace(chain.capture, sightings=replace(s, used=used)))

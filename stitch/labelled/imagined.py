@@ -1,0 +1,55 @@
+"""Labelled points of views that nobody has taken yet."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stitch import frames
+from stitch.capture import place
+from stitch.effects.chain import Chain, Term
+from stitch.effects.views import ScanView
+from stitch.frames import Array
+from stitch.labelled.landmarks import Landmarks
+from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
+from stitch.sightings import Sightings
+
+
+def imagined_rows(
+    chain: Chain, seen: Rows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
+) -> tuple[Rows, list[Array], Array]:
+    """Rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
+
+    Args:
+        chain: of the imagined views.
+        seen: rows of the views that were taken.
+        variances: (3,) of rotation scatter, translation scatter, factor on the sensor's noise.
+
+    Returns:
+        Rows, one (K, m, P) per term, and (K, m, m).
+    """
+    before = seen.capture.sightings
+    assert before is not None
+    mount = "eye_to_hand" if chain.eye_to_hand else "eye_in_hand"
+    K, known = len(chain.T_base_flange), np.flatnonzero(np.isfinite(landmarks.positions).all(axis=1))
+    bare = place("imagined", (), chain.T_base_flange, mount)
+    back = frames.inverse(bare.poses(seen.T_mount))
+    points = frames.transform(back, landmarks.positions[known])
+    sightings = Sightings(
+        before.targets, np.tile(known, (K, 1)), points, np.full(points.shape[:2], np.median(before.sigma[before.used])),
+        np.ones(points.shape[:2], bool),
+    )  # fmt: skip
+    if before.sigma_rotation is not None and landmarks.orientation is not None:
+        sightings = replace(sightings, rotation=back[:, :3, :3] @ landmarks.orientation,
+                            sigma_rotation=np.full(K, np.median(before.sigma_rotation)))  # fmt: skip
+    straight, down = np.ones(len(known)), np.array([0.0, 0.0, -1.0])
+    size = chain.target_views[0].size
+    chain = replace(
+        chain, capture=replace(bare, sightings=sightings),
+        target_views=tuple(ScanView(v, chain.views, straight, None, down, size) for v in range(K)),
+    )  # fmt: skip
+    rows = rows_of(chain.capture, seen.T_mount, replace(landmarks, drawing=None, T_reference_part=None))
+    unknown = np.zeros((*rows.left.shape, landmarks.size - rows.landmarks.shape[2]))
+    rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
+    covariance = evidence_of_rows(rows, rows.hand_eye).covariance(variances)
+    return rows, [effect_rows(rows, chain, (), term) for term in terms], covariance

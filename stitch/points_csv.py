@@ -1,0 +1,133 @@
+"""points.csv and targets.csv: points that a sensor knows by name, and where a drawing puts them."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+
+_XYZ = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one view shows of named targets, sensor frame; a 6D probe is a target with an orientation."""
+
+    targets: tuple[str, ...]  # k
+    points: Array  # (k, 3) length_unit
+    sigma: Array  # (k,) of a coordinate; NaN where nobody states it
+    rotation: Array | None = None  # (3, 3) R_sensor_probe of the one target
+    sigma_rotation: float = float("nan")  # rad
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """Where targets.csv puts the targets, part frame."""
+
+    targets: tuple[str, ...]  # T
+    points: Array  # (T, 3) length_unit
+    sigma: Array  # (T,) of a coordinate; NaN where nobody states it
+
+
+def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
+    """Read and check points.csv: the sighting of every view that has one.
+
+    Args:
+        known: views of views.csv.
+
+    Raises:
+        InputError: names the line and the mend.
+    """
+    allowed = set(known)
+    rows: dict[str, list[tuple[str, list[float]]]] = {}
+    seen: dict[tuple[str, str], int] = {}
+    for line, row in _rows(file, ("view", "target", *_XYZ)):
+        view, target = row["view"], row["target"]
+        if view not in allowed:
+            raise InputError(f"{file} line {line}: view {view!r} is not in views.csv; add it there or remove the row")
+        if (view, target) in seen:
+            raise InputError(
+                f"{file} line {line}: view {view} shows target {target} on line {seen[view, target]} already; "
+                "leave one out, or name it otherwise"
+            )
+        seen[view, target] = line
+        rows.setdefault(view, []).append((target, _numbers(file, line, row)))
+    table = {view: np.array([numbers for _, numbers in found]) for view, found in rows.items()}
+    return {
+        view: Sighting(tuple(name for name, _ in found), table[view][:, :3], table[view][:, 3])
+        for view, found in rows.items()
+    }
+
+
+def read_targets(file: Path, seen: Sequence[str]) -> Nominal:
+    """Read and check targets.csv.
+
+    Args:
+        seen: targets of points.csv; one of them at least must be here.
+
+    Raises:
+        InputError: names the line and the mend.
+    """
+    lines: dict[str, int] = {}
+    table = []
+    for line, row in _rows(file, ("target", *_XYZ)):
+        name = row["target"]
+        if name in lines:
+            raise InputError(f"{file} line {line}: target {name} stands on line {lines[name]} already; leave one out")
+        lines[name] = line
+        table.append(_numbers(file, line, row))
+    if not set(lines) & set(seen):
+        raise InputError(
+            f"{file}: none of its targets ({', '.join(list(lines)[:4])}) is seen in points.csv "
+            f"({', '.join(list(seen)[:4])}); use the same names, or remove the file"
+        )
+    numbers = np.array(table)
+    return Nominal(tuple(lines), numbers[:, :3], numbers[:, 3])
+
+
+def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """Line number and cells by column of every row."""
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream, skipinitialspace=True)
+            header = [name.strip() for name in next(reader, [])]
+            cells = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: not UTF-8 text ({error.reason}); save it as CSV") from None
+    missing = [name for name in needed if name not in header]
+    if missing:
+        raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")
+    if not cells:
+        raise InputError(f"{file}: no rows; write {','.join(needed)}[,sigma] a row")
+    out = []
+    for line, row in cells:
+        if len(row) != len(header):
+            raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
+        out.append((line, dict(zip(header, (cell.strip() for cell in row), strict=True))))
+        if not out[-1][1]["target"]:
+            raise InputError(f"{file} line {line}: target is empty; give it a name")
+    return out
+
+
+def _numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
+    """x, y, z and sigma, NaN where its cell is empty or the column absent."""
+    out = []
+    for column in (*_XYZ, "sigma"):
+        cell = row.get(column, "")
+        if column == "sigma" and not cell:
+            out.append(float("nan"))
+            continue
+        try:
+            value = float(cell)
+        except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
+            raise InputError(f"{file} line {line}: {column} is {cell!r}; write a finite number")
+        out.append(value)
+    if out[3] <= 0:
+        raise InputError(f"{file} line {line}: sigma is {out[3]:g}; write a positive number or leave it empty")
+    return out

@@ -1,0 +1,351 @@
+"""Labelled points and measured probes against a cell written down here, and against scipy's least squares."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stitch.calibrate.robot import calibrated, dh_rows
+from stitch.capture import capture
+from stitch.cli.main import main
+from stitch.effects.chain import Term, chain_of, corrected, shift_targets, target_shifts
+from stitch.effects.contract import EFFECTS
+from stitch.errors import InputError
+from stitch.labelled.landmarks import settled
+from stitch.labelled.rows import effect_rows, rows_of
+from stitch.labelled.start import closed_form
+from stitch.pipeline import run
+from stitch.points_csv import Sighting
+from stitch.robot import forward, robot_from_dh
+from stitch.session import Scanner, Session, View, load_session
+from stitch.urdf import robot_from_urdf
+from stitch.urdf_write import to_urdf
+
+ROWS = [
+    {"a": 0, "alpha_deg": -90, "d": 290}, {"a": 270, "alpha_deg": 0, "d": 0, "theta_deg": -90},
+    {"a": 70, "alpha_deg": -90, "d": 0}, {"a": 0, "alpha_deg": 90, "d": 302}, {"a": 0, "alpha_deg": -90, "d": 0},
+    {"a": 0, "alpha_deg": 0, "d": 72, "theta_deg": 180},
+]  # fmt: skip
+TARGETS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0], [10.0, 5.0, 95.0]])
+
+
+def flange(joints, offset=0.0, rows=ROWS):
+    """Forward kinematics from elementary matrices, without the robot of the library."""
+    T = np.eye(4)
+    for q, row in zip(joints + offset, rows, strict=True):
+        a, d, alpha, theta = row["a"], row["d"], np.radians(row["alpha_deg"]), q + np.radians(row.get("theta_deg", 0))
+        c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+        T = T @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
+    return T
+
+
+def pose(rng, far):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * far
+    return T
+
+
+def cell(
+    seed=0, views=40, mount="eye_to_hand", offset=0.0, scatter=(2e-5, 0.02), noise=0.01, probe=False, targets=TARGETS
+):
+    """A session, the true T_mount and the true targets in the reference frame."""
+    rng = np.random.default_rng(seed)
+    joints = rng.uniform(-1.2, 1.2, (views, 6))
+    T_mount = pose(rng, 2000 if mount == "eye_to_hand" else 60)
+    places = targets if mount == "eye_to_hand" else targets + np.array([450.0, 100.0, 200.0])
+    turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
+    rows = []
+    for v, q in enumerate(joints):
+        jitter = np.eye(4)
+        jitter[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * scatter[0]).as_matrix()
+        jitter[:3, 3] = rng.normal(size=3) * scatter[1]
+        T = flange(q, offset) @ jitter
+        T_sensor_reference = np.linalg.inv(T_mount) @ (T if mount == "eye_to_hand" else np.linalg.inv(T))
+        seen = places @ T_sensor_reference[:3, :3].T + T_sensor_reference[:3, 3] + noise * rng.normal(size=places.shape)
+        names = tuple(f"t{i}" for i in range(len(places)))
+        sighting = Sighting(names, seen, np.full(len(seen), noise))
+        if probe:
+            R = T_sensor_reference[:3, :3] @ turn @ Rotation.from_rotvec(rng.normal(size=3) * 3e-5).as_matrix()
+            sighting = Sighting(("probe",), seen[:1], np.full(1, noise), R, 3e-5)
+        rows.append(View(f"v{v}", None, flange(q), q, np.zeros(6), None, {}, sighting))
+    robot = robot_from_dh("arm", "standard", ROWS, None, np.array([0, 0, -9.81]), "mm")
+    session = Session(Path("cell"), "cell", "mm", mount, Scanner(None, noise, None, np.array([0, 0, 1.0])), robot, None,
+                      None, None, tuple(rows))  # fmt: skip
+    return session, T_mount, places, turn
+
+
+def off(T, true):
+    """Angle (rad) and distance between two poses."""
+    return np.linalg.norm(Rotation.from_matrix(T[:3, :3].T @ true[:3, :3]).as_rotvec()), np.linalg.norm(
+        T[:3, 3] - true[:3, 3]
+    )
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_closed_form_is_exact_without_errors(mount):
+    session, T_mount, *_ = cell(mount=mount, scatter=(0, 0), noise=1e-12)
+    angle, distance = off(closed_form(capture(session)), T_mount)
+    assert angle < 1e-9 and distance < 1e-6
+
+
+def test_closed_form_of_a_probe_is_exact_without_errors():
+    session, T_mount, *_ = cell(scatter=(0, 0), noise=1e-12, probe=True)
+    views = [replace(v, sighting=replace(v.sighting, rotation=np.linalg.inv(T_mount)[:3, :3] @ v.T_base_flange[:3, :3]))
+             for v in session.views]  # fmt: skip
+    angle, distance = off(closed_form(capture(replace(session, views=tuple(views)))), T_mount)
+    assert angle < 1e-9 and distance < 1e-6
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_hand_eye_and_targets_with_their_sigmas(mount):
+    z = []
+    for seed in range(6):
+        session, T_mount, places, _ = cell(seed, mount=mount)
+        found = run(session)
+        relative = np.linalg.inv(found.T_mount) @ T_mount
+        xi = np.append(Rotation.from_matrix(relative[:3, :3]).as_rotvec(), relative[:3, 3])
+        z.append(xi @ np.linalg.solve(found.mount_covariance, xi))
+        assert np.abs(found.fused.points - places).max() < 0.1
+        assert found.heldout_rms > found.residual_rms
+    # Six χ² of six degrees of freedom; wider sigmas are allowed, too narrow ones are not.
+    assert np.sum(z) < 67.99  # 99.9 % point of χ² with 36
+
+
+def test_fit_equals_scipy_least_squares_where_all_rows_weigh_alike():
+    session, *_ = cell(3, views=25, scatter=(0.0, 0.0))
+    found = run(session)
+    p = np.array([v.sighting.points for v in session.views])
+    left = np.array([np.linalg.inv(v.T_base_flange) for v in session.views])
+
+    def residual(x):
+        placed = p @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        placed = np.einsum("vij,vkj->vki", left[:, :3, :3], placed) + left[:, None, :3, 3]
+        return (placed - x[6:].reshape(-1, 3)).ravel()
+
+    start = np.concatenate(
+        [Rotation.from_matrix(found.T_mount[:3, :3]).as_rotvec(), found.T_mount[:3, 3], TARGETS.ravel()]
+    )
+    x = least_squares(residual, start + 1e-3, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    np.testing.assert_allclose(found.fused.points.ravel(), x[6:], atol=2e-4)
+    assert found.residual_rms == pytest.approx(np.sqrt(np.mean(residual(x) ** 2) * 3), rel=1e-3)
+
+
+def test_rows_are_the_slopes_of_what_is_left():
+    session, T_mount, *_ = cell(1, views=6)
+    chain = chain_of(session, capture(session))
+    for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
+        effect = EFFECTS[name]
+        if chain.lacks(effect):
+            continue
+        zero = Term(effect, np.zeros(len(chain.parameters(effect))))
+        landmarks = settled(chain.capture, T_mount)
+        rows = rows_of(chain.capture, T_mount, landmarks)
+        slopes = effect_rows(rows, chain, (), zero)
+        for i, parameter in enumerate(chain.parameters(effect)):
+            step = 0.01 * parameter.typical
+            both = [rows_of(corrected(chain, [replace(zero, values=s * step * np.eye(len(zero.values))[i])], T_mount),
+                            T_mount, landmarks).left for s in (1, -1)]  # fmt: skip
+            numeric = (both[0] - both[1]) / (2 * step)
+            scale = max(np.abs(numeric).max(), 1e-12)
+            np.testing.assert_allclose(
+                slopes[..., i] / scale, numeric / scale, atol=2e-4, err_msg=f"{name} {parameter.name}"
+            )
+
+
+def test_a_hidden_joint_offset_is_named_and_found():
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = cell(2, views=40, offset=offset)
+    before = run(session)
+    found = before.diagnose()
+    assert "joint_offset" in found.effects, found.sentence
+    after = before.add("joint_offset")
+    assert after.heldout_rms < 0.2 * before.heldout_rms
+    values = dict(
+        zip([p.name for p in after.chain.parameters(after.terms[0].effect)], after.terms[0].values, strict=True)
+    )
+    for name, true in zip(("d2", "d3", "d5"), offset[[1, 2, 4]], strict=True):
+        assert values[name] == pytest.approx(true, abs=2e-4)
+
+
+def test_an_honest_cell_is_adequate():
+    session, *_ = cell(5, views=40)
+    found = run(session).diagnose()
+    assert found.verdict == "adequate", found.sentence
+
+
+def test_a_swapped_label_and_a_broken_joint_reading_are_taken_out_and_listed():
+    session, T_mount, *_ = cell(4, views=40)
+    views = list(session.views)
+    s = views[7].sighting
+    views[7] = replace(views[7], sighting=replace(s, points=s.points[[1, 0, 2, 3]]))
+    views[20] = replace(views[20], joints=views[20].joints + 0.01, T_base_flange=flange(views[20].joints + 0.01))
+    found = run(replace(session, views=tuple(views)))
+    assert {o.view for o in found.outliers} == {7, 20}
+    assert not any(o.view == 7 and o.target in ("t2", "t3") for o in found.outliers)
+    angle, distance = off(found.T_mount, T_mount)
+    assert angle < 1e-4 and distance < 0.3
+    assert any("v7" in note and "v20" in note for note in found.notes)
+
+
+def test_a_probe_is_placed_and_turned():
+    session, T_mount, places, turn = cell(6, views=60, probe=True)
+    found = run(session)
+    assert np.abs(found.fused.points[0] - places[0]).max() < 0.1
+    assert Rotation.from_matrix(found.labelled.landmarks.orientation.T @ turn).magnitude() < 1e-4
+
+
+def written(folder, session, kind="points"):
+    """The session as a folder of files."""
+    folder.mkdir()
+    rows = ",\n".join("{ " + ", ".join(f"{k} = {v}" for k, v in row.items()) + " }" for row in ROWS)
+    (folder / "session.toml").write_text(
+        f'format = "stitch-session/1"\nname = "{folder.name}"\nlength_unit = "mm"\nmount = "{session.mount}"\n'
+        f'[scanner]\nnoise = 0.01\n[robot]\ndh = "standard"\njoints = [\n{rows}\n]\n'
+    )
+    header = "view," + ",".join(f"j{i + 1}_deg" for i in range(6))
+    lines = [f"{v.name}," + ",".join(f"{x:.10f}" for x in np.degrees(v.joints)) for v in session.views]
+    (folder / "views.csv").write_text("\n".join([header, *lines]) + "\n")
+    if kind == "points":
+        lines = [f"{v.name},{t},{p[0]:.6f},{p[1]:.6f},{p[2]:.6f}" for v in session.views
+                 for t, p in zip(v.sighting.targets, v.sighting.points, strict=True)]  # fmt: skip
+        (folder / "points.csv").write_text("\n".join(["view,target,x,y,z", *lines]) + "\n")
+    else:
+        lines = []
+        for v in session.views:
+            numbers = [*v.sighting.points[0], *Rotation.from_matrix(v.sighting.rotation).as_quat()]
+            lines.append(f"{v.name}," + ",".join(f"{x:.10f}" for x in numbers))
+        (folder / "frames.csv").write_text("\n".join(["view,x,y,z,qx,qy,qz,qw", *lines]) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["points", "frames"])
+def test_every_command_works(kind, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
+    folder, out = str(written(tmp_path / "s", session, kind)), str(tmp_path / "r")
+
+    def stitch(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main(list(arguments))
+        assert not stop.value.code, capsys.readouterr().err
+        return capsys.readouterr().out
+
+    assert json.loads(stitch("check", folder, "--json"))["sessions"][0]["targets"] == (4 if kind == "points" else 1)
+    first = json.loads(stitch("run", folder, "-o", out, "--json"))
+    assert first["targets"] and first["rms_of"].startswith("3D")
+    stitch("compare", out)
+    assert json.loads(stitch("diagnose", out, "--json"))["effects"]
+    stitch("next", out)
+    second = json.loads(stitch("add", out, "joint_offset", "--json"))
+    assert second["heldout_rms"] < first["heldout_rms"]
+    # The model of one run judges other poses of the rig without fitting anything.
+    other, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
+    judged = json.loads(
+        stitch("run", str(written(tmp_path / "o", other, kind)), "--hand-eye", out, "-o", str(tmp_path / "q"), "--json")
+    )
+    assert (
+        judged["hand_eye"] == second["hand_eye"]
+        and judged["targets"][0]["position"] == second["targets"][0]["position"]
+    )
+    assert judged["residual_rms"] == pytest.approx(second["residual_rms"], rel=0.05)
+    stitch("drop", out, "joint_offset")
+    stitch("add", out, "--suggested", "--no-recording")
+    assert "joint_offset" in json.loads((tmp_path / "r" / "result.json").read_text())["effects"]
+    stitch("report", out, "--no-diagnosis")
+    assert "Targets" in (tmp_path / "r" / "report.html").read_text()
+
+
+def test_calibrate_robot_writes_rows_and_urdf_of_the_same_arm(tmp_path, capsys):
+    session, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]))
+    folder = written(tmp_path / "s", session)
+    with pytest.raises(SystemExit) as stop:
+        main(["calibrate", "robot", str(folder), "-o", str(tmp_path / "out"), "--json"])
+    assert not stop.value.code
+    document = json.loads(capsys.readouterr().out)
+    assert document["kind"] == "robot" and len(document["robot"]) == 6 and document["next"]
+    assert ElementTree.parse(tmp_path / "out" / "robot.urdf").getroot().tag == "robot"
+    robot = robot_from_dh("arm", "standard", document["robot"], None, np.array([0, 0, -9.81]), "mm")
+    urdf = robot_from_urdf(tmp_path / "out" / "robot.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
+    joints = np.random.default_rng(0).uniform(-3, 3, (50, 6))
+    np.testing.assert_allclose(forward(urdf, joints), forward(robot, joints), atol=1e-6)  # mm: 1e-9 m
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_rows_and_urdf_place_the_flange_as_the_chain_does(convention, tmp_path):
+    session, *_ = cell(7, views=30)
+    rng = np.random.default_rng(3)
+    nominal = robot_from_dh("arm", convention, ROWS, None, np.array([0, 0, -9.81]), "mm")
+    views = tuple(replace(v, T_base_flange=forward(nominal, v.joints)) for v in session.views)
+    session = replace(session, robot=nominal, views=views)
+    found = run(session)
+    terms = [Term(EFFECTS[name], rng.normal(size=len(found.chain.parameters(EFFECTS[name]))) * size)
+             for name, size in (("joint_offset", 1e-3), ("link_geometry", 1e-3))]  # fmt: skip
+    arm = calibrated(replace(found, terms=tuple(terms))).robot
+    (tmp_path / "a.urdf").write_text(to_urdf(arm))
+    urdf = robot_from_urdf(tmp_path / "a.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
+    rows = robot_from_dh("arm", convention, dh_rows(arm), None, np.array([0, 0, -9.81]), "mm")
+    own = corrected(found.chain, terms, found.T_mount)
+    T_base_flange = np.linalg.inv(own.T_reference_mount)
+    for robot in (urdf, rows):
+        np.testing.assert_allclose(forward(robot, found.chain.views.joints), T_base_flange, atol=1e-6)  # mm: 1e-9 m
+
+
+BROKEN = [
+    ("view,target,x,y\nv0,a,1,2\n", "no column 'z'"),
+    ("view,target,x,y,z\nv0,a,1,2,3\nv0,a,1,2,3\n", "line 3"),
+    ("view,target,x,y,z\nnobody,a,1,2,3\n", "line 2"),
+    ("view,target,x,y,z\nv0,a,1,two,3\n", "y is 'two'"),
+    ("view,target,x,y,z,sigma\nv0,a,1,2,3,-1\n", "sigma is -1"),
+    ("view,target,x,y,z\nv0,,1,2,3\n", "target is empty"),
+    ("view,target,x,y,z\n", "no rows"),
+]
+
+
+@pytest.mark.parametrize(("text", "told"), BROKEN)
+def test_broken_points_are_refused_in_one_line(text, told, tmp_path):
+    session, *_ = cell(0, views=3)
+    folder = written(tmp_path / "s", session)
+    (folder / "points.csv").write_text(text)
+    with pytest.raises(InputError, match=told) as error:
+        load_session(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_nominal_targets_pull_by_their_sigma(tmp_path):
+    session, _, places, _ = cell(8, views=6, noise=0.05)
+    folder = written(tmp_path / "s", session)
+    T = pose(np.random.default_rng(1), 100)
+    drawn = (places - T[:3, 3]) @ T[:3, :3]
+    lines = [f"t{i},{p[0]:.6f},{p[1]:.6f},{p[2]:.6f},0.0001" for i, p in enumerate(drawn)]
+    alone = run(load_session(folder)).fused.points
+    (folder / "targets.csv").write_text("\n".join(["target,x,y,z,sigma", *lines]) + "\n")
+    found = run(load_session(folder)).fused.points
+
+    def shape(points):
+        return np.linalg.norm(points[:, None] - points[None], axis=2)
+
+    assert np.abs(shape(found) - shape(places)).max() < 1e-3
+    assert np.abs(shape(alone) - shape(places)).max() > 1e-2
+
+
+def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):
+    session = load_session(shared_data / "irb120-tracker")
+    even, odd = (replace(session, views=session.views[k::2]) for k in (0, 1))
+    fitted = run(even)
+    from stitch.run_folder import model_of
+
+    assert 0.90 < run(odd, model_of(fitted)).residual_rms < 0.97
+
+
+def test_slopes_of_shifts_are_linear_in_small_steps():
+    session, T_mount, *_ = cell(1, views=4)
+    chain = chain_of(session, capture(session))
+    term = Term(EFFECTS["range_scale"], np.zeros(1))
+    poses = chain.capture.poses(T_mount)
+    moved = shift_targets(chain, [replace(term, values=np.array([1e-4]))], poses)
+    np.testing.assert_allclose(moved, 1e-4 * target_shifts(chain, (), term, poses)[0], rtol=1e-3)

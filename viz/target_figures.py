@@ -1,0 +1,62 @@
+"""Figures of a run on labelled points, by matplotlib; each function returns a Figure."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from stitch.frames import Array
+from stitch.result import Run
+from viz.units import to_micrometres
+
+_BLUE, _RED, _GREY = "#4878a8", "#b5532a", "grey"
+# The longest stick covers this share of the targets' spread.
+_SHARE = 0.25
+_PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def sticks(run: Run) -> Figure:
+    """Where every view puts each target, as magnified sticks from the target's place, in three planes."""
+    target, left = residual_vectors(run)
+    place = run.fused.points
+    size = float(np.ptp(place, axis=0).max()) or 1.0
+    magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):
+        start, end = place[target], place[target] + magnified * left
+        axes.plot([start[:, a], end[:, a]], [start[:, b], end[:, b]], color=_BLUE, lw=0.4, alpha=0.35)
+        axes.plot(place[:, a], place[:, b], "o", ms=4, color=_RED)
+        axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({run.session.length_unit})", ylabel="xyz"[b])
+    figure.suptitle(f"sticks {magnified:.0f} times longer than they are", fontsize=9)
+    return _plain(figure)
+
+
+def errors(run: Run) -> Figure:
+    """3D distance of the targets under the model, in the order of views and as a distribution."""
+    assert run.labelled is not None
+    um, rows = to_micrometres(run.session.length_unit), run.labelled.rows
+    distances = rows.distances(rows.left) * um
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    course, share = figure.subplots(1, 2, width_ratios=[2, 1])
+    course.plot(np.nanmax(distances, axis=1), ".", ms=2, color=_BLUE)
+    course.set(xlabel="view", ylabel="farthest target (µm)", ylim=(0, None))
+    for values, colour, name in ((distances, _BLUE, "in the fit"), (run.labelled.heldout * um, _RED, "left out")):
+        ordered = np.sort(values[np.isfinite(values)])
+        share.plot(ordered, np.linspace(0, 100, len(ordered)), color=colour, label=name)
+    share.axvline(run.noise_floor * um, color=_GREY, lw=1, ls="--", label="noise floor")
+    share.set(xlabel="3D distance (µm)", ylabel="share of targets (%)", xlim=(0, None))
+    share.legend(frameon=False, fontsize=8)
+    return _plain(figure)
+
+
+def residual_vectors(run: Run) -> tuple[Array, Array]:
+    """Number of the target (N,) and its offset (N, 3) under the model, reference frame, for all in use."""
+    assert run.labelled is not None
+    rows, s = run.labelled.rows, run.labelled.rows.capture.sightings
+    assert s is not None
+    left = rows.left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)
+    return s.target[s.used], left[s.used]
+
+
+def _plain(figure: Figure) -> Figure:
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
