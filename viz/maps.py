@@ -42,7 +42,7 @@ def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figu
     states = [steps(run, p) for p in poses]
     points = states[0][0]
     centre = points.mean(axis=0)
-    flat = (points - centre) @ np.linalg.svd((points - centre)[:: max(len(points) // 20_000, 1)])[2][:2].T
+    flat = (points - centre) @ np.linalg.eigh(np.cov(points.T))[1][:, :0:-1]
     size = float(np.ptp(flat, axis=0).max()) / _CELLS
     maps = [_cells(flat, values, size) * um for _, values in states]
     limit = float(np.nanquantile(maps[0], 0.97))
