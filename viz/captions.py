@@ -10,8 +10,8 @@ PER_VIEW = (
     "One bar that stands out is a view to look at; bars that rise together are a missing effect."
 )
 WATERFALL = (
-    "An effect earns its place if the bar of the views left out falls too; nothing can fall below the dashed line, "
-    "the sensor's noise."
+    "An effect earns its place if the bar of the views left out falls too; the dashed line is what the sensor's "
+    "noise alone would leave."
 )
 CHANGE = "The same correspondences with one colour scale: where the right map is darker, the change has helped."
 BUDGET = "Shares of the mean square: what noise explains, what the named effect would take away, what is left."
