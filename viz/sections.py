@@ -84,8 +84,6 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
     addresses = {}
     for name, figure in figures.items():
         text = svg_text(figure)
-        # Laid out once: the size of the paper does not change any more.
-        figure.set_layout_engine("none")
         figure.savefig(folder / f"{name}.png", dpi=120)
         (folder / f"{name}.svg").write_text(text, encoding="utf-8")
         addresses[name] = uri("svg+xml", text.encode())
