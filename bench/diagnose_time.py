@@ -54,7 +54,12 @@ def command(*arguments: str) -> None:
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     seconds = time.perf_counter() - start
-    print(f"stitch {arguments[0]:<10} {seconds:6.1f} s {usage.ru_maxrss / 1e6:6.2f} GB   exit {child.returncode}")
+    print(
+        f"stitch {arguments[0]:<10} {seconds:6.1f} s {usage.ru_maxrss / 1e6:6.2f} GB   exit {child.returncode}",
+        flush=True,
+    )
+    if child.returncode:
+        sys.exit(f"stitch {arguments[0]} failed")
 
 
 def streamed(run: Path, correspondences: int) -> None:

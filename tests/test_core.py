@@ -11,6 +11,7 @@ from stitch.free_poses import free_poses
 from stitch.hand_eye import scatter_of
 from stitch.match import match, overlapping_pairs, sample
 from stitch.overlaps import collect
+from stitch.rounding import rounded
 from stitch.scan import prepare_view
 from stitch.solve import assemble, gram, pair_squares
 
@@ -126,3 +127,22 @@ def test_repeatability_is_recovered():
 def test_disturbed_is_as_far_off_as_it_says():
     off = frames.log(frames.inverse(np.eye(4)) @ disturbed(np.eye(4), 3))
     assert np.degrees(np.linalg.norm(off[:3])) == pytest.approx(5)
+
+
+def test_a_thinned_scan_keeps_the_surface_of_all_points(cell):
+    """Fewer points, the normals and edges of all of them; what is small enough already stays as it is."""
+    measured, capture = cell
+    whole = capture.scans[0]
+    index = np.arange(0, len(whole.points), 3)
+    scan = prepare_view("v", whole.points, index)
+    assert np.array_equal(scan.points, whole.points[index])
+    assert np.array_equal(scan.normals, whole.normals[index]) and np.array_equal(scan.usable, whole.usable[index])
+    assert scan.spacing > whole.spacing and scan.area.sum() == pytest.approx(whole.area.sum(), rel=0.02)
+    assert np.array_equal(prepare_view("v", whole.points, np.arange(len(whole.points))).normals, whole.normals)
+
+
+def test_numbers_end_where_their_sigma_begins():
+    assert rounded(4.38e-7, 3.3e-8) == "4.4e-07"
+    assert rounded(-2e-10, 0.03) == "0"
+    assert rounded(0.1342, 0.0312) == "0.13"
+    assert rounded(1.23456, float("nan")) == "1.235"

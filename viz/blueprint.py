@@ -6,8 +6,8 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun.blueprint as rrb
 
 
-def blueprint() -> rrb.Blueprint:
-    """Result | before and after | every iteration."""
+def blueprint(changed: bool = False) -> rrb.Blueprint:
+    """Result | the model's history | before and after | every iteration; `changed`: an effect came or went."""
     side = rrb.Vertical(
         rrb.TextDocumentView(origin="verdict", name="Verdict"),
         rrb.BarChartView(origin="views", contents=["views/correction_um"], name="Correction per view (µm)"),
@@ -18,6 +18,12 @@ def blueprint() -> rrb.Blueprint:
         rrb.Spatial3DView(origin="fused", name="Stitched, by disagreement of the views"), side,
         column_shares=[3, 2], name="Result",
     )  # fmt: skip
+    pictures = [rrb.Spatial2DView(origin="history/waterfall", name="The error over the history of the model")]
+    if changed:
+        pictures.append(rrb.Spatial2DView(origin="history/change", name="Where the last change of the model helped"))
+    else:
+        pictures.append(rrb.Spatial2DView(origin="history/register", name="Before and after register, rms on the part"))
+    history = rrb.Vertical(*pictures, name="History of the model")
     compare = rrb.Horizontal(
         rrb.Spatial3DView(origin="before", name="One hand-eye: before register"),
         rrb.Spatial3DView(origin="after", name="After register, same colour scale"),
@@ -38,4 +44,26 @@ def blueprint() -> rrb.Blueprint:
     )  # fmt: skip
     # Opens at the end of the timeline: the result is there, the way back is the slider.
     time = rrb.TimePanel(state="collapsed", timeline="step", play_state="following")
-    return rrb.Blueprint(rrb.Tabs(result, compare, steps, active_tab=0), time, collapse_panels=True)
+    return rrb.Blueprint(rrb.Tabs(result, history, compare, steps, active_tab=0), time, collapse_panels=True)
+
+
+def diagnosis_blueprint() -> rrb.Blueprint:
+    """Verdict and suspects | seen against predicted | look-alikes | what the poses follow."""
+
+    def picture(name: str, title: str) -> rrb.Spatial2DView:
+        return rrb.Spatial2DView(origin=f"diagnosis/{name}", name=title)
+
+    verdict = rrb.Vertical(
+        rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict"),
+        rrb.Horizontal(picture("suspects", "Suspects, best first"), picture("budget", "Where the error comes from")),
+        row_shares=[1, 2], name="What is missing",
+    )  # fmt: skip
+    left = rrb.Vertical(
+        picture("shape", "Bins of the covariates that the displacement follows most"),
+        picture("views", "Displacement of every view"), name="What the poses follow",
+    )  # fmt: skip
+    tabs = rrb.Tabs(
+        verdict, picture("added_variable", "Seen against predicted"), picture("aliases", "Look-alikes"), left,
+        active_tab=0,
+    )  # fmt: skip
+    return rrb.Blueprint(tabs, collapse_panels=True)

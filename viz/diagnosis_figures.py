@@ -61,13 +61,13 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
     """
     # Of candidates that gain nothing no amplitude was fitted.
     shown = [s for s in found.suspects if s.ranked.score.observable and s.ranked.score.p_value < 1.0][:at_most]
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    figure = Figure(figsize=(7, 3.0), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, suspect in zip(axes, shown, strict=False):
         _added(ax, found, suspect)
     reach = 1.08 * max((float(np.abs(ax.dataLim.get_points()).max()) for ax in axes if shown), default=1.0)
     for ax in axes:
-        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1)
     axes[0].set_ylabel("seen (sigma)")
     return plain(figure)
 

@@ -42,7 +42,7 @@ def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figu
     states = [steps(run, p) for p in poses]
     points = states[0][0]
     centre = points.mean(axis=0)
-    flat = (points - centre) @ np.linalg.svd((points - centre)[:: max(len(points) // 20_000, 1)])[2][:2].T
+    flat = (points - centre) @ np.linalg.eigh(np.cov(points.T))[1][:, :0:-1]
     size = float(np.ptp(flat, axis=0).max()) / _CELLS
     maps = [_cells(flat, values, size) * um for _, values in states]
     limit = float(np.nanquantile(maps[0], 0.97))
@@ -53,7 +53,7 @@ def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figu
     for axes, values, title in zip(panels, maps, titles, strict=True):
         extent = (low[0], low[0] + size * values.shape[0], low[1], low[1] + size * values.shape[1])
         drawn = axes.imshow(values.T, origin="lower", extent=extent, cmap=UNSIGNED, vmin=0, vmax=limit)
-        axes.set_title(f"{title}: {np.sqrt(np.nanmean(values**2)):.1f} µm", fontsize=10)
+        axes.set_title(title, fontsize=10)
         axes.set_xlabel(run.session.length_unit)
         axes.spines[["top", "right"]].set_visible(False)
     figure.colorbar(drawn, ax=panels, label="rms between views (µm)", extend="max")

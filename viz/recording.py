@@ -1,15 +1,19 @@
 """The Rerun recording of a run: every stage and iteration, on one timeline `step`."""
 
+import io
 import os
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from stitch.frames import Array
 from stitch.result import Run, StageResult
 from stitch.session import Session, View
 from viz.blueprint import blueprint
 from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
+from viz.diagnosis_figures import waterfall
+from viz.maps import change_maps, residual_maps
 from viz.target_figures import residual_vectors
 from viz.units import to_micrometres
 from viz.words import run_markdown
@@ -18,8 +22,8 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
 
 # What a screen can show; the run folder keeps everything.
-_POINTS_PER_VIEW = 12_000
-_POINTS_FUSED = 400_000
+_POINTS_PER_VIEW = 6_000
+_POINTS_FUSED = 200_000
 
 
 class RerunRecorder:
@@ -92,6 +96,8 @@ class RerunRecorder:
         shift = np.linalg.norm(view_shifts(run), axis=1) * self.to_um
         rec.log("views/correction_um", rr.BarChart(shift), static=True)
         rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)
+        self._history(run)
+        rec.send_blueprint(blueprint(changed=run.poses_before is not None))
         rec.disconnect()
 
     def _sticks(self, run: Run) -> None:
@@ -103,6 +109,16 @@ class RerunRecorder:
         strips = np.stack([start, start + factor * left], axis=1).astype(np.float32)
         self.recording.log("fused/sticks", rr.LineStrips3D(strips, colors=[(72, 120, 168)]), static=True)
         self.recording.log("log", rr.TextLog(f"sticks at the targets are {factor:.0f} times longer than they are"))
+
+    def _history(self, run: Run) -> None:
+        """The waterfall of the error, and the maps of the part before and after the last change."""
+        pictures = {"waterfall": waterfall(run.ledger, run.session.length_unit)}
+        if run.overlaps is not None:
+            pictures["register"] = residual_maps(run)
+            if run.poses_before is not None:
+                pictures["change"] = change_maps(run)
+        for name, figure in pictures.items():
+            self.recording.log(f"history/{name}", encoded(figure), static=True)
 
     def _snapshot(self, stage: str, poses: Array, residuals: list[Array], limit: float) -> None:
         """The whole set as it stood at the end of a stage, on a static entity for side-by-side views."""
@@ -132,6 +148,13 @@ def shown_points(view: View) -> Array:
     if view.cloud is not None:
         return view.cloud.points
     return np.zeros((0, 3)) if view.sighting is None else view.sighting.points
+
+
+def encoded(figure: Figure) -> rr.EncodedImage:
+    """A figure as a picture that stays small in the file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=140)
+    return rr.EncodedImage(contents=buffer.getvalue(), media_type="image/png")
 
 
 def view_shifts(run: Run) -> Array:

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from stitch.result import Run
-from viz import figures, target_figures
+from stitch.rounding import rounded
+from viz import captions, figures, maps, target_figures
 from viz.diagnosis_figures import waterfall
 from viz.recording import shown_points, view_shifts
 from viz.units import to_micrometres, to_millimetres
@@ -47,15 +48,20 @@ def _content(run: Run) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _pictures(run: Run) -> list[tuple[str, str]]:
+def _pictures(run: Run) -> list[tuple[str, str, str]]:
     """What the views have in common decides what can be drawn: overlaps or targets."""
     out = []
     if run.overlaps is not None:
-        out += [("Steps between the views", png(figures.residual_maps(run), 130)),
-                ("Convergence", svg(figures.convergence(run))), ("Views", svg(figures.per_view(run)))]  # fmt: skip
+        out += [
+            ("Where the views disagree", png(maps.residual_maps(run), 130), captions.MAPS),
+            ("How the error fell, iteration by iteration", svg(figures.convergence(run)), captions.CONVERGENCE),
+            ("What register did to every view", svg(figures.per_view(run)), captions.PER_VIEW),
+        ]
     if run.labelled is not None:
-        out += [("Targets, as every view puts them", png(target_figures.sticks(run), 130)),
-                ("Distance of the targets", svg(target_figures.errors(run)))]  # fmt: skip
+        out += [
+            ("Targets, as every view puts them", png(target_figures.sticks(run), 130), captions.STICKS),
+            ("Distance of the targets", svg(target_figures.errors(run)), captions.TARGETS),
+        ]
     return out
 
 
@@ -79,18 +85,20 @@ def _effects(run: Run) -> list[dict[str, str]]:
         for p, value, sigma in zip(run.chain.parameters(term.effect), term.values, sigmas, strict=True):
             if np.isfinite(sigma) or p.grid:
                 told = f"{sigma:.1g}" if np.isfinite(sigma) else "–"
-                rows.append({"effect": term.effect.name, "name": p.name, "value": f"{value:.4g}", "sigma": told,
+                rows.append({"effect": term.effect.name, "name": p.name, "value": rounded(value, sigma), "sigma": told,
                              "unit": p.unit})  # fmt: skip
     return rows
 
 
-def _history(run: Run) -> list[tuple[str, str]]:
+def _history(run: Run) -> list[tuple[str, str, str]]:
     """How the error fell as the model grew."""
     if len(run.ledger) < 2:
         return []
-    out = [("The error over the history of the model", svg(waterfall(run.ledger, run.session.length_unit)))]
+    picture = svg(waterfall(run.ledger, run.session.length_unit))
+    out = [("The error over the history of the model", picture, captions.WATERFALL)]
     if run.poses_before is not None and run.overlaps is not None:
-        out.append(("Steps between the views before and after the last change", png(figures.change_maps(run), 130)))
+        picture = png(maps.change_maps(run), 130)
+        out.append(("Where the last change of the model helped", picture, captions.CHANGE))
     return out
 
 
@@ -111,17 +119,22 @@ def _hand_eye(run: Run) -> list[dict[str, object]]:
 
 def svg(figure: Figure) -> str:
     """A figure as a data address."""
+    return uri("svg+xml", svg_text(figure).encode())
+
+
+def svg_text(figure: Figure) -> str:
+    """A figure as the text of a file."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return _uri("svg+xml", buffer.getvalue().encode())
+    return buffer.getvalue()
 
 
 def png(figure: Figure, dpi: int) -> str:
     """A figure as a data address."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
-    return _uri("png", buffer.getvalue())
+    return uri("png", buffer.getvalue())
 
 
-def _uri(kind: str, data: bytes) -> str:
+def uri(kind: str, data: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -11,8 +11,10 @@ from stitch.diagnosis.compare import Comparison
 from stitch.diagnosis.diagnose import Diagnosis
 from stitch.diagnosis.words import amounts_of
 from stitch.state import State
+from viz import captions
 from viz import diagnosis_figures as draw
-from viz.report import svg
+from viz.blueprint import diagnosis_blueprint
+from viz.report import svg_text, uri
 from viz.units import to_micrometres
 
 
@@ -21,13 +23,14 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     unit = state.session.length_unit
     um = to_micrometres(unit)
     pictures = {
-        "budget": ("Where the error comes from", draw.budget(found, unit)),
-        "suspects": ("How likely each suspect is", draw.suspects(found)),
-        "added_variable": ("What the views show against what the first suspects predict", draw.added_variable(found)),
-        "shape": ("What the unexplained displacement follows", draw.shape(found, unit)),
-        "aliases": ("Which suspects look alike in these views", draw.alias_picture(found)),
-        "views": ("Displacement of every view from the model", draw.view_arrows(found, unit)),
-    }
+        "budget": ("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
+        "suspects": ("How likely each suspect is", draw.suspects(found), captions.SUSPECTS),
+        "added_variable": ("What the views show against what the first suspects predict", draw.added_variable(found),
+                           captions.ADDED),
+        "shape": ("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
+        "aliases": ("Which suspects look alike in these views", draw.alias_picture(found), captions.ALIASES),
+        "views": ("Displacement of every view from the model", draw.view_arrows(found, unit), captions.VIEWS),
+    }  # fmt: skip
     rows = [
         {"name": s.name, "p": f"{s.ranked.adjusted:.1g}", "posterior": f"{s.ranked.posterior:.2f}",
          "amounts": amounts_of(s.ranked),
@@ -37,8 +40,8 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         for s in found.suspects if s.ranked.score.observable
     ][:8]  # fmt: skip
     unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
-    _save(folder / "pictures", {name: figure for name, (_, figure) in pictures.items()})
-    shown = [(title, svg(figure)) for title, figure in pictures.values()]
+    addresses = _save(folder / "pictures", {name: figure for name, (_, figure, _) in pictures.items()})
+    shown = [(title, addresses[name], caption) for name, (title, _, caption) in pictures.items()]
     _insert(folder / "report.html", "diagnosis", _render("diagnosis.html.j2", found=found, rows=rows, unseen=unseen,
                                                          pictures=shown))  # fmt: skip
     _record(found, folder)
@@ -47,12 +50,12 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
 def write_comparison(found: Comparison, state: State, folder: Path) -> None:
     """Section of report.html and pictures/compare.*."""
     figure = draw.comparison(found, state.session.length_unit)
-    _save(folder / "pictures", {"compare": figure})
+    picture = _save(folder / "pictures", {"compare": figure})["compare"]
     um = to_micrometres(state.session.length_unit)
     worst = []
     for table in found.labelled:
         worst.append((table.name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in table.worst(5))))
-    html = _render("comparison.html.j2", picture=svg(figure), worst=worst, rms=found.rms * um)
+    html = _render("comparison.html.j2", picture=picture, caption=captions.COMPARISON, worst=worst, rms=found.rms * um)
     _insert(folder / "report.html", "comparison", html)
 
 
@@ -73,17 +76,22 @@ def _insert(page: Path, name: str, html: str) -> None:
     scratch.replace(page)
 
 
-def _save(folder: Path, figures: dict[str, Figure]) -> None:
+def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
+    """Each figure as SVG and PNG; the SVG's data address by name."""
     folder.mkdir(exist_ok=True)
+    addresses = {}
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        text = svg_text(figure)
         figure.savefig(folder / f"{name}.png", dpi=120)
+        (folder / f"{name}.svg").write_text(text, encoding="utf-8")
+        addresses[name] = uri("svg+xml", text.encode())
+    return addresses
 
 
 def _record(found: Diagnosis, folder: Path) -> None:
     """The verdict and its pictures; `stitch view` opens it beside the recording of the run."""
     recording = rr.RecordingStream("stitch_diagnosis")
-    recording.save(str(folder / "diagnosis.rrd"))
+    recording.save(str(folder / "diagnosis.rrd"), default_blueprint=diagnosis_blueprint())
     text = f"# {found.verdict}\n\n{found.sentence}"
     recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
     for picture in sorted((folder / "pictures").glob("*.png")):

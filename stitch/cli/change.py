@@ -20,6 +20,7 @@ from stitch.errors import InputError
 from stitch.pipeline import change
 from stitch.recorder import Recorder
 from stitch.result import Run
+from stitch.rounding import rounded
 from stitch.state import State, load_state, state_of
 
 _SCRATCH = ".new"
@@ -117,7 +118,9 @@ def show_ledger(result: Run) -> None:
         for p, value, sigma in zip(result.chain.parameters(term.effect), term.values, sigmas, strict=True):
             told = f"± {sigma:.1g}" if np.isfinite(sigma) else "(not seen by these views)"
             if np.isfinite(sigma) or p.grid:
-                console.print(f"  {term.effect.name}.{p.name} = {value:.4g} {told} {p.unit}", highlight=False)
+                console.print(
+                    f"  {term.effect.name}.{p.name} = {rounded(value, sigma)} {told} {p.unit}", highlight=False
+                )
     for line in remarks(result):
         console.print(line, soft_wrap=True, highlight=False)
 

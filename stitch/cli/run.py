@@ -102,7 +102,9 @@ def show(runs: list[Run], target: Path) -> None:
         for heading in ("stage", "rms (µm)", "correspondences", "iterations", "seconds"):
             table.add_column(heading, justify="left" if heading == "stage" else "right")
         for s in result.stages:
-            table.add_row(s.name, f"{s.rms * to_um:.1f}", str(s.correspondences), str(s.iterations), f"{s.seconds:.2f}")
+            table.add_row(
+                s.name, f"{s.rms * to_um:.1f}", f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}"
+            )
         console.print(table)
         console.print(result.verdict, soft_wrap=True, highlight=False)
         for line in (*(f"Not observable from these motions: {u}." for u in result.unobservable), *result.notes):

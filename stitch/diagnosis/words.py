@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stitch.diagnosis.select import IMPLAUSIBLE, Ranked
+from stitch.rounding import rounded
 
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnose import Diagnosis
@@ -76,7 +77,10 @@ def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
     s = ranked.score
     kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
     order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
-    told = [f"{kept[i].name} = {s.values[i]:.3g} ± {s.sigmas[i]:.1g} {kept[i].unit}" for i in sorted(order)]
+    told = [
+        f"{kept[i].name} = {rounded(s.values[i], s.sigmas[i])} ± {s.sigmas[i]:.1g} {kept[i].unit}"
+        for i in sorted(order)
+    ]
     grid = [
         f"{p.name} = {v:g} {p.unit}" for p, v in zip(s.candidate.parameters, s.form.term.values, strict=True) if p.grid
     ]

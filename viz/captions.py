@@ -1,0 +1,39 @@
+"""One line under every figure: what to read from it."""
+
+MAPS = (
+    "Rms distance between neighbouring views on the part, looked at along its thinnest axis; one colour scale for "
+    "both. What register takes away was an error of single poses; what stays is noise or shape."
+)
+CONVERGENCE = "Near the dashed line the scanner's own noise is all that is left; further iterations bring nothing."
+PER_VIEW = (
+    "Left: how far each view had to move beyond what the model says. Right: what is left afterwards. "
+    "One bar that stands out is a view to look at; bars that rise together are a missing effect."
+)
+WATERFALL = (
+    "An effect earns its place if the bar of the views left out falls too; the dashed line is what the sensor's "
+    "noise alone would leave."
+)
+CHANGE = "The same correspondences with one colour scale: where the right map is darker, the change has helped."
+BUDGET = "Shares of the mean square: what noise explains, what the named effect would take away, what is left."
+SUSPECTS = (
+    "To the right of zero an effect explains more than its parameters cost; a step of 3 is odds of 20 to 1. "
+    "Orange: named."
+)
+ADDED = (
+    "A dot is one number of the evidence. A suspect that is there as fitted puts the dots along the line; "
+    "a cloud that is narrow sideways explains nothing."
+)
+SHAPE = "Mean displacement in bins with two sigmas. Bars that all reach zero follow nothing."
+ALIASES = (
+    "1 in a row: in these views the effect of the column can do the same, and only other views or an artefact "
+    "tell the two apart."
+)
+VIEWS = "Where the overlaps would put each view against where the model puts it, along the axes of the reference frame."
+COMPARISON = (
+    "Signed mean distance between the views against each property with two sigmas, clearest first; "
+    "a slope or a bend is what the model does not know. The sample is the view."
+)
+STICKS = (
+    "Where each view puts every target against the place they share; sticks that all point one way in a region repeat."
+)
+TARGETS = "The farthest target of every view, in the order of views, and how the distances are distributed."
