@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from data_synth import window, window_job
+from data_synth import window, window_job, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window import Weld
@@ -132,7 +132,7 @@ def draw_map(scan, cad, T) -> None:
 
 def seam_table(door, draws: int) -> list[str]:
     """Errors of flush and gap against the meshes cut at the stations."""
-    middle, across, out = window.stations(Pane())
+    middle, across, out = window_views.stations(Pane())
     places = [Station(str(i + 1), *v) for i, v in enumerate(zip(middle, across, out, strict=True))]
     errors, sigmas, shown = [], [], []
     for seed in range(draws):
@@ -180,7 +180,7 @@ def write_example() -> None:
     path = np.array([nominal @ frames.make(np.eye(3), [x, 200.0, 750.0]) for x in (300, 600, 900)])
     window_job.write_path(EXAMPLE / "path.csv", path)
     (EXAMPLE / "fit.toml").write_text(FIT_JOB + window_job.pose_table(nominal) + GRIPPER, encoding="utf-8")
-    middle, across, out = window.stations(Pane())
+    middle, across, out = window_views.stations(Pane())
     door, set_wrong = car_door.build(), car_door.build_pane()
     set_wrong.apply_translation([0.8, 0.6, -0.5])
     clouds, poses = window.scan_seam([door, set_wrong], T, middle, across, out, NOISE, 3, rays=100)

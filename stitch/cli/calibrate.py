@@ -13,6 +13,7 @@ from stitch.calibrate.sphere import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
 from stitch.calibrate.tracker import calibrate_tracker
 from stitch.calibrate.tracker import document_of as tracker_document
+from stitch.run_folder import write_json
 from stitch.session import load_session
 
 calibrate = typer.Typer(
@@ -26,11 +27,14 @@ _JSON = Annotated[bool, typer.Option("--json", help="Print JSON alone on standar
 def sphere(
     session: _SESSION,
     radius_free: Annotated[bool, typer.Option("--radius-free", help="Fit the sphere's radius too.")] = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the JSON there.")] = None,
     as_json: _JSON = False,
 ) -> None:
     """Hand-eye from laser-line or area scans of one sphere of known radius."""
     loaded = load_session(session)
     document = document_of(calibrate_sphere(loaded, radius_free), loaded)
+    if output is not None:
+        write_json(document, output)
     if as_json:
         print(json.dumps(document, indent=1))
         return
