@@ -91,12 +91,16 @@ def _drive(hole: Hole, group: Compensation, tool_axis: ToolAxis | None) -> Drive
 
 def _actual(job: Job, H: Array, naming: Naming | None, name: str) -> Array:
     """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
-    T_base_tool, uv, height = job.placed[name]
+    T_base_tool, _, height = job.placed[name]
+    return hole_coordinate(T_base_tool, np.append(seen_in_plane(job, H, naming, name), height - job.height))
+
+
+def seen_in_plane(job: Job, H: Array, naming: Naming | None, name: str) -> Array:
+    """x, y (2,) in the flange frame at which the camera saw a reference hole, named camera effects taken out."""
+    _, uv, height = job.placed[name]
     if naming is not None and naming.camera.effects:
-        xy = naming.camera.plane(uv[None], height)[0]
-    else:
-        xy = to_plane(H, uv[None])[0]
-    return hole_coordinate(T_base_tool, np.append(xy, height - job.height))
+        return np.asarray(naming.camera.plane(uv[None], height)[0])
+    return np.asarray(to_plane(H, uv[None])[0])
 
 
 def write_drives(result: JobResult, file: Path) -> None:
