@@ -1,0 +1,187 @@
+"""Page and recording of a drilling job: where the holes are, and what the correction does to the drives' errors."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from stitch.cells.drilling.job import JobResult
+from stitch.cells.drilling.reading import Job
+from stitch.frames import Array, transform
+from viz.cells import stage
+from viz.cells.page import Page, Picture, Table, write
+
+_BEFORE, _AFTER, _DRILL = "#b5523b", "#6a9955", "#4878a8"
+# Of the panel's extent, that the largest error's arrow is drawn.
+_LONGEST = 0.25
+
+
+def write_page(job: Job, result: JobResult, path: Path) -> None:
+    """Sentence, holes with error arrows before and after, plate, tables."""
+    caption = (
+        "Arrows: where a reference hole really is, seen from where its drive was expected to meet it, "
+        f"{magnified(job, result):g} times larger. Left by the drawing; right after the correction of its group, with "
+        "which the holes to drill move."
+    )
+    pictures = [Picture("Holes and drive errors", holes(job, result), caption)]
+    if len(result.left_out):
+        caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
+        pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
+    page = Page("Drilling", sentence(job, result), pictures, _tables(job, result), _notes(result))
+    write(page, path)
+
+
+def sentence(job: Job, result: JobResult) -> str:
+    """What the correction is worth."""
+    before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
+    after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
+    return (
+        f"{len(result.drives)} holes to drill in {len(result.groups)} groups. By the drawing the drives miss the "
+        f"reference holes by {before.min():.2f} to {before.max():.2f} {job.length_unit}; after the correction "
+        f"{after.max():.2f} at most is left."
+    )
+
+
+def _notes(result: JobResult) -> list[str]:
+    found = [t for t in (result.naming.trials if result.naming else ()) if t.accepted]
+    out = [f"Found and taken out: {t.effect} = {t.value:.4g} ± {t.sigma:.2g} (p {t.p_value:.1g})." for t in found]
+    tool = result.tool_axis
+    if tool is not None and tool.accepted:
+        tilt, sigma = np.degrees([tool.tilt, tool.sigma])
+        out.append(f"The tool's true axis lies {tilt:.2f} ± {sigma:.2f}° off its frame's z; the drives take it up.")
+    return out
+
+
+def _tables(job: Job, result: JobResult) -> list[Table]:
+    unit = job.length_unit
+    references = [
+        (hole.name, name, f"{np.linalg.norm(error):.3f}", f"{np.linalg.norm(left):.3f}")
+        for name, c in result.groups.items()
+        for hole, error, left in zip(_references(job, name), c.errors, c.residuals, strict=True)
+    ]
+    drives = [
+        (d.hole.name, d.hole.group, *(f"{x:.3f}" for x in d.position), *(f"{a:.3f}" for a in np.degrees(d.angles)),
+         f"{np.linalg.norm(d.position - d.hole.position):.3f}")
+        for d in result.drives
+    ]  # fmt: skip
+    header = ("hole", "group", *(f"{k} ({unit})" for k in "xyz"), "a (°)", "b (°)", "c (°)", f"moved ({unit})")
+    return [
+        Table("Reference holes", ("hole", "group", f"error before ({unit})", f"left after ({unit})"), references),
+        Table("Drives", header, drives),
+    ]
+
+
+def _references(job: Job, group: str) -> list:
+    return [hole for hole in job.holes if hole.group == group and hole.reference]
+
+
+def holes(job: Job, result: JobResult) -> Figure:
+    """The panel from above and from its side, before and after: reference holes with error arrows, holes to drill."""
+    figure = Figure(figsize=(10.5, 4.6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
+    middle, along = _panel_axes(job)
+    for column, title in enumerate(("by the drawing", "after the correction")):
+        after = column == 1
+        for row, side in enumerate((along[:2], along[[0, 2]])):
+            _draw_holes(axes[row, column], job, result, middle, side, after)
+            if row == 0:
+                _name_holes(axes[row, column], job, middle, side)
+        axes[0, column].set_title(title)
+        axes[1, column].set_xlabel(f"along the panel ({job.length_unit})")
+    axes[0, 0].set_ylabel(f"from above ({job.length_unit})")
+    axes[1, 0].set_ylabel(f"from the side ({job.length_unit})")
+    axes[0, 1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def magnified(job: Job, result: JobResult) -> float:
+    """How many times larger than the panel errors are drawn: a round number."""
+    places = np.array([hole.position for hole in job.holes])
+    largest = max(float(np.linalg.norm(c.errors, axis=1).max()) for c in result.groups.values())
+    wanted = _LONGEST * float(np.linalg.norm(np.ptp(places, axis=0))) / max(largest, 1e-12)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(step for step in (1, 2, 5) if step * power <= wanted) * power)
+
+
+def _panel_axes(job: Job) -> tuple[Array, Array]:
+    """Middle (3,) of the drawing's holes and axes (3, 3): along the panel, across it, out of it."""
+    places = np.array([hole.position for hole in job.holes])
+    middle = places.mean(axis=0)
+    return middle, np.linalg.svd(places - middle, full_matrices=False)[2]
+
+
+def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Array, after: bool) -> None:
+    """One panel of `holes`; `side` (2, 3) holds the axes that are drawn."""
+    colour = _AFTER if after else _BEFORE
+    label = f"error, {magnified(job, result):g} times larger"
+    for name, c in result.groups.items():
+        references = _references(job, name)
+        nominal = np.array([hole.position for hole in references])
+        at = ((transform(c.T_actual_nominal, nominal) if after else nominal) - middle) @ side.T
+        off = (c.residuals if after else c.errors) @ side.T * magnified(job, result)
+        ax.scatter(*at.T, s=45, facecolor="none", edgecolor="0.3", zorder=3, label=_once(ax, "reference hole"))
+        ax.quiver(*at.T, *off.T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.006,
+                  label=_once(ax, label))  # fmt: skip
+        ax.update_datalim(at + off)
+    drives = np.array([d.position if after else d.hole.position for d in result.drives])
+    ax.plot(*((drives - middle) @ side.T).T, "+", color=_DRILL, ms=9, label="hole to drill")
+    ax.set_aspect("equal")
+    ax.margins(0.12)
+    ax.autoscale_view()
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _name_holes(ax: Axes, job: Job, middle: Array, side: Array) -> None:
+    for name, position in {hole.name: hole.position for hole in job.holes}.items():
+        ax.annotate(name, side @ (position - middle), xytext=(0, -13), textcoords="offset points", ha="center",
+                    fontsize=7, color="0.4")  # fmt: skip
+
+
+def _once(ax: Axes, label: str) -> str:
+    """The label for the first of several groups, nothing for the others."""
+    return "_" if label in ax.get_legend_handles_labels()[1] else label
+
+
+def plate(job: Job, result: JobResult) -> Figure:
+    """Leave-one-out errors of the plate's holes."""
+    figure = Figure(figsize=(4.6, 3.8), layout="constrained")
+    ax = figure.subplots()
+    at, off = job.plate_xyz[:, :2], result.left_out
+    ax.scatter(*at.T, s=120, facecolor="none", edgecolor="0.3")
+    largest = max(float(np.linalg.norm(off, axis=1).max()), 1e-9)
+    scale = 0.25 * float(np.ptp(at, axis=0).max()) / largest
+    ax.quiver(*at.T, *(off * scale).T, color=_BEFORE, angles="xy", scale_units="xy", scale=1, width=0.007)
+    ax.set(aspect="equal", xlabel=f"flange x ({job.length_unit})", ylabel=f"flange y ({job.length_unit})",
+           title=f"longest arrow {largest:.3f} {job.length_unit}")  # fmt: skip
+    ax.margins(0.25)
+    return figure
+
+
+def record(job: Job, result: JobResult, path: Path) -> None:
+    """Nominal, measured and corrected holes in the base frame, error arrows before and after."""
+    places = np.array([hole.position for hole in job.holes])
+    size = float(np.ptp(places, axis=0).max())
+    with stage.stage(path, "Drilling", _words(job, result)) as recording:
+        stage.points(recording, "holes/drawing", places, [stage.GREY], size / 150, [hole.name for hole in job.holes])
+        for name, c in result.groups.items():
+            nominal = np.array([hole.position for hole in _references(job, name)])
+            corrected, length = transform(c.T_actual_nominal, nominal), magnified(job, result)
+            stage.points(recording, f"holes/measured/{name}", nominal + c.errors, [stage.BLUE], size / 150)
+            args = (nominal, c.errors * length, stage.RED, size / 400)
+            stage.arrows(recording, f"errors/before/{name}", *args)
+            stage.arrows(recording, f"errors/after/{name}", corrected, c.residuals * length, stage.GREEN, size / 300)
+        drives = np.array([d.position for d in result.drives])
+        inward = np.array([d.direction for d in result.drives])
+        stage.points(recording, "holes/corrected", drives, [stage.GREEN], size / 150)
+        stage.arrows(recording, "drives", drives - inward * size / 8, inward * size / 8, stage.GREEN, size / 500)
+        for name, (T, _, _) in job.placed.items():
+            stage.frame(recording, f"tool on {name}", T, size / 15)
+
+
+def _words(job: Job, result: JobResult) -> str:
+    notes = "\n".join(f"- {note}" for note in _notes(result))
+    return (
+        f"# Drilling\n\n{sentence(job, result)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as measured. Green: "
+        f"corrected drives. Red and green arrows: errors before and after, {magnified(job, result):g} times larger."
+    )
