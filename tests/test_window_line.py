@@ -30,7 +30,9 @@ def path_end(file):
 
     row = list(csv.DictReader(file.open()))[-1]
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("ZYX", [float(row[k]) for k in ("a_deg", "b_deg", "c_deg")], degrees=True).as_matrix()
+    T[:3, :3] = Rotation.from_euler(
+        "ZYX", [float(row[k]) for k in ("a_deg", "b_deg", "c_deg")], degrees=True
+    ).as_matrix()
     T[:3, 3] = [float(row[k]) for k in "xyz"]
     return T
 

@@ -109,6 +109,7 @@ def _draw(ax: Axes, stand: Stand, result: BaseResult, i: int, j: int) -> None:
                     "", tip[[i, j]], pose[[i, j], 3], arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.6}
                 )
                 ax.annotate(axis, tip[[i, j]], color=colour, fontsize=8)
+                ax.update_datalim([tip[[i, j]], (2 * pose[:3, 3] - tip)[[i, j]]])
         ax.annotate(name, pose[[i, j], 3], xytext=(-6, -14), textcoords="offset points", color=colour, weight="bold")
     for label, place in [
         *zip(stand.rail.names, stand.rail.points, strict=True),

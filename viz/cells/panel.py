@@ -129,7 +129,7 @@ def _draw_panel(ax: Axes, job: Job, result: JobResult) -> None:
     for name, pads in zip(job.robots, result.contacts.pads, strict=True):
         at = _unrolled(job, pads)
         ax.fill(*at.T, facecolor="0.93", edgecolor="0.6")
-        aside = at.mean(axis=0) * [0.5, 1.0]
+        aside = at.mean(axis=0) * [0.22, 1.0]
         ax.annotate(name, aside, ha="center", va="center", fontsize=13, color="0.45", weight="bold")
     half = job.layout.length / 2
     ax.set(aspect="equal", xlim=(-half - 330, half + 330))
@@ -204,6 +204,8 @@ def _record_legs(recording: stage.Recording, job: Job, name: str, T_base: Array,
     if job.legs is None:
         return
     feet, ends = frames.transform(T_base, job.legs.base), frames.transform(T_flange, job.legs.platform)
+    for name_of, ring in (("foot", feet), ("platform", ends)):
+        stage.line(recording, f"robots/{name_of} {name}", np.vstack([ring, ring[:1]]), stage.BLUE, 12.0)
     for k in range(6):
         stage.line(recording, f"robots/legs {name}/{k + 1}", np.array([feet[k], ends[k]]), stage.GREY, 10.0)
 

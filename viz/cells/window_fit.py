@@ -78,11 +78,13 @@ def deviation_map(part: Part) -> Figure:
     ax = figure.subplots()
     pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
     order = pick[np.argsort(np.abs(found.distance[pick]))]
-    drawn = ax.scatter(found.points[order, i], found.points[order, j], c=found.distance[order], s=2, lw=0, cmap=SIGNED,
+    drawn = ax.scatter(found.points[order, i], found.points[order, j], c=found.distance[order], s=5, lw=0, cmap=SIGNED,
                        vmin=-found.tolerance, vmax=found.tolerance)  # fmt: skip
     bad = found.cells.middle[found.outside]
     ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
     figure.colorbar(drawn, label="outside (+) or inside (−) the CAD", extend="both", shrink=0.8)
+    # White means no deviation, so the ground cannot be white.
+    ax.set_facecolor("0.78")
     ax.set(aspect="equal", xlabel=f"{'xyz'[i]} of the part", ylabel=f"{'xyz'[j]} of the part")
     return figure
 

@@ -70,7 +70,7 @@ def cuts(job: SeamJob, seams: list[Seam]) -> Figure:
     """Small pictures of the scanned points at each station, across and outwards."""
     columns = min(4, len(seams))
     rows = -(-len(seams) // columns)
-    figure = Figure(figsize=(10.5, 1.9 * rows), layout="constrained")
+    figure = Figure(figsize=(10.5, 0.5 + 1.25 * rows), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)).ravel()
     for ax, station, seam in zip(axes, job.stations, seams, strict=False):
         _draw_cut(ax, job, station, seam)
@@ -79,7 +79,7 @@ def cuts(job: SeamJob, seams: list[Seam]) -> Figure:
     for ax in axes[-columns:]:
         ax.set_xlabel("across (mm)")
     for ax in axes[::columns]:
-        ax.set_ylabel("outwards (mm)")
+        ax.set_ylabel("out (mm)")
     return figure
 
 
@@ -88,7 +88,7 @@ def _draw_cut(ax: Axes, job: SeamJob, station: Station, seam: Seam) -> None:
     local = frames.transform(T, job.scan.points)
     near = (np.abs(local) < [_ACROSS, _SLICE, _DOWN]).all(axis=1)
     a, _, h = local[near].T
-    ax.scatter(a, h, s=0.6, c=np.where(a < 0, "#4878a8", "#555555"), lw=0)
+    ax.scatter(a, h, s=2, c=np.where(a < 0, "#4878a8", "#555555"), lw=0)
     colour = VERDICTS[seam.verdict]
     for edge in (seam.inner, seam.outer):
         if edge is not None:
@@ -106,14 +106,16 @@ def loop(job: SeamJob, seams: list[Seam]) -> Figure:
     flat = (middle - middle.mean(axis=0)) @ axes_of_plane.T
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     ax = figure.subplots()
-    reach = 0.06 * float(np.ptp(flat, axis=0).max())
+    reach = 0.05 * float(np.ptp(flat, axis=0).max())
+    ax.plot(*np.vstack([flat, flat[:1]]).T, color="0.8", lw=1, ls=":")
     for at, station, seam in zip(flat, job.stations, seams, strict=True):
         towards = axes_of_plane @ station.across * reach
         ax.plot(*np.array([at - towards, at + towards]).T, color=VERDICTS[seam.verdict], lw=3, solid_capstyle="round")
-        ax.annotate(seam.station, at - 1.9 * towards, ha="center", va="center", fontsize=11)
+        ax.annotate(seam.station, at + 1.9 * towards, ha="center", va="center", fontsize=11)
     for verdict in dict.fromkeys(s.verdict for s in seams):
         ax.plot([], [], color=VERDICTS[verdict], lw=3, label=verdict)
     ax.set(aspect="equal", xlabel="mm", ylabel="mm")
+    ax.margins(0.15)
     ax.legend(frameon=False, loc="center")
     ax.spines[["top", "right"]].set_visible(False)
     return figure
