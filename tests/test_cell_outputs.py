@@ -18,6 +18,7 @@ from scipy.stats import chi2
 import viz.cells.base_to_base
 import viz.cells.drilling
 import viz.cells.panel
+import viz.cells.panel_figures
 import viz.cells.window_fit
 import viz.cells.window_seam
 from data_synth.drilling import DrillingCell, Sizes
@@ -170,7 +171,7 @@ def test_expected_shape_is_what_the_commanded_clamps_do():
 
     job = read_job(JOBS["panel"])
     result = solve_job(job)
-    left = viz.cells.panel.expected_after(job, result)
+    left = viz.cells.panel_figures.expected_after(job, result)
     assert np.abs(left).max() < 0.05
     assert result.shape_largest.max() > 3.0
 

@@ -7,6 +7,7 @@ import rerun as rr
 from matplotlib.figure import Figure
 
 from stitch import frames
+from stitch.cells.window.deviation import Deviations
 from stitch.cells.window.job import Part
 from stitch.cells.window.reading import FitJob
 from stitch.frames import Array
@@ -27,7 +28,7 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
             f"the CAD, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
             "whose mean is beyond it."
         )
-        pictures.append(Picture(f"Deviation map{of}", deviation_map(part), caption, pixels=True))
+        pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
         caption = "All points with a place on the CAD. What lies far out is a deformed place, and did not pull the fit."
         pictures.append(Picture(f"Distances{of}", histogram(part), caption))
     write(Page("Scan onto CAD", sentence(parts), pictures, _tables(parts)), path)
@@ -69,9 +70,8 @@ def _tables(parts: list[Part]) -> list[Table]:
     return tables
 
 
-def deviation_map(part: Part) -> Figure:
+def deviation_map(found: Deviations) -> Figure:
     """Points along the thinnest axis, coloured by their distance; cells beyond the tolerance ringed."""
-    found = part.deviations
     extent = np.ptp(found.points, axis=0)
     i, j = np.sort(np.argsort(extent)[1:])
     figure = Figure(figsize=(9, min(9 * extent[j] / extent[i] + 0.8, 9)), layout="constrained")
@@ -139,6 +139,6 @@ def _record_cad(recording: stage.Recording, name: str, job: FitJob, T: Array) ->
     mesh = job.cad.mesh
     shown = rr.Mesh3D(
         vertex_positions=np.float32(frames.transform(T, np.asarray(mesh.vertices))), triangle_indices=mesh.faces,
-        albedo_factor=[190, 190, 195, 255],
+        albedo_factor=[190, 190, 195, 120],
     )  # fmt: skip
     recording.log(stage.place(name), shown, static=True)
