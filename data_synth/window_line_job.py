@@ -30,7 +30,7 @@ session = "seam"
 hand_eye = "hand-eye.json"
 fit = "found-body/fit.json"  # as `stitch fit body.toml -o found-body` wrote it
 stations = "stations.csv"  # in the body's frame
-pose_sigma = {sigma}  # what one scan may stand off another: robot and rail
+pose_sigma = {sigma:.3f}  # what one scan may stand off another: the robot's scatter in both
 """
 
 
@@ -51,7 +51,7 @@ def write_line(folder: Path, line: WindowLine) -> None:
     ):
         text = _FIT.format(part=part, path=path, nominal=pose_table(T))
         (folder / f"{part}.toml").write_text(text, encoding="utf-8")
-    (folder / "seam.toml").write_text(_SEAM.format(sigma=line.errors.shift), encoding="utf-8")
+    (folder / "seam.toml").write_text(_SEAM.format(sigma=np.sqrt(2) * line.errors.shift), encoding="utf-8")
 
 
 def write_seam(folder: Path, line: WindowLine) -> None:
