@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.scanner import Cloud, Scanner, scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window import NO_FIELD
+from data_synth.window import NO_FIELD, Weld, warp
 from data_synth.window_views import across_seam, along_edges, looking_at, over, stations
 from stitch import frames
 
@@ -60,12 +60,15 @@ class WindowLine:
     move_errors: Errors = Errors()
     sizes: dict[str, float] = field(default_factory=dict)  # of the door, by the names of CarDoor
     rays: int = 130  # rows and columns that the scanner reports
+    grids: tuple[tuple[int, int], tuple[int, int]] = ((4, 2), (4, 3))  # overview of window and body, along x and z
+    weld: Weld | None = None  # a bulge that welding left in the body; its CAD has none
     rng: np.random.Generator = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = rng = np.random.default_rng(self.seed)
         self.door, self.pane = CarDoor(**self.sizes), Pane(**self.sizes)
-        self.body_mesh, self.window_mesh = car_door.build(self.door), car_door.build_pane(self.pane)
+        self.body_cad, self.window_mesh = car_door.build(self.door), car_door.build_pane(self.pane)
+        self.body_mesh = self.body_cad if self.weld is None else warp(self.body_cad, self.weld)
         self.T_flange_scanner_nominal = frames.make(np.eye(3), [0.0, 130.0, 90.0])
         self.T_flange_scanner = self.T_flange_scanner_nominal @ frames.exp(_scatter(rng, 0.005, 2.0))
         self.T_flange_tool = frames.make(np.eye(3), [0.0, -150.0, 220.0])
@@ -101,13 +104,17 @@ class WindowLine:
 
     def scan_window(self) -> Scans:
         """The window in its rack: an overview, then its edges."""
-        views = [over(self.window_mesh.bounds, (4, 2), 600.0, self.rng), along_edges(self.pane, "pane", 10, 400.0)]
+        views = [
+            over(self.window_mesh.bounds, self.grids[0], 600.0, self.rng),
+            along_edges(self.pane, "pane", 10, 400.0),
+        ]
         where = self.T_cell_window_nominal, self.T_cell_window
         return self._scan(self.window_mesh, *where, np.concatenate(views), self.errors)
 
     def scan_body(self) -> Scans:
         """The body in pieces along the rail: an overview, then the edges of outline and window."""
-        views = [over(self.body_mesh.bounds, (4, 3), 600.0, self.rng), along_edges(self.door, "door", 10, 400.0)]
+        overview = over(self.body_mesh.bounds, self.grids[1], 600.0, self.rng)
+        views = [overview, along_edges(self.door, "door", 10, 400.0)]
         where = self.T_cell_body_nominal, self.T_cell_body
         return self._scan(self.body_mesh, *where, np.concatenate(views), self.errors)
 

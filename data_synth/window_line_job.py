@@ -41,7 +41,7 @@ def write_line(folder: Path, line: WindowLine) -> None:
     write_scans(folder / "window", line.scan_window(), line)
     write_scans(folder / "body", line.scan_body(), line)
     line.window_mesh.export(folder / "window.stl")
-    line.body_mesh.export(folder / "body.stl")
+    line.body_cad.export(folder / "body.stl")
     write_path(folder / "grip.csv", line.grip_path())
     write_path(folder / "place.csv", line.place_path())
     write_stations(folder / "stations.csv", *line.stations())

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from data_synth.window import true_seam
+from data_synth.window import Weld, true_seam
 from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
 from stitch import frames
@@ -15,6 +15,8 @@ from stitch.cli.main import main
 
 # A door of half the size: the same shapes, a quarter of the triangles.
 DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
+# A bulge that is 3 mm deep in the body and not in its CAD.
+WELD = Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
 
 
 def run(*arguments):
@@ -46,7 +48,9 @@ def placed(tmp_path_factory):
     """Scanner noise while sphere and parts are scanned; robot and rail exact, so that the limits are the scanner's."""
     folder = tmp_path_factory.mktemp("line")
     scanner_alone = Errors(noise=0.05, turn=0.0, shift=0.0, rail=0.0)
-    line = WindowLine(3, scanner_alone, scanner_alone, EXACT, DOOR, rays=85)
+    # Rays as in the full line: at fewer, the pane's flanks of 4 mm are not seen and nothing holds it in its plane.
+    grids = (2, 1), (2, 2)
+    line = WindowLine(3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, weld=WELD)
     write_line(folder, line)
     in_rack = line.T_cell_window
     run("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
@@ -66,6 +70,18 @@ def test_parts_are_found_and_the_window_goes_where_the_drawing_puts_it(placed):
     assert furthest(np.linalg.inv(line.T_cell_body) @ line.T_cell_window, np.eye(4), line.window_mesh) < 0.05
     # The programmed places are millimetres off: without the found frames the window would miss.
     assert furthest(line.T_cell_body_nominal, line.T_cell_body, line.body_mesh) > 2.0
+
+
+def test_welding_bulge_shows_in_the_map(placed):
+    folder, _, _ = placed
+    cells = list(csv.DictReader((folder / "found-body" / "deviation.csv").open()))
+    at = np.array([[float(cell[k]) for k in ("x", "z", "deviation")] for cell in cells])
+    near = np.hypot(at[:, 0] - WELD.x, at[:, 1] - WELD.z) < 25
+    # The skin slopes there, so that 3 mm along y are a little less along its normal.
+    assert -3.1 < np.median(at[near & (at[:, 2] < -1), 2]) < -2.0
+    assert np.hypot(*(at[0, :2] - [WELD.x, WELD.z])) < WELD.reach
+    far = np.hypot(at[:, 0] - WELD.x, at[:, 1] - WELD.z) > 4 * WELD.reach
+    assert np.median(np.abs(at[far, 2])) < 0.05
 
 
 def test_seam_is_that_of_the_meshes(placed):
