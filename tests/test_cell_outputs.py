@@ -165,6 +165,18 @@ def test_page_needs_nothing_beside_it(handed_out, command, wanted):
     assert wanted in page
 
 
+def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monkeypatch, capsys):
+    """R2 read 0.2 m short of where its rod puts it."""
+    text = JOBS["base"].read_text()
+    (tmp_path / "bad.toml").write_text(text.replace("length = 4.4084", "length = 4.2084"))
+    assert text != (tmp_path / "bad.toml").read_text()
+    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.base_to_base.write_page)])
+    with pytest.raises(SystemExit) as stop:
+        main(["base", str(tmp_path / "bad.toml"), "--report", str(tmp_path / "page.html")])
+    assert stop.value.code == 1
+    assert "no transform is given" in (tmp_path / "page.html").read_text()
+
+
 def test_expected_shape_is_what_the_commanded_clamps_do():
     """A clamp that is lifted by what its three points need leaves nothing; one point alone cannot turn it."""
     from stitch.cells.panel import read_job, solve_job

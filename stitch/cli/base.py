@@ -14,6 +14,7 @@ from stitch.cells.base_to_base import BaseResult, handover, read_stand, solve
 from stitch.cells.base_to_base.report import describe, document
 from stitch.cells.session_folder import write_sessions
 from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.errors import NoResultError
 
 
 def base(
@@ -25,7 +26,12 @@ def base(
 ) -> None:
     """Find the transform between two robot bases from a stand with a measuring rod."""
     stand = read_stand(file)
-    result = solve(stand)
+    try:
+        result = solve(stand)
+    except NoResultError:
+        # The page shows which readings contradict each other.
+        show("base", None, report, stand, None)
+        raise
     if session is not None:
         write_sessions(session, [handover.session(stand, result)])
     show("base", recording, report, stand, result)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
+from stitch.cells.base_to_base.contradiction import compare_distances
 from stitch.cells.base_to_base.report import LIMIT, BaseResult, describe
 from stitch.cells.base_to_base.stand import Stand
 from stitch.frames import Array
@@ -14,23 +15,29 @@ from viz.cells.page import Page, Picture, Table, write
 from viz.units import to_millimetres
 
 
-def write_page(stand: Stand, result: BaseResult, path: Path) -> None:
-    """Sentence, plan and elevation of the stand, contradictions, the transform by all solutions."""
-    legend = (
-        "Left from above, right from the side, in the frame of base 1. Blue: base 1 and the cups that it touched on "
-        "the rail. Green: base 2 and the rod's cup as it touched it; the shade is two sigmas of its place, 100 times "
-        "larger. Red: the rod from its pivot on the rail (grey) to the cup, as slide, angle and length say."
-    )
+def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
+    """Sentence, plan and elevation, contradictions, the transform; without a result the contradictions alone."""
+    comparisons = compare_distances(stand) if result is None else result.comparisons
     judged = (
         "Distances that the stand and a robot's joints give independently; beyond "
         f"{LIMIT:g} sigmas the command refuses to give a transform."
     )
-    pictures = [
-        Picture("The stand and both bases", plan(stand, result), legend),
-        Picture("Do the readings contradict each other?", contradictions(result), judged),
-    ]
-    notes = [f"No projection: {result.no_projection}."] if result.no_projection else []
-    write(Page("Base to base", sentence(stand, result), pictures, _tables(stand, result), notes), path)
+    pictures = [Picture("Do the readings contradict each other?", contradictions(comparisons), judged)]
+    tables = [Table("Distances", ("comparison",), [(describe(c, stand.length_unit),) for c in comparisons])]
+    verdict, notes = "The readings contradict each other; no transform is given.", []
+    if result is not None:
+        verdict = sentence(stand, result)
+        notes = [f"No projection: {result.no_projection}."] if result.no_projection else []
+        pictures.insert(0, Picture("The stand and both bases", plan(stand, result), _PLAN))
+        tables.insert(0, _transforms(stand, result))
+    write(Page("Base to base", verdict, pictures, tables, notes), path)
+
+
+_PLAN = (
+    "Left from above, right from the side, in the frame of base 1. Blue: base 1 and the cups that it touched on the "
+    "rail. Green: base 2 and the rod's cup as it touched it; the shade is two sigmas of its place, 100 times larger. "
+    "Red: the rod from its pivot on the rail (grey) to the cup, as slide, angle and length say."
+)
 
 
 def sentence(stand: Stand, result: BaseResult) -> str:
@@ -44,7 +51,7 @@ def sentence(stand: Stand, result: BaseResult) -> str:
     )
 
 
-def _tables(stand: Stand, result: BaseResult) -> list[Table]:
+def _transforms(stand: Stand, result: BaseResult) -> Table:
     rows = [("least squares", *_row(result.fit.T_base1_base2))]
     rows.append(
         ("  its sigma", *(f"{s:.5f}" for s in result.fit.sigma[3:]), *(f"{s:.6f}" for s in result.fit.sigma[:3]))
@@ -53,8 +60,7 @@ def _tables(stand: Stand, result: BaseResult) -> list[Table]:
         rows.append(("projection", *_row(result.projection.T_base1_base2)))
     unit = stand.length_unit
     header = ("solution", *(f"{k} ({unit})" for k in "xyz"), *(f"about {k} (rad)" for k in "xyz"))
-    told = [(describe(c, unit),) for c in result.comparisons]
-    return [Table("T_base1_base2, rotation as a vector", header, rows), Table("Distances", ("comparison",), told)]
+    return Table("T_base1_base2, rotation as a vector", header, rows)
 
 
 def _row(T: Array) -> list[str]:

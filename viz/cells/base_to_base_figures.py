@@ -1,11 +1,14 @@
 """Figures of two robots joined by a stand; each function returns a Figure."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from stitch import frames
+from stitch.cells.base_to_base.contradiction import Comparison
 from stitch.cells.base_to_base.report import LIMIT, BaseResult
 from stitch.cells.base_to_base.stand import Stand, rod_points
 from stitch.frames import Array
@@ -26,39 +29,38 @@ def plan(stand: Stand, result: BaseResult) -> Figure:
 
 
 def _draw(ax: Axes, stand: Stand, result: BaseResult, i: int, j: int) -> None:
-    T = result.fit.T_base1_base2
-    touched = frames.transform(T, stand.rod.points)
-    pivots, cups = rods(stand, result)
-    rail = np.vstack([stand.rail.points, pivots])
-    order = np.argsort(rail @ (rail[-1] - rail[0]))
-    ax.plot(rail[order, i], rail[order, j], color="0.75", lw=5, zorder=0, solid_capstyle="round")
+    """The plane of axes i and j of base 1."""
+    T, (pivots, cups) = result.fit.T_base1_base2, rods(stand, result)
+    touched, rail = frames.transform(T, stand.rod.points), np.vstack([stand.rail.points, pivots])
+    rail = rail[np.argsort(rail @ (rail[-1] - rail[0]))]
+    ax.plot(rail[:, i], rail[:, j], color="0.75", lw=5, zorder=0, solid_capstyle="round")
     for pivot, cup in zip(pivots, cups, strict=True):
         ax.plot([pivot[i], cup[i]], [pivot[j], cup[j]], color=_ROD, lw=1.5)
     size = 0.12 * float(np.ptp(np.vstack([rail, touched, np.zeros((1, 3)), T[None, :3, 3]]), axis=0).max())
-    for name, pose, colour, places in (
-        ("base 1", np.eye(4), _ONE, stand.rail.points),
-        ("base 2", T, _TWO, touched),
+    for name, pose, colour, places, labels in (
+        ("base 1", np.eye(4), _ONE, stand.rail.points, stand.rail.names),
+        ("base 2", T, _TWO, touched, stand.rod.names),
     ):
-        for place in places:
-            ax.plot([pose[i, 3], place[i]], [pose[j, 3], place[j]], color=colour, lw=0.8, ls=":")
-        ax.plot(places[:, i], places[:, j], "o", color=colour, ms=6)
-        for k, axis in enumerate("xyz"):
-            tip = pose[:3, 3] + size * pose[:3, k]
-            if np.hypot(*(tip - pose[:3, 3])[[i, j]]) > size / 4:
-                ax.annotate(
-                    "", tip[[i, j]], pose[[i, j], 3], arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.6}
-                )
-                ax.annotate(axis, tip[[i, j]], color=colour, fontsize=8)
-                ax.update_datalim([tip[[i, j]], (2 * pose[:3, 3] - tip)[[i, j]]])
-        ax.annotate(name, pose[[i, j], 3], xytext=(-6, -14), textcoords="offset points", color=colour, weight="bold")
-    for label, place in [
-        *zip(stand.rail.names, stand.rail.points, strict=True),
-        *zip(stand.rod.names, touched, strict=True),
-    ]:
-        ax.annotate(label, place[[i, j]], xytext=(6, 6), textcoords="offset points", fontsize=9)
-    for point in (T[:3, 3],):
-        spread = result.fit.covariance[3:, 3:][np.ix_([i, j], [i, j])]
-        ax.add_patch(_ellipse(point[[i, j]], spread))
+        _draw_base(ax, name, pose, size, colour, [i, j])
+        for place, label in zip(places[:, [i, j]], labels, strict=True):
+            ax.plot(*np.array([pose[[i, j], 3], place]).T, color=colour, lw=0.8, ls=":")
+            ax.plot(*place, "o", color=colour, ms=6)
+            ax.annotate(label, place, xytext=(6, 6), textcoords="offset points", fontsize=9)
+    ax.add_patch(_ellipse(T[[i, j], 3], result.fit.covariance[3:, 3:][np.ix_([i, j], [i, j])]))
+
+
+def _draw_base(ax: Axes, name: str, T: Array, size: float, colour: str, plane: list[int]) -> None:
+    """Axes of a base (4, 4) as far as they show in the plane, and its name."""
+    origin = T[plane, 3]
+    for k, axis in enumerate("xyz"):
+        arrow = size * T[plane, k]
+        if np.hypot(*arrow) > size / 4:
+            style = {"arrowstyle": "->", "color": colour, "lw": 1.6}
+            ax.annotate("", origin + arrow, origin, arrowprops=style)
+            ax.annotate(axis, origin + arrow, color=colour, fontsize=8)
+            # Arrows do not count for the limits of the axes by themselves.
+            ax.update_datalim([origin + arrow, origin - arrow])
+    ax.annotate(name, origin, xytext=(-6, -14), textcoords="offset points", color=colour, weight="bold")
 
 
 def _ellipse(at: Array, covariance: Array) -> Ellipse:
@@ -69,9 +71,9 @@ def _ellipse(at: Array, covariance: Array) -> Ellipse:
     return Ellipse((float(at[0]), float(at[1])), width, height, angle=angle, facecolor=_TWO, alpha=0.2, lw=0)
 
 
-def contradictions(result: BaseResult) -> Figure:
+def contradictions(comparisons: Sequence[Comparison]) -> Figure:
     """Every comparison's difference in sigmas."""
-    shown = result.comparisons[:12][::-1]
+    shown = comparisons[:12][::-1]
     figure = Figure(figsize=(7, 0.9 + 0.32 * len(shown)), layout="constrained")
     ax = figure.subplots()
     sizes = [c.sigmas for c in shown]
