@@ -61,6 +61,7 @@ class WindowLine:
     sizes: dict[str, float] = field(default_factory=dict)  # of the door, by the names of CarDoor
     rays: int = 130  # rows and columns that the scanner reports
     grids: tuple[tuple[int, int], tuple[int, int]] = ((4, 2), (4, 3))  # overview of window and body, along x and z
+    edges: int = 10  # scans along each edge
     weld: Weld | None = None  # a bulge that welding left in the body; its CAD has none
     rng: np.random.Generator = field(init=False)
 
@@ -106,7 +107,7 @@ class WindowLine:
         """The window in its rack: an overview, then its edges."""
         views = [
             over(self.window_mesh.bounds, self.grids[0], 600.0, self.rng),
-            along_edges(self.pane, "pane", 10, 400.0),
+            along_edges(self.pane, "pane", self.edges, 400.0),
         ]
         where = self.T_cell_window_nominal, self.T_cell_window
         return self._scan(self.window_mesh, *where, np.concatenate(views), self.errors)
@@ -114,7 +115,7 @@ class WindowLine:
     def scan_body(self) -> Scans:
         """The body in pieces along the rail: an overview, then the edges of outline and window."""
         overview = over(self.body_mesh.bounds, self.grids[1], 600.0, self.rng)
-        views = [overview, along_edges(self.door, "door", 10, 400.0)]
+        views = [overview, along_edges(self.door, "door", self.edges, 400.0)]
         where = self.T_cell_body_nominal, self.T_cell_body
         return self._scan(self.body_mesh, *where, np.concatenate(views), self.errors)
 

@@ -50,7 +50,7 @@ def placed(tmp_path_factory):
     scanner_alone = Errors(noise=0.05, turn=0.0, shift=0.0, rail=0.0)
     # Rays as in the full line: at fewer, the pane's flanks of 4 mm are not seen and nothing holds it in its plane.
     grids = (2, 1), (2, 2)
-    line = WindowLine(3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, weld=WELD)
+    line = WindowLine(3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, edges=7, weld=WELD)
     write_line(folder, line)
     in_rack = line.T_cell_window
     run("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
@@ -101,6 +101,7 @@ def test_seam_is_that_of_the_meshes(placed):
     ('hand_eye = "hand-eye.json"', 'hand_eye = "none.json"', "none.json: not found; `stitch calibrate sphere SESSION -o none.json` writes one"),
     ('hand_eye = "hand-eye.json"', "", "session needs hand_eye"),
     ('session = "window"', 'session = "window"\nscans = "grip.csv"', "say where the scans are"),
+    ('session = "window"', 'scans = "grip.csv"', "hand_eye goes with session"),
 ])  # fmt: skip
 def test_bad_scans_are_refused_in_one_line(placed, capsys, old, new, message):
     folder, _, _ = placed

@@ -9,6 +9,6 @@ from stitch.cells.window.scans import Placed
 def session(name: str, placed: Placed, cad: Path | None = None) -> HandOver:
     """One view for each scan; where the job knew only the scanner's poses, the scanner itself counts as the flange."""
     return HandOver(
-        name, "mm", "eye_in_hand", placed.names, placed.T_base_flange, placed.T_flange_scanner, clouds=placed.clouds,
-        cad=cad,
+        name, placed.length_unit, "eye_in_hand", placed.names, placed.T_base_flange, placed.T_flange_scanner,
+        clouds=placed.clouds, cad=cad,
     )  # fmt: skip

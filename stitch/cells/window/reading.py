@@ -120,6 +120,8 @@ def _scans(file: Path, document: dict[str, Any]) -> Placed:
     """From a table of scanner poses, or from a session and a hand-eye."""
     if ("scans" in document) == ("session" in document):
         raise InputError(f"{file}: say where the scans are: scans = a table of them, or session = a session folder")
+    if "scans" in document and "hand_eye" in document:
+        raise InputError(f"{file}: hand_eye goes with session; the poses of a table of scans are the scanner's own")
     if "scans" in document:
         return read_table(_file(file, document, "scans"))
     if "hand_eye" not in document:

@@ -30,6 +30,7 @@ class Placed:
     clouds: tuple[Array, ...]  # (N, 3) each, scanner frame
     T_base_flange: Array  # (V, 4, 4) reported
     T_flange_scanner: Array  # (4, 4)
+    length_unit: str = "mm"  # as a session states it; a table of scans does not
 
     @property
     def T_base_scanner(self) -> Array:
@@ -87,7 +88,10 @@ def read_table(file: Path) -> Placed:
         if len(points) < _FEWEST:
             raise InputError(f"{file.parent / name}: {len(points)} points are too few; scan again or drop its row")
         clouds.append(points)
-    return Placed(tuple(Path(name).stem for name in table.texts["file"]), tuple(clouds), from_columns(table), np.eye(4))
+    names = [Path(name).stem for name in table.texts["file"]]
+    if len(set(names)) < len(names):
+        names = [f"{i + 1:03}-{name}" for i, name in enumerate(names)]
+    return Placed(tuple(names), tuple(clouds), from_columns(table), np.eye(4))
 
 
 def read_session(folder: Path, hand_eye: Path) -> Placed:
@@ -106,7 +110,8 @@ def read_session(folder: Path, hand_eye: Path) -> Placed:
         clouds.append(view.cloud.points)
     poses = np.array([view.T_base_flange for view in session.views])
     T_flange_scanner = read_hand_eye(hand_eye, session.length_unit)
-    return Placed(tuple(view.name for view in session.views), tuple(clouds), poses, T_flange_scanner)
+    names = tuple(view.name for view in session.views)
+    return Placed(names, tuple(clouds), poses, T_flange_scanner, session.length_unit)
 
 
 def read_hand_eye(file: Path, length_unit: str) -> Array:
