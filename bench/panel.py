@@ -1,66 +1,32 @@
-"""The panel cell in closed loop: writes the tables and pictures of docs/panel.md, and the files of examples/panel.
+"""The panel cell in closed loop: writes the tables and pictures of docs/panel.md.
 
-Run: python bench/panel.py [--draws N] [--write-example]
+Run: python bench/panel.py [--draws N]
 """
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready_without_panel, shape_run
 
 from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
 from stitch.cells.panel.errors_along import along
-from stitch.cells.panel.experiment import Stage, measure_pose, run_pose, run_shape
+from stitch.cells.panel.experiment import run_pose
 from stitch.cells.panel.figures import draw_errors, draw_shape
-from stitch.cells.panel.global_model import Readings, calibrate
-from stitch.cells.panel.layout import Layout, contacts
+from stitch.cells.panel.global_model import calibrate
 from stitch.cells.panel.legs import Legs, find_leg_offset, true_flanges
-from stitch.cells.panel.motion import follow, preposition
-from stitch.cells.panel.rigid_fit import rigid_fit
+from stitch.cells.panel.motion import follow
 from stitch.cells.panel.shape import SHAPING
 from stitch.cells.panel.tracker import Tracker
 from stitch.errors import NoResultError
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, PICTURES, EXAMPLE = ROOT / "docs" / "panel.md", ROOT / "docs" / "pictures", ROOT / "examples" / "panel"
+PAGE, PICTURES = ROOT / "docs" / "panel.md", ROOT / "docs" / "pictures"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
-LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
 LEGS = Legs(hexapod.BASE, hexapod.PLATFORM)
-POSES, MASTER, TOLERANCE = 40, 1, 0.6
-
-
-@dataclass
-class Ready:
-    """A cell with its panel on the clamps."""
-
-    cell: PanelCell
-    stage: Stage
-    readings: list[Readings]
-    T_base_flange: np.ndarray
-
-
-def read(cell: PanelCell, tracker: Tracker) -> list[Readings]:
-    commands = panel_job.calibration_poses(POSES, cell.seed)
-    seen = panel_job.calibration(cell, commands)
-    return [Readings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)]
-
-
-def ready(seed: int, **settings) -> Ready:
-    """Calibrate, pre-position, lay the panel on."""
-    r = ready_without_panel(seed, **settings)
-    r.cell.lay()
-    return r
-
-
-def pose_error(cell: PanelCell) -> np.ndarray:
-    """(6,) true error of the panel's pose: rotation in deg, then mm; from the targets' true places."""
-    targets = panel_job.pose_targets()
-    T = rigid_fit(targets, cell.true_points(targets), np.ones(len(targets))).T
-    e = frames.log(frames.inverse(cell.target) @ T)
-    return np.concatenate([np.degrees(e[:3]), e[3:]])
 
 
 def pose_table(draws: int) -> list[str]:
@@ -101,15 +67,6 @@ def shape_table(draws: int) -> list[str]:
         lines.append(f"| {name} | {at[0]:.2f} | {at[1]:.2f} | {at[2]:.2f} | {steps} | {force:.0f} | {plane:.0f} |")
     lines.append("| published | larger | | | not given | table lost | |")
     return lines
-
-
-def shape_run(seed: int, compliant: bool, axes: np.ndarray, tolerance: float = TOLERANCE):
-    r = ready(seed)
-    stand = run_pose(r.cell, r.stage, panel_job.pose_targets(), r.T_base_flange)
-    r.cell.compliant = compliant
-    points, clamp = panel_job.control_points()
-    contact = contacts(LAYOUT).T_panel_contact
-    return run_shape(r.cell, r.stage, points, clamp, contact, stand, tolerance, axes)
 
 
 def leg_table(draws: int) -> list[str]:
@@ -187,17 +144,6 @@ def drift_table() -> list[str]:
     return lines
 
 
-def ready_without_panel(seed: int, **settings) -> Ready:
-    cell = PanelCell(seed, **settings)
-    tracker = Tracker(cell.tracker)
-    readings = read(cell, tracker)
-    stage = Stage([calibrate(r) for r in readings], MASTER, tracker, cell.target)
-    base, contact = (np.array([getattr(m, n) for m in stage.models]) for n in ("T_world_base", "T_flange_contact"))
-    start = preposition(base, cell.target, contacts(LAYOUT).T_panel_contact, contact)
-    cell.drive(start)
-    return Ready(cell, stage, readings, start)
-
-
 def pictures() -> None:
     PICTURES.mkdir(exist_ok=True)
     r = ready_without_panel(0)
@@ -213,35 +159,10 @@ def pictures() -> None:
     draw_shape(PICTURES / "panel-shape.png", NAMES, run.deviations, TOLERANCE, forces)
 
 
-def write_example() -> None:
-    """The job of a cell in which leg 4 of robot C is 0.5 mm longer than it believes, panel just laid on."""
-    EXAMPLE.mkdir(exist_ok=True)
-    hidden = np.zeros((6, 6))
-    hidden[2, 3] = 0.5
-    r = ready(7, leg_offsets=hidden)
-    files = {k: f"{k}.csv" for k in ("calibration", "flanges", "targets", "control", "forces")}
-    commands = panel_job.calibration_poses(POSES, 7)
-    seen = np.stack([reading.reflectors for reading in r.readings], axis=1)
-    panel_job.write_calibration(EXAMPLE / files["calibration"], commands, seen)
-    panel_job.write_flanges(EXAMPLE / files["flanges"], r.T_base_flange)
-    targets, (control, clamp) = panel_job.pose_targets(), panel_job.control_points()
-    names = [f"T{i + 1}" for i in range(len(targets))]
-    panel_job.write_points(EXAMPLE / files["targets"], names, targets, r.cell.track(targets))
-    names = [f"SC{c + 1}.{i % 3 + 1}" for i, c in enumerate(clamp)]
-    panel_job.write_points(EXAMPLE / files["control"], names, control, r.cell.track(control), [NAMES[c] for c in clamp])
-    panel_job.write_forces(EXAMPLE / files["forces"], r.cell.forces())
-    panel_job.write_job(EXAMPLE / "job.toml", r.cell, files)
-    print(measure_pose(r.cell, r.stage, targets).T)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=30)
-    parser.add_argument("--write-example", action="store_true")
     given = parser.parse_args()
-    if given.write_example:
-        write_example()
-        return
     pictures()
     parts = [pose_table(given.draws), shape_table(max(1, given.draws // 3)), leg_table(given.draws), drift_table()]
     text = "\n\n".join("\n".join(part) for part in parts)

@@ -1,16 +1,15 @@
 """Scan onto CAD and seam on a car door and its pane: writes the tables and pictures of docs/window.md.
 
-Run: python bench/window.py [--draws N] [--write-example]
+Run: python bench/window.py [--draws N]
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from data_synth import window, window_job
+from data_synth import window, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window import Weld
@@ -22,45 +21,13 @@ from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.scans import join
 from stitch.cells.window.seam import Limits, Station, measure_seam
 from stitch.cells.window.start import find_start
-from stitch.native import load_open3d
 from stitch.scan import prepare_view
+from viz.cells.window_fit import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, PICTURES, EXAMPLE = ROOT / "docs" / "window.md", ROOT / "docs" / "pictures", ROOT / "examples" / "window"
+PAGE, PICTURES = ROOT / "docs" / "window.md", ROOT / "docs" / "pictures"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 NOISE = 0.05
-FIT_JOB = """# Lengths in the CAD's unit, here mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
-format = "stitch-fit/1"
-cad = "pane.stl"
-scans = "pane.csv"  # cloud files in their scanners' frames, and where the scanner stood in the base
-tolerance = 0.5  # of the deviation map
-path = "path.csv"  # of the robot, programmed for a part that stands as [nominal] says
-
-[nominal]
-"""
-GRIPPER = """
-
-[[region]]  # a box of the part's frame whose points do not count; "expected" boxes carry the fit alone
-name = "gripper"
-kind = "forbidden"
-low = [600.0, -50.0, 700.0]
-high = [700.0, 50.0, 800.0]
-"""
-SEAM_JOB = """# Lengths in mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
-format = "stitch-seam/1"
-scans = "seam.csv"
-stations = "stations.csv"  # in the part's frame: across from the pane to the body, out of the surface
-
-[part]  # where it lies in the base; or, above this table, fit = "fit.json" as stitch fit wrote it
-"""
-LIMITS = """
-
-[limits]
-flush = 0.0
-flush_tolerance = 1.5
-gap = 16.0
-gap_tolerance = 2.0
-"""
 
 
 def truth(seed: int) -> np.ndarray:
@@ -110,7 +77,7 @@ def fit_table(door, pane, draws: int) -> list[str]:
             off = (furthest(start, T, cad_mesh), furthest(found.T_base_part, T, cad_mesh))
             rows.append([*off, found.rms, found.inliers])
             if name.startswith("door, welding bulge 3") and seed == 0:
-                draw_map(scan, surfaces["door"], found.T_base_part)
+                write_map(scan, surfaces["door"], found.T_base_part)
         r = np.array(rows)
         off, left = f"{r[:, 0].max():.2f} | {r[:, 1].max():.4f}", f"{r[:, 2].mean():.3f} | {r[:, 3].mean():.0%}"
         lines.append(f"| {name} | {off} | {left} |")
@@ -118,21 +85,14 @@ def fit_table(door, pane, draws: int) -> list[str]:
     return lines
 
 
-def draw_map(scan, cad, T) -> None:
-    found = deviations(scan, cad, T, 0.5, cad.size / 60)
-    front = found.points[::5], found.distance[::5]
-    figure = Figure(figsize=(8, 5.6), layout="constrained")
-    axis = figure.subplots()
-    dots = axis.scatter(front[0][:, 0], front[0][:, 2], c=front[1], s=1, cmap="coolwarm", vmin=-3, vmax=3)
-    figure.colorbar(dots, label="deviation from the CAD / mm")
-    axis.set(xlabel="x / mm", ylabel="z / mm", aspect="equal", title="Door warped by welding, fitted without a guess")
-    PICTURES.mkdir(exist_ok=True)
+def write_map(scan, cad, T) -> None:
+    figure = deviation_map(deviations(scan, cad, T, 0.5, cad.size / 60))
     figure.savefig(PICTURES / "window-map.png", dpi=100)
 
 
 def seam_table(door, draws: int) -> list[str]:
     """Errors of flush and gap against the meshes cut at the stations."""
-    middle, across, out = window.stations(Pane())
+    middle, across, out = window_views.stations(Pane())
     places = [Station(str(i + 1), *v) for i, v in enumerate(zip(middle, across, out, strict=True))]
     errors, sigmas, shown = [], [], []
     for seed in range(draws):
@@ -164,40 +124,10 @@ def seam_table(door, draws: int) -> list[str]:
     return lines
 
 
-def write_example() -> None:
-    """A pane to fit, coarse enough to be small, and the seam of a pane set a little wrong."""
-    EXAMPLE.mkdir(exist_ok=True)
-    o3d = load_open3d()
-    pane = car_door.build_pane()
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(pane.vertices), o3d.utility.Vector3iVector(pane.faces))
-    small = mesh.simplify_quadric_decimation(3000)
-    pane.__init__(np.asarray(small.vertices), np.asarray(small.triangles))
-    pane.export(EXAMPLE / "pane.stl")
-    T, nominal = truth(1), truth(1) @ frames.exp(np.array([0.01, -0.006, 0.004, 6.0, -4.0, 9.0]))
-    overview, poses = window.scan_outside(pane, T, NOISE, 1, (3, 1), rays=60)
-    close, near = window.scan_edges(pane, T, Pane(), "pane", NOISE, 2, count=8, rays=60)
-    window_job.write_scans(EXAMPLE / "pane.csv", overview + close, np.concatenate([poses, near]))
-    path = np.array([nominal @ frames.make(np.eye(3), [x, 200.0, 750.0]) for x in (300, 600, 900)])
-    window_job.write_path(EXAMPLE / "path.csv", path)
-    (EXAMPLE / "fit.toml").write_text(FIT_JOB + window_job.pose_table(nominal) + GRIPPER, encoding="utf-8")
-    middle, across, out = window.stations(Pane())
-    door, set_wrong = car_door.build(), car_door.build_pane()
-    set_wrong.apply_translation([0.8, 0.6, -0.5])
-    clouds, poses = window.scan_seam([door, set_wrong], T, middle, across, out, NOISE, 3, rays=100)
-    clouds = [points[(np.abs(points[:, :2]) < 24).all(axis=1)] for points in clouds]
-    window_job.write_scans(EXAMPLE / "seam.csv", clouds, poses)
-    window_job.write_stations(EXAMPLE / "stations.csv", middle, across, out)
-    (EXAMPLE / "seam.toml").write_text(SEAM_JOB + window_job.pose_table(T) + LIMITS, encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=3)
-    parser.add_argument("--write-example", action="store_true")
     given = parser.parse_args()
-    if given.write_example:
-        write_example()
-        return
     door, pane = car_door.build(), car_door.build_pane()
     text = "\n\n".join("\n".join(part) for part in (fit_table(door, pane, given.draws), seam_table(door, given.draws)))
     page = PAGE.read_text(encoding="utf-8")

@@ -23,7 +23,7 @@ def write_session(out: Path, measured: Measured, name: str) -> None:
     """session.toml, views.csv, clouds and, where the scene has them, points.csv, below the new folder `out`."""
     (out / "clouds").mkdir(parents=True)
     for i, cloud in enumerate(measured.clouds):
-        _write_ply(out / "clouds" / f"v{i:03d}.ply", cloud)
+        write_ply(out / "clouds" / f"v{i:03d}.ply", cloud)
     (out / "views.csv").write_text(_views(measured))
     (out / "session.toml").write_text(tomli_w.dumps(_document(name, measured)))
     if measured.labelled:
@@ -114,7 +114,8 @@ def _points(measured: Measured) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write_ply(path: Path, cloud: Cloud) -> None:
+def write_ply(path: Path, cloud: Cloud) -> None:
+    """One scan with its intensity and, where it has them, times."""
     names = ["x", "y", "z"]
     # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
     vertex = np.empty(len(cloud.points), [(n, "<f8") for n in names] + [("intensity", "<f4")]

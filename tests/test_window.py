@@ -9,7 +9,7 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from data_synth import window
+from data_synth import window, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames
@@ -177,7 +177,7 @@ def test_seam_at_eight_stations(door, pane):
     """Within 0.05 mm of the meshes cut at the stations; the pane stands 0.6 mm out and 2.5 mm down."""
     moved = pane.copy()
     moved.apply_translation([0.7, 0.6, -2.5])
-    middle, across, out = window.stations(Pane(**DOOR))
+    middle, across, out = window_views.stations(Pane(**DOOR))
     T = truth(4)
     scan = joined(*window.scan_seam([door, moved], T, middle, across, out, NOISE, 1, rays=110))
     places = [Station(str(i), *v) for i, v in enumerate(zip(middle, across, out, strict=True))]

@@ -10,16 +10,31 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch import frames
-from stitch.cells.base_to_base import BaseResult, read_stand, solve
+from stitch.cells.base_to_base import BaseResult, handover, read_stand, solve
 from stitch.cells.base_to_base.report import describe, document
+from stitch.cells.session_folder import write_sessions
+from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.errors import NoResultError
 
 
 def base(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings of the stand, TOML.")],
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Find the transform between two robot bases from a stand with a measuring rod."""
-    result = solve(read_stand(file))
+    stand = read_stand(file)
+    try:
+        result = solve(stand)
+    except NoResultError:
+        # The page shows which readings contradict each other.
+        show("base", None, report, stand, None)
+        raise
+    if session is not None:
+        write_sessions(session, [handover.session(stand, result)])
+    show("base", recording, report, stand, result)
     if as_json:
         print(json.dumps(document(result), indent=1))
     else:

@@ -22,6 +22,7 @@ from stitch.cli.diagnose import write_diagnosis
 from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
 from stitch.result import Run
+from stitch.run_folder import write_json
 from stitch.session import load_session
 from stitch.state import state_of
 
@@ -38,11 +39,14 @@ _JSON = Annotated[bool, typer.Option("--json", help="Print JSON alone on standar
 def sphere(
     session: _SESSION,
     radius_free: Annotated[bool, typer.Option("--radius-free", help="Fit the sphere's radius too.")] = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the JSON there.")] = None,
     as_json: _JSON = False,
 ) -> None:
     """Hand-eye from laser-line or area scans of one sphere of known radius."""
     loaded = load_session(session)
     document = document_of(calibrate_sphere(loaded, radius_free), loaded)
+    if output is not None:
+        write_json(document, output)
     if as_json:
         print(json.dumps(document, indent=1))
         return

@@ -9,13 +9,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from stitch.cells.drilling import handover
 from stitch.cells.drilling.job import JobResult, document, solve_job, write_drives
 from stitch.cells.drilling.reading import read_job
+from stitch.cells.session_folder import write_sessions
+from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
 
 
 def drill(
     file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the drives.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Correct the drives of holes from reference holes that the robot has seen."""
@@ -23,6 +29,9 @@ def drill(
     result = solve_job(job)
     if output is not None:
         write_drives(result, output)
+    if session is not None:
+        write_sessions(session, [handover.session(job, result)])
+    show("drill", recording, report, job, result)
     if as_json:
         print(json.dumps(document(result), indent=1))
     else:

@@ -8,19 +8,27 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from stitch.cells.window import fit_parts, read_fit_job
+from stitch.cells.session_folder import write_sessions
+from stitch.cells.window import fit_parts, handover, read_fit_job
 from stitch.cells.window.job import Part, fit_document, write_fit
+from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
 
 
 def fit(
     file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path."""
     job = read_fit_job(file)
     parts = fit_parts(job)
     written = write_fit(job, parts, output) if output is not None else []
+    if session is not None:
+        write_sessions(session, [handover.session(file.stem, job.placed, job.cad_file)])
+    show("fit", recording, report, job, parts)
     if as_json:
         print(json.dumps(fit_document(job, parts), indent=1))
         return

@@ -9,19 +9,27 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cells.panel import Job, JobResult, read_job, solve_job
+from stitch.cells.panel import Job, JobResult, handover, read_job, solve_job
 from stitch.cells.panel.report import document, write_folder
+from stitch.cells.session_folder import write_sessions
+from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
 
 
 def panel(
     file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For the commands.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape."""
     job = read_job(file)
     result = solve_job(job)
     written = write_folder(job, result, output) if output is not None else []
+    if session is not None:
+        write_sessions(session, handover.sessions(job, result))
+    show("panel", recording, report, job, result)
     if as_json:
         print(json.dumps(document(job, result), indent=1))
         return

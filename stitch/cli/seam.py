@@ -10,14 +10,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cells.window import read_seam_job, solve_seam
+from stitch.cells.session_folder import write_sessions
+from stitch.cells.window import handover, read_seam_job, solve_seam
 from stitch.cells.window.job import write_seam
 from stitch.cells.window.seam import Limits, Seam
+from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
 
 
 def seam(
     file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the stations.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Measure flush and gap at the stations of a seam, with uncertainty and verdict."""
@@ -25,6 +30,9 @@ def seam(
     seams = solve_seam(job)
     if output is not None:
         write_seam(seams, output)
+    if session is not None:
+        write_sessions(session, [handover.session(file.stem, job.placed)])
+    show("seam", recording, report, job, seams)
     if as_json:
         rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
         print(json.dumps(rows, indent=1))

@@ -11,6 +11,7 @@ from stitch.capture_evidence import jacobian
 from stitch.diagnosis.pose_trial import PoseTrial
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
+from stitch.effects.scanner_field import field_scatter
 from stitch.effects.visible import independent, project_out
 from stitch.folds import grouped_folds
 from stitch.frames import Array
@@ -39,7 +40,7 @@ class PoseEvidence:
     @cached_property
     def covariance(self) -> Array:
         """(n, n) of the channel under the null."""
-        return np.asarray(np.einsum("c,cij->ij", self.null.variances, self.evidence.components[:, 0]))
+        return np.asarray(self.evidence.covariance(self.null.variances)[0])
 
     def columns(self, candidates: Sequence[Term]) -> tuple[list[Array], PointGram | None, list[slice | None]]:
         """Twists (6V, P) of each candidate, and the sums of point effects."""
@@ -141,11 +142,12 @@ def pose_evidence(
     hand_eye = jacobian(capture.carriers(T_mount), g.centre)
     extra = np.hstack([np.zeros((6 * g.views, 0)), *all_columns(chain, terms, terms, T_mount, freed)[0]])
     sizes = np.array([p.typical for t in terms for p in chain.parameters(t.effect)])
-    start = fit_variances(evidence_of(channel), both_starts=True)
-    half = np.linalg.cholesky(np.einsum("c,cij->ij", start.variances, evidence_of(channel).components[:, 0]))
+    field = channel.left @ field_scatter(chain, terms, T_mount, freed)
+    alone = replace(evidence_of(channel), fixed=(field @ field.T)[None])
+    half = np.linalg.cholesky(alone.covariance(fit_variances(alone, both_starts=True).variances)[0])
     own, further = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.left @ extra))
     seen = independent(own, further, sizes, _UNSEEN)
     model = np.hstack([hand_eye, extra[:, seen]])
-    evidence = evidence_of(channel, channel.left @ extra[:, seen])
+    evidence = replace(evidence_of(channel, channel.left @ extra[:, seen]), fixed=alone.fixed)
     null = fit_variances(evidence, both_starts=True)
     return PoseEvidence(chain, tuple(terms), capture, T_mount, freed, channel, model, evidence, null)

@@ -52,7 +52,7 @@ class JobResult:
 def solve_job(job: Job) -> JobResult:
     """Homography, compensation of every group, and what else the job holds readings for.
 
-    Camera effects that the check holes show are taken out of the reference holes' places.
+    What the check holes show of the camera is taken out of the reference holes' places.
 
     Raises:
         NoResultError: a step has too few or degenerate readings; names the step.
@@ -91,12 +91,20 @@ def _drive(hole: Hole, group: Compensation, tool_axis: ToolAxis | None) -> Drive
 
 def _actual(job: Job, H: Array, naming: Naming | None, name: str) -> Array:
     """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
-    T_base_tool, uv, height = job.placed[name]
-    if naming is not None and naming.camera.effects:
-        xy = naming.camera.plane(uv[None], height)[0]
-    else:
-        xy = to_plane(H, uv[None])[0]
-    return hole_coordinate(T_base_tool, np.append(xy, height - job.height))
+    T_base_tool, _, height = job.placed[name]
+    return hole_coordinate(T_base_tool, np.append(seen_in_plane(job, H, naming, name), height - job.height))
+
+
+def seen_in_plane(job: Job, H: Array, naming: Naming | None, name: str) -> Array:
+    """x, y (2,) in the flange frame at which the camera saw a reference hole.
+
+    Where check holes have shown the camera beyond its work plane, at the hole's own height and without the effects that
+    were named; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for each mm.
+    """
+    _, uv, height = job.placed[name]
+    if naming is not None:
+        return np.asarray(naming.camera.plane(uv[None], height)[0])
+    return np.asarray(to_plane(H, uv[None])[0])
 
 
 def write_drives(result: JobResult, file: Path) -> None:

@@ -14,6 +14,13 @@ from stitch.frames import Array
 def draw_errors(
     files: Sequence[Path], names: Sequence[str], master: int, shift: ErrorsAlong, turn: ErrorsAlong
 ) -> None:
+    """Write `errors_figure`."""
+    figure = errors_figure(names, master, shift, turn)
+    for file in files:
+        figure.savefig(file, dpi=110)
+
+
+def errors_figure(names: Sequence[str], master: int, shift: ErrorsAlong, turn: ErrorsAlong) -> Figure:
     """Error against distance and angle, one line per slave: the worst of the three axes."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots(2, 2, sharex="row", squeeze=False)
@@ -23,8 +30,7 @@ def draw_errors(
         _lines(axes[row, 1], steps, np.degrees(errors.angle) * 1e3, names, master, label, "angle error / 0.001°")
     axes[0, 0].legend(title=f"slaves of {names[master]}", fontsize="small")
     figure.suptitle("Slave against master, rms expected from the global model's covariance, worst axis")
-    for file in files:
-        figure.savefig(file, dpi=110)
+    return figure
 
 
 def _lines(axis: Axes, steps: Array, values: Array, names: Sequence[str], master: int, across: str, up: str) -> None:

@@ -46,6 +46,12 @@ class LegOffset:
     p_after: float  # chance of the misfit that is left with the offset taken out
 
 
+def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
+    """(M, 6) lengths, mm, that a controller sets for flange poses (M, 4, 4)."""
+    ends = frames.transform(T_base_flange, legs.platform)
+    return np.asarray(np.linalg.norm(ends - legs.base, axis=-1))
+
+
 def leg_jacobian(legs: Legs, T_base_flange: Array) -> Array:
     """(M, 6, 6): change of leg length per flange twist ξ in T·exp(ξ), rotation first; poses (M, 4, 4).
 

@@ -114,5 +114,5 @@ def solve_seam(job: SeamJob) -> list[Seam]:
 
 def write_seam(seams: list[Seam], file: Path) -> None:
     """One row per station."""
-    columns = {name: [getattr(seam, name) for seam in seams] for name in Seam.__dataclass_fields__}
-    write_columns(file, columns)
+    names = ("station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason")
+    write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})

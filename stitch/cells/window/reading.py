@@ -13,22 +13,25 @@ from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
 from stitch.cells.toml_tables import check_keys, choice, finite, read_toml
 from stitch.cells.window.cad import Surface, read_cad
 from stitch.cells.window.regions import Box, Regions
-from stitch.cells.window.scans import Joined, read_scans
+from stitch.cells.window.scans import Joined, Placed, assemble, read_session, read_table
 from stitch.cells.window.seam import Limits, Station
 from stitch.errors import InputError
 from stitch.frames import Array
 
 FIT, SEAM = "stitch-fit/1", "stitch-seam/1"
-_FIT_KEYS = {"format", "scans", "cad", "instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
-_SEAM_KEYS = {"format", "scans", "stations", "fit", "part", "limits", "pose_sigma"}
+_SCANS = {"scans", "session", "hand_eye"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
+_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
 
 
 @dataclass(frozen=True)
 class FitJob:
     """Scans onto one CAD model; lengths in the CAD's unit."""
 
-    scan: Joined
+    placed: Placed
+    scan: Joined  # the same as one cloud
     cad: Surface
+    cad_file: Path
     instances: int
     tolerance: float
     cell: float
@@ -42,7 +45,8 @@ class FitJob:
 class SeamJob:
     """Scans of a seam, where the part lies and where to measure; mm."""
 
-    scan: Joined
+    placed: Placed
+    scan: Joined  # the same as one cloud
     T_base_part: Array  # (4, 4)
     stations: tuple[Station, ...]
     limits: Limits
@@ -66,9 +70,10 @@ def read_fit_job(file: Path | str) -> FitJob:
     instances = document.get("instances", 1)
     if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
         raise InputError(f"{file}: instances is {instances!r}; write how many parts are in the scan, 1 or more")
-    cad = read_cad(_file(file, document, "cad"))
+    cad_file = _file(file, document, "cad")
+    cad, placed = read_cad(cad_file), _scans(file, document)
     return FitJob(
-        read_scans(_file(file, document, "scans")), cad, instances,
+        placed, assemble(placed), cad, cad_file, instances,
         finite(file, "tolerance", document.get("tolerance", 0.5), positive=True),
         finite(file, "cell", document.get("cell", cad.size / 60), positive=True),
         _regions(file, document.get("region", [])), finite(file, "coverage", document.get("coverage", 0.5)),
@@ -90,8 +95,9 @@ def read_seam_job(file: Path | str) -> SeamJob:
     known = Limits.__dataclass_fields__
     check_keys(file, "limits", limits, set(known))
     values = {key: finite(file, f"limits.{key}", value, positive="tolerance" in key) for key, value in limits.items()}
+    placed, stations = _scans(file, document), _stations(_file(file, document, "stations"))
     return SeamJob(
-        read_scans(_file(file, document, "scans")), part, _stations(_file(file, document, "stations")),
+        placed, assemble(placed), part, stations,
         Limits(**values), abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
     )  # fmt: skip
 
@@ -108,6 +114,19 @@ def _file(file: Path, document: dict[str, Any], key: str) -> Path:
     if not isinstance(document.get(key), str):
         raise InputError(f"{file}: {key} is {document.get(key)!r}; name a file in quotes")
     return file.parent / str(document[key])
+
+
+def _scans(file: Path, document: dict[str, Any]) -> Placed:
+    """From a table of scanner poses, or from a session and a hand-eye."""
+    if ("scans" in document) == ("session" in document):
+        raise InputError(f"{file}: say where the scans are: scans = a table of them, or session = a session folder")
+    if "scans" in document and "hand_eye" in document:
+        raise InputError(f"{file}: hand_eye goes with session; the poses of a table of scans are the scanner's own")
+    if "scans" in document:
+        return read_table(_file(file, document, "scans"))
+    if "hand_eye" not in document:
+        raise InputError(f"{file}: session needs hand_eye = what `stitch calibrate sphere -o` wrote")
+    return read_session(_file(file, document, "session"), _file(file, document, "hand_eye"))
 
 
 def _pose(file: Path, place: str, entries: Any) -> Array:

@@ -54,6 +54,8 @@ class Seam:
     sigma_gap: float
     verdict: str  # "good", "bad", "open" or "not measured"
     reason: str = ""
+    inner: tuple[float, float] | None = None  # its edge: across and outwards in the station's frame
+    outer: tuple[float, float] | None = None
 
 
 def measure_seam(
@@ -88,7 +90,8 @@ def _measure(scan: Joined, T_base_part: Array, station: Station, limits: Limits,
         (abs(flush - limits.flush) - limits.flush_tolerance, sigma_flush),
         (abs(gap - limits.gap) - limits.gap_tolerance, sigma_gap),
     )
-    return Seam(station.name, flush, gap, float(sigma_flush), float(sigma_gap), verdict)
+    edges = [(edge.across, edge.height) for edge in (inner, outer)]
+    return Seam(station.name, flush, gap, float(sigma_flush), float(sigma_gap), verdict, "", *edges)
 
 
 def _side(points: Array, normals: Array, side: float, name: str) -> Edge:

@@ -1,0 +1,41 @@
+"""Pictures of the cells' pages, from the jobs in examples/: writes docs/pictures/*.png.
+
+Run: python bench/cell_pictures.py
+"""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from stitch.cells.base_to_base import read_stand, solve
+from stitch.cells.drilling.job import solve_job as solve_drilling
+from stitch.cells.drilling.reading import read_job as read_drilling
+from stitch.cells.panel import read_job as read_panel
+from stitch.cells.panel import solve_job as solve_panel
+from stitch.cells.window import read_seam_job, solve_seam
+from viz.cells import base_to_base_figures, drilling_figures, panel_figures, window_seam
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures"
+
+
+def figures() -> dict[str, Figure]:
+    """By the picture's name."""
+    stand, drilling = read_stand(EXAMPLES / "base_to_base.toml"), read_drilling(EXAMPLES / "drilling" / "job.toml")
+    panel, seam = read_panel(EXAMPLES / "panel" / "job.toml"), read_seam_job(EXAMPLES / "window" / "seam.toml")
+    return {
+        "base-to-base": base_to_base_figures.plan(stand, solve(stand)),
+        "drilling": drilling_figures.holes(drilling, solve_drilling(drilling)),
+        "panel-clamps": panel_figures.shape(panel, solve_panel(panel)),
+        "window-seam": window_seam.cuts(seam, solve_seam(seam)),
+    }
+
+
+def main() -> None:
+    for name, figure in figures().items():
+        figure.savefig(PICTURES / f"{name}.png", dpi=95)
+        print(PICTURES / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()

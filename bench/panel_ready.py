@@ -1,0 +1,69 @@
+"""Simulated panel cells made ready: calibrated, pre-positioned, the panel laid on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_synth import panel_job
+from data_synth.panel_cell import NAMES, PanelCell
+from stitch import frames
+from stitch.cells.panel.experiment import ShapeRun, Stage, run_pose, run_shape
+from stitch.cells.panel.global_model import Readings, calibrate
+from stitch.cells.panel.layout import Layout, contacts
+from stitch.cells.panel.motion import preposition
+from stitch.cells.panel.rigid_fit import rigid_fit
+from stitch.cells.panel.tracker import Tracker
+
+LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
+POSES, MASTER, TOLERANCE = 40, 1, 0.6
+
+
+@dataclass
+class Ready:
+    """A cell with its panel on the clamps."""
+
+    cell: PanelCell
+    stage: Stage
+    readings: list[Readings]
+    T_base_flange: np.ndarray
+
+
+def ready(seed: int, **settings) -> Ready:
+    """Calibrate, pre-position, lay the panel on."""
+    r = ready_without_panel(seed, **settings)
+    r.cell.lay()
+    return r
+
+
+def ready_without_panel(seed: int, **settings) -> Ready:
+    cell = PanelCell(seed, **settings)
+    tracker = Tracker(cell.tracker)
+    readings = read(cell, tracker)
+    stage = Stage([calibrate(r) for r in readings], MASTER, tracker, cell.target)
+    base, contact = (np.array([getattr(m, n) for m in stage.models]) for n in ("T_world_base", "T_flange_contact"))
+    start = preposition(base, cell.target, contacts(LAYOUT).T_panel_contact, contact)
+    cell.drive(start)
+    return Ready(cell, stage, readings, start)
+
+
+def read(cell: PanelCell, tracker: Tracker) -> list[Readings]:
+    commands = panel_job.calibration_poses(POSES, cell.seed)
+    seen = panel_job.calibration(cell, commands)
+    return [Readings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)]
+
+
+def pose_error(cell: PanelCell) -> np.ndarray:
+    """(6,) true error of the panel's pose: rotation in deg, then mm; from the targets' true places."""
+    targets = panel_job.pose_targets()
+    T = rigid_fit(targets, cell.true_points(targets), np.ones(len(targets))).T
+    e = frames.log(frames.inverse(cell.target) @ T)
+    return np.concatenate([np.degrees(e[:3]), e[3:]])
+
+
+def shape_run(seed: int, compliant: bool, axes: np.ndarray, tolerance: float = TOLERANCE) -> ShapeRun:
+    r = ready(seed)
+    stand = run_pose(r.cell, r.stage, panel_job.pose_targets(), r.T_base_flange)
+    r.cell.compliant = compliant
+    points, clamp = panel_job.control_points()
+    contact = contacts(LAYOUT).T_panel_contact
+    return run_shape(r.cell, r.stage, points, clamp, contact, stand, tolerance, axes)

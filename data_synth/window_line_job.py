@@ -1,0 +1,76 @@
+"""A window line on disk: what it scans as session folders, its CAD and its programs as job files."""
+
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from data_synth.window_job import pose_table, write_path, write_stations
+from data_synth.window_line import RADIUS, Scans, WindowLine
+from data_synth.write import write_ply
+from stitch import frames
+
+Array = NDArray[np.float64]
+
+_FIT = """# Where does the {part} stand? Lengths in mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
+format = "stitch-fit/1"
+cad = "{part}.stl"
+session = "{part}"  # scans with the flange's reported poses, the rail's travel in them
+hand_eye = "hand-eye.json"  # as `stitch calibrate sphere -o` wrote it
+tolerance = 0.5
+path = "{path}.csv"  # of the gripper, programmed for a {part} that stands as [nominal] says
+
+[nominal]
+{nominal}
+"""
+_SEAM = """# Does the window sit in the body as it should?
+format = "stitch-seam/1"
+session = "seam"
+hand_eye = "hand-eye.json"
+fit = "found-body/fit.json"  # as `stitch fit body.toml -o found-body` wrote it
+stations = "stations.csv"  # in the body's frame
+pose_sigma = {sigma:.3f}  # what one scan may stand off another: the robot's scatter in both
+"""
+
+
+def write_line(folder: Path, line: WindowLine) -> None:
+    """Everything before the window is gripped: scans of sphere, window and body, CAD, paths, jobs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_scans(folder / "sphere", line.scan_sphere(), line, sphere=True)
+    write_scans(folder / "window", line.scan_window(), line)
+    write_scans(folder / "body", line.scan_body(), line)
+    line.window_mesh.export(folder / "window.stl")
+    line.body_cad.export(folder / "body.stl")
+    write_path(folder / "grip.csv", line.grip_path())
+    write_path(folder / "place.csv", line.place_path())
+    write_stations(folder / "stations.csv", *line.stations())
+    for part, path, T in (
+        ("window", "grip", line.T_cell_window_nominal),
+        ("body", "place", line.T_cell_body_nominal),
+    ):
+        text = _FIT.format(part=part, path=path, nominal=pose_table(T))
+        (folder / f"{part}.toml").write_text(text, encoding="utf-8")
+    (folder / "seam.toml").write_text(_SEAM.format(sigma=np.sqrt(2) * line.errors.shift), encoding="utf-8")
+
+
+def write_seam(folder: Path, line: WindowLine) -> None:
+    """The scans of the seam, after the window was placed."""
+    write_scans(folder / "seam", line.scan_seam(), line)
+
+
+def write_scans(folder: Path, scans: Scans, line: WindowLine, sphere: bool = False) -> None:
+    """One session folder, eye_in_hand; the scanner's drawing gives the coarse hand-eye."""
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    rows = ["view,cloud,x,y,z,qx,qy,qz,qw,rail_mm"]
+    for i, (T, stop, cloud) in enumerate(zip(scans.T_cell_flange, scans.rail, scans.clouds, strict=True)):
+        name = f"v{i:03d}"
+        write_ply(folder / "clouds" / f"{name}.ply", cloud)
+        numbers = [*T[:3, 3], *frames.to_quaternion(T), stop]
+        rows.append(",".join([name, f"clouds/{name}.ply", *(f"{x:.12g}" for x in numbers)]))
+    (folder / "views.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    document = {
+        "format": "stitch-session/1", "name": folder.name, "length_unit": "mm", "mount": "eye_in_hand",
+        "scanner": {"pose": line.T_flange_scanner_nominal.tolist(), "noise": line.errors.noise},
+    } | ({"sphere": {"radius": RADIUS}} if sphere else {})  # fmt: skip
+    (folder / "session.toml").write_text(tomli_w.dumps(document), encoding="utf-8")

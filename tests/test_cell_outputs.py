@@ -1,0 +1,205 @@
+"""What the cells' commands hand out beside their results: sessions that close, pages and recordings that are whole."""
+
+import csv
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import viz.cells.base_to_base
+import viz.cells.drilling
+import viz.cells.panel
+import viz.cells.panel_figures
+import viz.cells.window_fit
+import viz.cells.window_seam
+from data_synth.drilling import DrillingCell, Sizes
+from data_synth.drilling_job import write_job
+from stitch.cli import outputs
+from stitch.cli.main import main
+from stitch.errors import InputError
+from stitch.session import load_session
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+JOBS = {
+    "base": EXAMPLES / "base_to_base.toml", "drill": EXAMPLES / "drilling" / "job.toml",
+    "panel": EXAMPLES / "panel" / "job.toml", "fit": EXAMPLES / "window" / "fit.toml",
+    "seam": EXAMPLES / "window" / "seam.toml",
+}  # fmt: skip
+VIEWERS = {
+    "base": viz.cells.base_to_base, "drill": viz.cells.drilling, "panel": viz.cells.panel,
+    "fit": viz.cells.window_fit, "seam": viz.cells.window_seam,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Offer:
+    """An entry point that is there without an installation."""
+
+    writer: object
+
+    def load(self):
+        return self.writer
+
+
+@pytest.fixture(scope="module")
+def handed_out(tmp_path_factory):
+    """Every command once, with recording, page and session; Rerun strict."""
+    folder = tmp_path_factory.mktemp("cells")
+    part = {"stitch.cell_recordings": "record", "stitch.cell_reports": "write_page"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outputs, "entry_points", lambda group, name: [Offer(getattr(VIEWERS[name], part[group]))])
+        rr.set_strict_mode(True)
+        try:
+            for command, job in JOBS.items():
+                files = ("--recording", folder / f"{command}.rrd", "--report", folder / f"{command}.html")
+                run(command, job, *files, "--session", folder / command)
+        finally:
+            rr.set_strict_mode(False)
+    return folder
+
+
+def run(*arguments):
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as stop:
+        assert not stop.code
+
+
+def rows(file):
+    with file.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def numbers(table, names):
+    return np.array([[float(row[name]) for name in names.split()] for row in table])
+
+
+def placed_points(folder):
+    """Targets' names and places (N, 3) in the frame where they stand still, by the session's files alone."""
+    mount = tomllib.loads((folder / "session.toml").read_text())
+    pose = np.array(mount["scanner"]["pose"])
+    table = rows(folder / "points.csv")
+    views = {row["view"]: row for row in rows(folder / "views.csv")}
+    out = []
+    for row, p in zip(table, numbers(table, "x y z"), strict=True):
+        view = views[row["view"]]
+        R = Rotation.from_quat([float(view[k]) for k in ("qx", "qy", "qz", "qw")])
+        t = np.array([float(view[k]) for k in "xyz"])
+        seen = pose[:3, :3] @ p + pose[:3, 3]
+        out.append(R.apply(seen) + t if mount["mount"] == "eye_in_hand" else R.inv().apply(seen - t))
+    return [row["target"] for row in table], np.array(out)
+
+
+@pytest.mark.parametrize("name", ["base", "drill", "fit", "seam", *(f"panel/{robot}" for robot in "ABCDEF")])
+def test_every_session_is_readable(handed_out, name):
+    session = load_session(handed_out / name)
+    assert session.scanner.T_mount is not None
+    assert len(session.views) == len(rows(handed_out / name / "views.csv"))
+
+
+def test_panel_session_holds_one_rigid_flange(handed_out):
+    """Robot A has no leg offset: its reflectors stay where they are on the flange, within the tracker's noise."""
+    names, _ = placed_points(handed_out / "panel" / "A")
+    for target in ("r1", "r2", "r3"):
+        assert sum(n == target for n in names) == 40
+    assert chance(handed_out / "panel" / "A") > 1e-4
+    # Leg 4 of robot C is 0.5 mm too long for its controller: the session still holds what that does.
+    assert chance(handed_out / "panel" / "C") < 1e-12
+    assert "leg4_mm" in rows(handed_out / "panel" / "C" / "views.csv")[0]
+
+
+def chance(folder):
+    """Of so large a scatter of the reflectors on the flange, if only the tracker's stated sigma made it."""
+    names, places = placed_points(folder)
+    sigma = numbers(rows(folder / "points.csv"), "sigma")
+    own = [np.array(names) == target for target in dict.fromkeys(names)]
+    sums = [(((places[k] - places[k].mean(axis=0)) / sigma[k]) ** 2).sum() for k in own]
+    return chi2.sf(sum(sums), places.size - 3 * len(own))
+
+
+def test_base_session_puts_the_tip_where_the_robot_says(handed_out):
+    _, places = placed_points(handed_out / "base")
+    # The rod is read to 0.1 mm and 0.1 mrad at 4 m.
+    assert np.linalg.norm(places, axis=1).max() < 1e-3
+
+
+def test_drilling_session_keeps_the_distances_of_the_holes(tmp_path):
+    """A cell without errors of its robot and camera: the session's holes are as far apart as the true ones."""
+    exact = Sizes(stretch=0.0, wave=0.0, repeat=0.0, pixel=0.0, tool_tilt=0.0)
+    cell = DrillingCell(4, exact)
+    write_job(tmp_path / "job", cell)
+    run("drill", tmp_path / "job" / "job.toml", "--session", tmp_path / "s")
+    names, places = placed_points(tmp_path / "s")
+    true = np.array([cell.actual[name][0] for name in names])
+    # The height of a hole over the flange is read with 0.03 mm, its place by the camera to about 0.01.
+    assert np.abs(pdist(places) - pdist(true)).max() < 0.1
+
+
+@pytest.mark.parametrize("command", JOBS)
+def test_recording_is_whole(handed_out, command):
+    program, path = Path(sys.executable).with_name("rerun"), handed_out / f"{command}.rrd"
+    assert subprocess.run([program, "rrd", "verify", path], capture_output=True, check=False).returncode == 0
+    printed = subprocess.run([program, "rrd", "print", path], capture_output=True, text=True, check=False).stdout
+    wanted = {"base": "/world/stand/rail", "drill": "/world/errors/before/1", "panel": "/world/shape/after",
+              "fit": "/world/part\\ 1/deviation", "seam": "/world/stations/8/gap"}  # fmt: skip
+    for entity in ("/words", wanted[command]):
+        assert entity in printed
+
+
+@pytest.mark.parametrize("command, wanted", [
+    ("base", "R1 to R2 is 0.6073 m by the stand"), ("drill", "<td>1001</td>"),
+    ("panel", "Leg 4 of robot C"), ("fit", "Worst cells"), ("seam", "8 stations: 8 good"),
+])  # fmt: skip
+def test_page_needs_nothing_beside_it(handed_out, command, wanted):
+    page = (handed_out / f"{command}.html").read_text()
+    assert not re.search(r"""(src|href)=["'](?!data:)""", page)
+    assert wanted in page
+
+
+def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monkeypatch, capsys):
+    """R2 read 0.2 m short of where its rod puts it."""
+    text = JOBS["base"].read_text()
+    (tmp_path / "bad.toml").write_text(text.replace("length = 4.4084", "length = 4.2084"))
+    assert text != (tmp_path / "bad.toml").read_text()
+    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.base_to_base.write_page)])
+    with pytest.raises(SystemExit) as stop:
+        main(["base", str(tmp_path / "bad.toml"), "--report", str(tmp_path / "page.html")])
+    assert stop.value.code == 1
+    assert "no transform is given" in (tmp_path / "page.html").read_text()
+
+
+def test_expected_shape_is_what_the_commanded_clamps_do():
+    """A clamp that is lifted by what its three points need leaves nothing; one point alone cannot turn it."""
+    from stitch.cells.panel import read_job, solve_job
+
+    job = read_job(JOBS["panel"])
+    result = solve_job(job)
+    left = viz.cells.panel_figures.expected_after(job, result)
+    assert np.abs(left).max() < 0.05
+    assert result.shape_largest.max() > 3.0
+
+
+def test_session_never_overwrites(handed_out, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["drill", str(JOBS["drill"]), "--session", str(handed_out / "drill")])
+    assert stop.value.code == 2
+    assert "exists already; name another folder" in capsys.readouterr().err
+
+
+def test_page_into_a_missing_folder_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.drilling.write_page)])
+    with pytest.raises(InputError, match="its folder does not exist"):
+        outputs.show("drill", None, tmp_path / "nowhere" / "page.html")
+    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [])
+    with pytest.raises(InputError, match="no writer for `stitch drill`"):
+        outputs.show("drill", tmp_path / "x.rrd", None)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,96 @@
+"""Page and recording of a drilling job: where the holes are, and what the correction does to the drives' errors."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stitch.cells.drilling.job import JobResult
+from stitch.cells.drilling.reading import Job
+from stitch.frames import transform
+from viz.cells import stage
+from viz.cells.drilling_figures import holes, magnified, plate, references_of
+from viz.cells.page import Page, Picture, Table, write
+
+
+def write_page(job: Job, result: JobResult, path: Path) -> None:
+    """Sentence, holes with error arrows before and after, plate, tables."""
+    caption = (
+        "Arrows: where a reference hole really is, seen from where its drive was expected to meet it, "
+        f"{magnified(job, result):g} times larger. Left by the drawing; right after the correction of its group, with "
+        "which the holes to drill move."
+    )
+    pictures = [Picture("Holes and drive errors", holes(job, result), caption)]
+    if len(result.left_out):
+        caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
+        pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
+    page = Page("Drilling", sentence(job, result), pictures, _tables(job, result), _notes(result))
+    write(page, path)
+
+
+def sentence(job: Job, result: JobResult) -> str:
+    """What the correction is worth."""
+    before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
+    after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
+    return (
+        f"{len(result.drives)} holes to drill in {len(result.groups)} groups. By the drawing the drives miss the "
+        f"reference holes by {before.min():.2f} to {before.max():.2f} {job.length_unit}; after the correction "
+        f"{after.max():.2f} at most is left."
+    )
+
+
+def _notes(result: JobResult) -> list[str]:
+    found = [t for t in (result.naming.trials if result.naming else ()) if t.accepted]
+    out = [f"Found and taken out: {t.effect} = {t.value:.4g} ± {t.sigma:.2g} (p {t.p_value:.1g})." for t in found]
+    tool = result.tool_axis
+    if tool is not None and tool.accepted:
+        tilt, sigma = np.degrees([tool.tilt, tool.sigma])
+        out.append(f"The tool's true axis lies {tilt:.2f} ± {sigma:.2f}° off its frame's z; the drives take it up.")
+    return out
+
+
+def _tables(job: Job, result: JobResult) -> list[Table]:
+    unit = job.length_unit
+    references = [
+        (hole.name, name, f"{np.linalg.norm(error):.3f}", f"{np.linalg.norm(left):.3f}")
+        for name, c in result.groups.items()
+        for hole, error, left in zip(references_of(job, name), c.errors, c.residuals, strict=True)
+    ]
+    drives = [
+        (d.hole.name, d.hole.group, *(f"{x:.3f}" for x in d.position), *(f"{a:.3f}" for a in np.degrees(d.angles)),
+         f"{np.linalg.norm(d.position - d.hole.position):.3f}")
+        for d in result.drives
+    ]  # fmt: skip
+    header = ("hole", "group", *(f"{k} ({unit})" for k in "xyz"), "a (°)", "b (°)", "c (°)", f"moved ({unit})")
+    return [
+        Table("Reference holes", ("hole", "group", f"error before ({unit})", f"left after ({unit})"), references),
+        Table("Drives", header, drives),
+    ]
+
+
+def record(job: Job, result: JobResult, path: Path) -> None:
+    """Nominal, measured and corrected holes in the base frame, error arrows before and after."""
+    places = np.array([hole.position for hole in job.holes])
+    size = float(np.ptp(places, axis=0).max())
+    with stage.stage(path, "Drilling", _words(job, result)) as recording:
+        stage.points(recording, "holes/drawing", places, [stage.GREY], size / 150, [hole.name for hole in job.holes])
+        for name, c in result.groups.items():
+            nominal = np.array([hole.position for hole in references_of(job, name)])
+            corrected, length = transform(c.T_actual_nominal, nominal), magnified(job, result)
+            stage.points(recording, f"holes/measured/{name}", nominal + c.errors, [stage.BLUE], size / 150)
+            args = (nominal, c.errors * length, stage.RED, size / 400)
+            stage.arrows(recording, f"errors/before/{name}", *args)
+            stage.arrows(recording, f"errors/after/{name}", corrected, c.residuals * length, stage.GREEN, size / 300)
+        drives = np.array([d.position for d in result.drives])
+        inward = np.array([d.direction for d in result.drives])
+        stage.points(recording, "holes/corrected", drives, [stage.GREEN], size / 150)
+        stage.arrows(recording, "drives", drives - inward * size / 8, inward * size / 8, stage.GREEN, size / 500)
+        for name, (T, _, _) in job.placed.items():
+            stage.frame(recording, f"tool on {name}", T, size / 15)
+
+
+def _words(job: Job, result: JobResult) -> str:
+    notes = "\n".join(f"- {note}" for note in _notes(result))
+    return (
+        f"# Drilling\n\n{sentence(job, result)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as measured. Green: "
+        f"corrected drives. Red and green arrows: errors before and after, {magnified(job, result):g} times larger."
+    )

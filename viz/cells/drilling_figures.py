@@ -1,0 +1,100 @@
+"""Figures of a drilling job; each function returns a Figure."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from stitch.cells.drilling.job import JobResult
+from stitch.cells.drilling.reading import Hole, Job
+from stitch.frames import Array, transform
+
+_BEFORE, _AFTER, _DRILL = "#b5523b", "#6a9955", "#4878a8"
+# Of the panel's extent, that the largest error's arrow is drawn.
+_LONGEST = 0.25
+
+
+def holes(job: Job, result: JobResult) -> Figure:
+    """The panel from above and from its side, before and after: reference holes with error arrows, holes to drill."""
+    figure = Figure(figsize=(10.5, 4.6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
+    middle, along = _panel_axes(job)
+    for column, title in enumerate(("by the drawing", "after the correction")):
+        after = column == 1
+        for row, side in enumerate((along[:2], along[[0, 2]])):
+            _draw_holes(axes[row, column], job, result, middle, side, after)
+            if row == 0:
+                _name_holes(axes[row, column], job, middle, side)
+        axes[0, column].set_title(title)
+        axes[1, column].set_xlabel(f"along the panel ({job.length_unit})")
+    axes[0, 0].set_ylabel(f"from above ({job.length_unit})")
+    axes[1, 0].set_ylabel(f"from the side ({job.length_unit})")
+    axes[0, 1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def magnified(job: Job, result: JobResult) -> float:
+    """How many times larger than the panel errors are drawn: a round number."""
+    places = np.array([hole.position for hole in job.holes])
+    largest = max(float(np.linalg.norm(c.errors, axis=1).max()) for c in result.groups.values())
+    wanted = _LONGEST * float(np.linalg.norm(np.ptp(places, axis=0))) / max(largest, 1e-12)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(step for step in (1, 2, 5) if step * power <= wanted) * power)
+
+
+def _panel_axes(job: Job) -> tuple[Array, Array]:
+    """Middle (3,) of the drawing's holes and axes (3, 3): along the panel, across it, out of it."""
+    places = np.array([hole.position for hole in job.holes])
+    middle = places.mean(axis=0)
+    return middle, np.linalg.svd(places - middle, full_matrices=False)[2]
+
+
+def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Array, after: bool) -> None:
+    """One panel of `holes`; `side` (2, 3) holds the axes that are drawn."""
+    colour = _AFTER if after else _BEFORE
+    label = f"error, {magnified(job, result):g} times larger"
+    for name, c in result.groups.items():
+        references = references_of(job, name)
+        nominal = np.array([hole.position for hole in references])
+        at = ((transform(c.T_actual_nominal, nominal) if after else nominal) - middle) @ side.T
+        off = (c.residuals if after else c.errors) @ side.T * magnified(job, result)
+        ax.scatter(*at.T, s=45, facecolor="none", edgecolor="0.3", zorder=3, label=_once(ax, "reference hole"))
+        ax.quiver(*at.T, *off.T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.006,
+                  label=_once(ax, label))  # fmt: skip
+        ax.update_datalim(at + off)
+    drives = np.array([d.position if after else d.hole.position for d in result.drives])
+    ax.plot(*((drives - middle) @ side.T).T, "+", color=_DRILL, ms=9, label="hole to drill")
+    ax.set_aspect("equal")
+    ax.margins(0.12)
+    ax.autoscale_view()
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _name_holes(ax: Axes, job: Job, middle: Array, side: Array) -> None:
+    for name, position in {hole.name: hole.position for hole in job.holes}.items():
+        ax.annotate(name, side @ (position - middle), xytext=(0, -13), textcoords="offset points", ha="center",
+                    fontsize=7, color="0.4")  # fmt: skip
+
+
+def _once(ax: Axes, label: str) -> str:
+    """The label for the first of several groups, nothing for the others."""
+    return "_" if label in ax.get_legend_handles_labels()[1] else label
+
+
+def plate(job: Job, result: JobResult) -> Figure:
+    """Leave-one-out errors of the plate's holes."""
+    figure = Figure(figsize=(4.6, 3.8), layout="constrained")
+    ax = figure.subplots()
+    at, off = job.plate_xyz[:, :2], result.left_out
+    ax.scatter(*at.T, s=120, facecolor="none", edgecolor="0.3")
+    largest = max(float(np.linalg.norm(off, axis=1).max()), 1e-9)
+    scale = 0.25 * float(np.ptp(at, axis=0).max()) / largest
+    ax.quiver(*at.T, *(off * scale).T, color=_BEFORE, angles="xy", scale_units="xy", scale=1, width=0.007)
+    ax.set(aspect="equal", xlabel=f"flange x ({job.length_unit})", ylabel=f"flange y ({job.length_unit})",
+           title=f"longest arrow {largest:.3f} {job.length_unit}")  # fmt: skip
+    ax.margins(0.25)
+    return figure
+
+
+def references_of(job: Job, group: str) -> list[Hole]:
+    """Reference holes of a group, in the order of the drawing."""
+    return [hole for hole in job.holes if hole.group == group and hole.reference]

@@ -1,0 +1,144 @@
+"""Page and recording of a scan fitted onto its CAD: the deviation map, and the path that follows the part."""
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from matplotlib.figure import Figure
+
+from stitch import frames
+from stitch.cells.window.deviation import Deviations
+from stitch.cells.window.job import Part
+from stitch.cells.window.reading import FitJob
+from stitch.frames import Array
+from viz.cells import stage
+from viz.cells.page import Page, Picture, Table, write
+from viz.colours import SIGNED, signed_colours
+
+_MAP_POINTS, _RECORDED_POINTS, _WORST = 40_000, 400_000, 10
+
+
+def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
+    """Sentence, a map and a histogram for each part, poses and the worst cells."""
+    pictures = []
+    for i, part in enumerate(parts):
+        of = f" of part {i + 1}" if len(parts) > 1 else ""
+        caption = (
+            "The scan on the CAD, seen along the part's thinnest axis, outer and inner side alike. Red stands outside "
+            f"the CAD, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
+            "whose mean is beyond it."
+        )
+        pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
+        caption = "All points with a place on the CAD. What lies far out is a deformed place, and did not pull the fit."
+        pictures.append(Picture(f"Distances{of}", histogram(part), caption))
+    write(Page("Scan onto CAD", sentence(parts), pictures, _tables(parts)), path)
+
+
+def sentence(parts: list[Part]) -> str:
+    """What was found and how it compares."""
+    told = []
+    for i, part in enumerate(parts):
+        bad, cells = part.deviations.outside, part.deviations.cells
+        name = f"Part {i + 1}" if len(parts) > 1 else "The part"
+        where = f"its points lie {part.fit.scale:.3f} (one sigma) about the CAD"
+        if bad.any():
+            worst = float(cells.mean[int(np.argmax(np.abs(cells.mean)))])
+            told.append(
+                f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells are out, by {worst:+.2f} at most."
+            )
+        else:
+            told.append(f"{name} is found; {where}, and all {len(bad)} cells are within {part.deviations.tolerance:g}.")
+    return " ".join(told)
+
+
+def _tables(parts: list[Part]) -> list[Table]:
+    poses = []
+    for i, part in enumerate(parts):
+        sigma = part.fit.sigma
+        place = (f"{x:.3f}" for x in part.fit.T_base_part[:3, 3])
+        poses.append((str(i + 1), *place, f"{sigma[3:].max():.4f}", f"{np.degrees(sigma[:3]).max():.5f}",
+                      f"{part.fit.rms:.3f}", f"{part.start.share:.0%}", f"{part.start.runner_up:.0%}"))  # fmt: skip
+    header = ("part", "x", "y", "z", "σ", "σ (°)", "rms", "meets the CAD", "next best pose")
+    tables = [Table("Where the parts lie", header, poses)]
+    for i, part in enumerate(parts):
+        cells = part.deviations.cells
+        worst = np.argsort(-np.abs(cells.mean))[:_WORST]
+        rows = [(*(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]),
+                 "bad" if part.deviations.outside[k] else "good") for k in worst]  # fmt: skip
+        title = "Worst cells" + (f" of part {i + 1}" if len(parts) > 1 else "")
+        tables.append(Table(title, ("x", "y", "z", "deviation", "points", "verdict"), rows))
+    return tables
+
+
+def deviation_map(found: Deviations) -> Figure:
+    """Points along the thinnest axis, coloured by their distance; cells beyond the tolerance ringed."""
+    extent = np.ptp(found.points, axis=0)
+    i, j = np.sort(np.argsort(extent)[1:])
+    figure = Figure(figsize=(9, min(9 * extent[j] / extent[i] + 0.8, 9)), layout="constrained")
+    ax = figure.subplots()
+    pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
+    order = pick[np.argsort(np.abs(found.distance[pick]))]
+    drawn = ax.scatter(found.points[order, i], found.points[order, j], c=found.distance[order], s=5, lw=0, cmap=SIGNED,
+                       vmin=-found.tolerance, vmax=found.tolerance)  # fmt: skip
+    bad = found.cells.middle[found.outside]
+    ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
+    figure.colorbar(drawn, label="outside (+) or inside (−) the CAD", extend="both", shrink=0.8)
+    # White means no deviation, so the ground cannot be white.
+    ax.set_facecolor("0.78")
+    ax.set(aspect="equal", xlabel=f"{'xyz'[i]} of the part", ylabel=f"{'xyz'[j]} of the part")
+    return figure
+
+
+def histogram(part: Part) -> Figure:
+    """Distances of all points, with the tolerance."""
+    found = part.deviations
+    figure = Figure(figsize=(7, 2.4), layout="constrained")
+    ax = figure.subplots()
+    reach = max(2 * found.tolerance, 1.05 * float(np.quantile(np.abs(found.distance), 0.999)))
+    ax.hist(np.clip(found.distance, -reach, reach), bins=120, color="#4878a8", log=True)
+    for side in (-1, 1):
+        ax.axvline(side * found.tolerance, color="#b5523b", ls="--", lw=1)
+    ax.set(xlabel="distance from the CAD (dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def record(job: FitJob, parts: list[Part], path: Path) -> None:
+    """Base frame: CAD where it was found, points by deviation, scanners, programmed and corrected path."""
+    size = job.cad.size
+    words = f"# Scan onto CAD\n\n{sentence(parts)}\n\n{_LEGEND}"
+    with stage.stage(path, "Scan onto CAD", words) as recording:
+        for name, T in zip(job.placed.names, job.placed.T_base_scanner, strict=True):
+            stage.frame(recording, f"scanners/{name}", T, size / 40)
+        for i, part in enumerate(parts):
+            T, found = part.fit.T_base_part, part.deviations
+            _record_cad(recording, f"part {i + 1}/cad", job, T)
+            stage.frame(recording, f"part {i + 1}/frame", T, size / 10)
+            pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _RECORDED_POINTS)).astype(int)
+            places, colours = (
+                frames.transform(T, found.points[pick]),
+                signed_colours(found.distance[pick], found.tolerance),
+            )
+            stage.points(recording, f"part {i + 1}/deviation", places, colours, size / 1200)
+            bad = frames.transform(T, found.cells.middle[found.outside])
+            stage.points(recording, f"part {i + 1}/out of tolerance", bad, [(20, 20, 20)], size / 300)
+            if part.path is not None and job.path is not None:
+                stage.line(recording, "path/programmed", job.path[1][:, :3, 3], stage.GREY, size / 500)
+                stage.line(recording, f"path/for part {i + 1}", part.path[:, :3, 3], stage.GREEN, size / 400)
+                for name, T_tool in zip(job.path[0], part.path, strict=True):
+                    stage.frame(recording, f"path/for part {i + 1}/{name}", T_tool, size / 25)
+
+
+_LEGEND = (
+    "Grey: the CAD. Points: red outside, blue inside it, full colour at the tolerance; black: cells beyond it. Grey "
+    "line: the path as programmed; green: moved with the part."
+)
+
+
+def _record_cad(recording: stage.Recording, name: str, job: FitJob, T: Array) -> None:
+    mesh = job.cad.mesh
+    shown = rr.Mesh3D(
+        vertex_positions=np.float32(frames.transform(T, np.asarray(mesh.vertices))), triangle_indices=mesh.faces,
+        albedo_factor=[190, 190, 195, 120],
+    )  # fmt: skip
+    recording.log(stage.place(name), shown, static=True)
