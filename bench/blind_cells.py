@@ -30,7 +30,7 @@ OUTSIDE = {"third_harmonic": "third_harmonic", "knock": "knock", "covariate_bias
 HARD = {
     "correlated field": {"field_error": 0.02},
     "heavy tails": {"tail": 3.0},
-    "edge bias": {"edge_bias": 0.1},
+    "edge bias": {"edge_bias": 0.05},
     "three times the repeatability": {"repeatability": 3.0},
 }
 HARD["all four"] = {key: value for kind in HARD.values() for key, value in kind.items()}
