@@ -38,9 +38,8 @@ def jobs(part: str, seeds: int, scenes: tuple[str, ...]) -> Iterator[Row]:
                 noise = list(HARD)[i // 2 % len(HARD)]
                 yield {"part": part, "scene": scenes[i % len(scenes)], "seed": 2000 + i, "noise": noise}
     elif part == "aliases":
-        on_flange = [c for c in cells if c["scene"] == "blade"]
         for i in range(20):
-            cell = {**on_flange[i % len(on_flange)], "seed": 3000 + i, "amplitude": (1.0, 2.0)[i % 2]}
+            cell = {"part": part, "scene": "blade", "seed": 3000 + i, "amplitude": (1.0, 2.0)[i % 2]}
             yield {**cell, "effect": "joint_offset", "how": "", "useful": [0]}
             yield {**cell, "effect": "joint_offset", "how": LAST_JOINT}
     elif part == "outside":

@@ -21,7 +21,9 @@ def report(
     """Write report.html of a run anew, with its diagnosis; the model and its history stay as they are."""
     state = load_state(run)
     result = change(state, [t.effect.name for t in state.terms])
-    run_folder.extend("stitch.reports", replace(result, ledger=state.ledger), run / "report.html")
+    # Nothing has changed now: there is no before and after to show.
+    shown = replace(result, ledger=state.ledger, poses_before=None)
+    run_folder.extend("stitch.reports", shown, run / "report.html")
     if with_diagnosis:
         write_diagnosis(diagnose(state), state, run)
     Console(stderr=True).print(f"  {run / 'report.html'}", highlight=False)
