@@ -71,9 +71,9 @@ def measure(name: str, seed: int, hidden: dict[str, float], how: str = "", usefu
     return simulate(scene_of(name, "" if alone else how, useful), hidden, seed, planned=planned)
 
 
-def drawn(measured: Measured, laws: Sequence[str], seed: int) -> dict[str, dict[str, float]]:
+def drawn(plan: Plan, laws: Sequence[str], seed: int) -> dict[str, dict[str, float]]:
     """What nature draws for these laws, in this order, at amplitude 1 in this very cell."""
-    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, measured.plan, np.random.default_rng([seed, 2]))[1]
+    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([seed, 2]))[1]
 
 
 def user_effect(law: str) -> str:

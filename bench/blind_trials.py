@@ -4,13 +4,15 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from blind_cells import OUTSIDE, drawn, hand_eye_error, hand_eye_sigma, in_session_units, measure, smallest, user_effect
 
+from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
 from stitch.diagnosis.diagnose import Diagnosis, diagnose
@@ -47,22 +49,31 @@ def trial(job: Row) -> Row:
     return {**job, **row, "seconds": round(time.perf_counter() - start, 2)}
 
 
-@cache
-def _empty_cell(scene: str, seed: int, useful: tuple[int, ...] = ()) -> tuple[Measured, Run, PoseEvidence]:
-    """The same cell with nothing hidden: what can be seen in it, and its floor."""
-    measured = measure(scene, seed, {}, useful=useful)
+@dataclass(frozen=True)
+class _EmptyCell:
+    """A cell with nothing hidden: what can be seen in it, and its floor."""
+
+    plan: Plan
+    evidence: PoseEvidence
+    residual_rms: float
+    heldout_rms: float
+
+
+@lru_cache(maxsize=8)
+def _empty_cell(scene: str, seed: int) -> _EmptyCell:
+    measured = measure(scene, seed, {})
     calm = run(session_of(measured))
-    return measured, calm, evidence_of_state(state_of(calm))
+    return _EmptyCell(measured.plan, evidence_of_state(state_of(calm)), calm.residual_rms, calm.heldout_rms)
 
 
 def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     """Amplitudes of the laws at the job's multiple of their smallest detectable size."""
-    measured, _, evidence = _empty_cell(job["scene"], job["seed"], tuple(job.get("useful", ())))
-    true = drawn(measured, laws, job["seed"])
+    cell = _empty_cell(job["scene"], job["seed"])
+    true = drawn(cell.plan, laws, job["seed"])
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law
-        found = smallest(evidence, effect, true[law])
+        found = smallest(cell.evidence, effect, true[law])
         if law in OUTSIDE:
             del EFFECTS[effect]
         if found is None:
@@ -142,7 +153,7 @@ def _outside(job: Row) -> Row:
             added = change(state_of(first), [name])
         finally:
             del EFFECTS[name]
-        floor = _empty_cell(job["scene"], job["seed"])[1]
+        floor = _empty_cell(job["scene"], job["seed"])
         row["user"] = {
             "named": list(again.effects), "heldout": [first.heldout_rms, added.heldout_rms, floor.heldout_rms],
             "residual": [first.residual_rms, added.residual_rms, floor.residual_rms],
