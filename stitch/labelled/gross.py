@@ -45,14 +45,14 @@ def gross(rows: Rows, variances: Array) -> list[Outlier]:
     distances = rows.distances(rows.left)
     alone = sightings.used.sum(axis=1) < 2
     out = []
-    for v in range(V):
+    for v in np.flatnonzero(sightings.used.any(axis=1)):
         worst = float(np.nanmax(slots[v], initial=0.0))
         if worst > GROSS and not alone[v]:
             slot = int(np.nanargmax(slots[v]))
             name = sightings.targets[sightings.target[v, slot]]
-            out.append(Outlier(v, name, float(apart[v, slot]), worst))
+            out.append(Outlier(int(v), name, float(apart[v, slot]), worst))
         elif views[v] > GROSS:
-            out.append(Outlier(v, None, float(np.nanmax(distances[v])), float(views[v])))
+            out.append(Outlier(int(v), None, float(np.nanmax(distances[v])), float(views[v])))
     return out
 
 
