@@ -1,7 +1,7 @@
 """Labelled points of real robots: what `stitch add --suggested` finds, judged on poses left out in several ways.
 
-Run: python bench/real_points.py [NAME...] [--at-most N]; writes the tables of docs/points.md. Needs the measured
-data beside the project, see tests/conftest.py.
+Run: python bench/real_points.py [NAME...] [--at-most N] [--models ";a;a,b"]; writes the tables of docs/points.md.
+With --models these are judged instead of what the diagnosis finds. Needs the measured data beside the project.
 """
 
 import argparse
@@ -63,19 +63,23 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     return float(np.sqrt(np.mean(d**2))), float(d.mean())
 
 
-def measure(name: str, at_most: int) -> dict[str, object]:
-    """The way that the diagnosis takes on the even poses, and every step of it judged in all ways."""
-    session = load_session(SHARED / name)
+def suggested(session: Session, at_most: int) -> tuple[list[list[str]], str]:
+    """The way that the diagnosis takes on the even poses, and what it says of the rest."""
     first = run(only(session, np.arange(0, len(session.views), 2)))
-    found, lines, last = suggest(state_of(first), at_most)
-    steps = [list(step.effects) for step in (found or first).ledger]
+    found, _, last = suggest(state_of(first), at_most)
+    return [list(step.effects) for step in (found or first).ledger], last.sentence
+
+
+def measure(name: str, at_most: int, models: list[list[str]] | None) -> dict[str, object]:
+    """Every model judged in all ways."""
+    session = load_session(SHARED / name)
+    steps, left = (models, "") if models else suggested(session, at_most)
     ways = splits(session)
     rows = []
     for effects in steps:
         rows.append({"effects": effects, "judged": {n: judged(session, effects, way) for n, way in ways.items()}})
         print(name, rows[-1], flush=True)
-    return {"name": name, "lines": lines, "left": last.sentence, "rows": rows,
-            "depends_on": [(d.covariate, d.score, d.p_value) for d in last.depends_on]}  # fmt: skip
+    return {"name": name, "left": left, "rows": rows}
 
 
 def table(found: dict[str, object]) -> str:
@@ -89,18 +93,20 @@ def table(found: dict[str, object]) -> str:
         before = set(row["effects"])
         numbers = " | ".join(f"{rms:.3f} / {mean:.3f}" for rms, mean in row["judged"].values())
         lines.append(f"| {told} | {numbers} |")
-    return "\n".join([*lines, "", f"What is left: {found['left']}", ""])
+    return "\n".join([*lines, "", *([f"What is left: {found['left']}", ""] if found["left"] else [])])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=DATA)
     parser.add_argument("--at-most", type=int, default=8)
+    parser.add_argument("--models", help="effects by commas, models by semicolons; the first may be empty")
     parser.add_argument("--cache", type=Path, default=ROOT / "runs" / "real_points")
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)
+    models = [[e for e in m.split(",") if e] for m in arguments.models.split(";")] if arguments.models else None
     for name in arguments.names:
-        document = measure(name, arguments.at_most)
+        document = measure(name, arguments.at_most, models)
         (arguments.cache / f"{name}.json").write_text(json.dumps(document, indent=1))
     tables = [table(json.loads(file.read_text())) for file in sorted(arguments.cache.glob("*.json"))]
     begin, end = "<!-- tables: begin -->", "<!-- tables: end -->"
