@@ -149,7 +149,7 @@ def test_fit_equals_scipy_least_squares_where_all_rows_weigh_alike():
 
 
 def test_rows_are_the_slopes_of_what_is_left():
-    session, T_mount, *_ = cell(1, views=6)
+    session, T_mount, *_ = cell(1, views=6, scatter=(0, 0), noise=1e-9)
     chain = chain_of(session, capture(session))
     for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
         effect = EFFECTS[name]
@@ -168,6 +168,18 @@ def test_rows_are_the_slopes_of_what_is_left():
             np.testing.assert_allclose(
                 slopes[..., i] / scale, numeric / scale, atol=2e-4, err_msg=f"{name} {parameter.name}"
             )
+
+
+def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
+    # The last joint's offset must not borrow from what is left, however large that is.
+    session, T_mount, *_ = cell(1, views=12, scatter=(1e-3, 1.0))
+    chain = chain_of(session, capture(session))
+    term = Term(EFFECTS["joint_offset"], np.zeros(6))
+    rows = rows_of(chain.capture, T_mount, settled(chain.capture, T_mount))
+    column = effect_rows(rows, chain, (), term)[..., 5].ravel()
+    landmarks = rows.landmarks.reshape(rows.left.size, -1)
+    left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
+    assert np.abs(left).max() < 1e-6 * np.abs(column).max()
 
 
 def test_a_hidden_joint_offset_is_named_and_found():

@@ -20,8 +20,6 @@ _ODDS = float(np.log(20.0))
 _GAIN = 2.5
 # Hundreds of views show several missing effects at once; among few, one is all that can be told.
 MANY = 100
-# Sigmas by which a value may reach beyond what is believable there.
-_SLACK = 2.0
 # Effects that are sought together, and candidates tried in earnest for each of them.
 _AT_ONCE, _TRIED = 6, 5
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
@@ -66,9 +64,7 @@ def score_all(evidence: ViewEvidence, candidates: Sequence[Candidate]) -> list[S
 def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit: str) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = rank(score_all(evidence, candidates))
-    # Parallel joints share a length: hundreds of views show the sum, and leave each value where chance puts it.
-    slack = _SLACK if evidence.chain.views.count >= MANY else 0.0
-    best = next((r for r in ranked if _nameable(r, slack)), None)
+    best = next((r for r in ranked if _nameable(r)), None)
     stray = next((r for r in empirical[:1] if r.adjusted < ALPHA_UNKNOWN and r.score.gain > _GAIN), None)
     if best is None and stray is None:
         verdict = "unknown_effect" if implausible(evidence, length_unit) else "adequate"
@@ -87,9 +83,7 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
         together = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(_PHYSICAL / len(ranked)))
         if stray.log_posterior > together + _ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
-    group = tuple(
-        r for r in ranked if second is None and _nameable(r, slack) and r.log_posterior > best.log_posterior - _ODDS
-    )
+    group = tuple(r for r in ranked if second is None and _nameable(r) and r.log_posterior > best.log_posterior - _ODDS)
     group = (best, *(r for r in group if r.name != best.name))
     return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second)
 
@@ -106,7 +100,7 @@ def _together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ran
         beside = _beside(evidence, chain)
         others = [c for c in candidates if c.name not in {r.name for r in chain} and c.effect.tier != "empirical"]
         ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
-        following = next((r for r in ranked if _nameable(r, _SLACK)), None)
+        following = next((r for r in ranked if _nameable(r)), None)
         if following is None:
             break
         chain.append(following)
@@ -115,7 +109,7 @@ def _together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ran
         others_in = [r for r in chain if r.name != name]
         candidate = next(c for c in candidates if c.name == name)
         own = rank(score_all(_beside(evidence, others_in), [candidate]))[0][0]
-        chain = [*others_in, own] if _nameable(own, _SLACK) else others_in
+        chain = [*others_in, own] if _nameable(own) else others_in
     return sorted(chain, key=lambda r: -r.log_posterior) or [best], explained
 
 
@@ -147,15 +141,14 @@ def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
 
 
-def _nameable(r: Ranked, slack: float = 0.0) -> bool:
-    """Significant, more likely than chance, seen, and of a size that somebody would believe, within `slack` sigmas.
+def _nameable(r: Ranked) -> bool:
+    """Significant, more likely than chance, seen, and of a size that somebody would believe.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the evidence
     does not know how many were tried.
     """
     kept = [p for p, k in zip(r.score.candidate.parameters, r.score.form.keep, strict=True) if k]
-    least = np.abs(r.score.values) - (slack * np.nan_to_num(r.score.sigmas) if slack else 0.0)
-    believable = all(v < p.limit for v, p in zip(least, kept, strict=True))
+    believable = all(abs(v) < p.limit for v, p in zip(r.score.values, kept, strict=True))
     likely = r.adjusted < ALPHA_NAME and r.score.gain > _GAIN
     return r.physical and r.score.observable and likely and believable
 
