@@ -25,6 +25,8 @@ from stitch.state import State
 from stitch.threads import Clock, library_threads_off
 from stitch.verdict import coarse_note
 
+_CLOUDS_ONLY = "The labelled points beside the clouds were read and checked, but only the clouds were fitted."
+
 
 def run(
     session: Session, model: Model | None = None, recorder: Recorder | None = None, effects: Sequence[str] = ()
@@ -152,6 +154,8 @@ def _finish(
     poses_before: Array | None = None,
 ) -> Run:  # fmt: skip
     result = finish(session, chain, index, place.start, place.correction, before, recorder, seconds)
+    if session.has_sightings:
+        result = replace(result, notes=(*result.notes, _CLOUDS_ONLY))
     return _in_ledger(replace(result, poses_before=poses_before), place.ledger, place.effects_file, recorder)
 
 

@@ -86,24 +86,36 @@ def diagnose(state: State) -> Diagnosis:
 
 
 def checked(selection: Selection, suspects: list[Suspect], implausible: bool) -> tuple[Selection, tuple[str, ...]]:
-    """An effect that does not help on views left out, or that one view carries, is not named.
+    """An effect that does not help on views left out, or that one view carries, is not named; a second one may be.
 
     What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
     beyond chance.
     """
     if selection.verdict != "missing_effect":
         return selection, ()
-    first = selection.named[0]
-    left = next((s.left for s in suspects if s.name == first.name), None)
+    verdicts, notes = list[str](), list[str]()
+    for named in (selection.named[0], selection.second):
+        if named is None:
+            continue
+        refusal = _refused(named, next((s.left for s in suspects if s.name == named.name), None), implausible)
+        if refusal is None:
+            if named is selection.named[0]:
+                return selection, ()
+            return replace(selection, named=(named,), second=None), tuple(notes)
+        verdicts.append(refusal[0])
+        notes.append(refusal[1])
+    return Selection(verdicts[0], (), selection.ranked, selection.empirical), (notes[0],)
+
+
+def _refused(named: Ranked, left: Left | None, implausible: bool) -> tuple[str, str] | None:
+    """Verdict and reason if an effect does not stand the test of views left out."""
     if left is None:
-        return selection, ()
+        return None
     if left.steadiness < _STEADY:
-        note = f"{first.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
-        verdict = "unknown_effect" if implausible or first.adjusted < _BEYOND_CHANCE else "adequate"
-    elif left.poses > 1 - left.poses_sigma:
+        note = f"{named.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
+        return "unknown_effect" if implausible or named.adjusted < _BEYOND_CHANCE else "adequate", note
+    if left.poses > 1 - left.poses_sigma:
         share = f"{left.poses:.2f} ± {left.poses_sigma:.2f}"
-        note = f"{first.name} would not help on views left out (mean square pose error {share} of now)"
-        verdict = "unknown_effect" if implausible else "adequate"
-    else:
-        return selection, ()
-    return Selection(verdict, (), selection.ranked, selection.empirical), (note,)
+        note = f"{named.name} would not help on views left out (mean square pose error {share} of now)"
+        return "unknown_effect" if implausible else "adequate", note
+    return None

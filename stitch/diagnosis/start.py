@@ -29,14 +29,14 @@ def evidence_of_state(state: State) -> ViewEvidence:
 
 def start_values(state: State, effects: Sequence[Effect]) -> list[Term]:
     """A term for each effect; events and time constants at the value that explains most."""
-    if not effects:
-        return []
+    gridded = [e for e in effects if any(p.grid for p in state.chain.parameters(e))]
+    if not gridded:
+        return [empty_term(state.chain, effect) for effect in effects]
     evidence = evidence_of_state(state)
     out = []
     for effect in effects:
-        candidate = candidate_of(evidence, effect)
-        gridded = any(p.grid for p in candidate.parameters) if candidate else False
-        if candidate is None or not gridded:
+        candidate = candidate_of(evidence, effect) if effect in gridded else None
+        if candidate is None:
             out.append(empty_term(state.chain, effect))
             continue
         best = score(evidence, candidate, 1)

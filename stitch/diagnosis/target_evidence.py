@@ -88,8 +88,18 @@ class TargetEvidence:
 
     def trial(self, response: Array, points: PointGram | None = None) -> TargetTrial:
         """A model with the columns of rows (n, k)."""
-        covariance = self.evidence.covariance(self.null.variances)
-        return TargetTrial(self.rows, covariance, self.in_blocks(response))
+        if response is self.model:
+            return self._present
+        return TargetTrial(self.rows, self._covariance, self.in_blocks(response))
+
+    @cached_property
+    def _covariance(self) -> Array:
+        return self.evidence.covariance(self.null.variances)
+
+    @cached_property
+    def _present(self) -> TargetTrial:
+        """The model as it is, asked for every candidate."""
+        return TargetTrial(self.rows, self._covariance, self.in_blocks(self.model))
 
     def touched(self, views: Array) -> Array:
         """(V,) bool."""
@@ -108,8 +118,7 @@ class TargetEvidence:
 
     def displaced(self) -> Array:
         """(V, 3) how far the targets of every view sit from where the model puts them."""
-        trial = self.trial(self.model)
-        return self.at_part(-(self.rows.left + trial.X @ trial.solve(None)))
+        return self.at_part(-(self.rows.left + self._present.X @ self._present.solve(None)))
 
 
 def target_evidence(chain: Chain, terms: Sequence[Term], T_mount: Array, drawing: Drawing | None) -> TargetEvidence:

@@ -1,7 +1,8 @@
 """Gross errors among labelled points: a wrong label, a broken reading, a pose that was not driven.
 
-A target is judged by what the other targets of its view and the scatter of the poses foretell, a view by all of
-it; both in units of what is usual in these data, so that outliers do not hide behind the scatter they cause.
+A view whose targets do not fit each other, wherever the arm stood, has a wrong one: that which the others and the
+scatter of the poses foretell least. A view whose targets agree but lie far off has a wrong pose. Both are measured
+by what is usual in these data (median), so that outliers do not hide behind the scatter they cause.
 """
 
 from dataclasses import dataclass
@@ -11,9 +12,11 @@ import numpy as np
 from stitch.frames import Array, Indices, Mask
 from stitch.labelled.rows import Rows, evidence_of_rows
 
-# Six times the usual deviation: one in a thousand million of honest Gaussian errors, and still outside the
-# bounded errors of a robot whose model lacks something.
-GROSS = 6.0
+# Six times the usual deviation: one in a thousand million of honest Gaussian errors. Pose errors of an arm whose
+# model lacks something have longer tails: six times the median happens.
+GROSS, FAR = 6.0, 10.0
+# A view that may stand anywhere: its pose scatters by this many times what the poses do.
+_ANYWHERE = 1e3
 
 
 @dataclass(frozen=True)
@@ -35,24 +38,26 @@ def gross(rows: Rows, variances: Array) -> list[Outlier]:
     sightings = rows.capture.sightings
     assert sightings is not None
     V, S = sightings.used.shape
-    P = np.asarray(np.linalg.inv(evidence_of_rows(rows, rows.hand_eye).covariance(variances)[:V]), float)
-    left = rows.left[:V]
+    evidence, left = evidence_of_rows(rows, rows.hand_eye), rows.left[:V]
+    P = np.asarray(np.linalg.inv(evidence.covariance(variances)[:V]), float)
+    free = np.linalg.inv(evidence.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
+    seen = sightings.used.any(axis=1)
     slots, apart = _slot_deviations(P, left, S)
     slots[~sightings.used] = np.nan
-    views = np.sqrt(np.einsum("vi,vij,vj->v", left, P, left) / np.maximum(rows.used.sum(axis=1), 1))
-    views[~sightings.used.any(axis=1)] = np.nan
-    slots, views = slots / np.nanmedian(slots), views / np.nanmedian(views)
+    misfit = np.where(seen, np.sqrt(np.maximum(np.einsum("vi,vij,vj->v", left, free, left), 0.0)), np.nan)
     distances = rows.distances(rows.left)
-    alone = sightings.used.sum(axis=1) < 2
+    off = np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(sightings.used.sum(axis=1), 1))
+    off[~seen] = np.nan
+    slots, misfit, far = (x / max(float(np.nanmedian(x)), 1e-300) for x in (slots, misfit, off))
+    several = sightings.used.sum(axis=1) > 1
     out = []
-    for v in range(V):
-        worst = float(np.nanmax(slots[v], initial=0.0))
-        if worst > GROSS and not alone[v]:
-            slot = int(np.nanargmax(slots[v]))
+    for v in np.flatnonzero(seen):
+        slot = int(np.nanargmax(slots[v]))
+        if several[v] and misfit[v] > GROSS and slots[v, slot] > GROSS:
             name = sightings.targets[sightings.target[v, slot]]
-            out.append(Outlier(v, name, float(apart[v, slot]), worst))
-        elif views[v] > GROSS:
-            out.append(Outlier(v, None, float(np.nanmax(distances[v])), float(views[v])))
+            out.append(Outlier(int(v), name, float(apart[v, slot]), float(slots[v, slot])))
+        elif far[v] > FAR:
+            out.append(Outlier(int(v), None, float(off[v]), float(far[v])))
     return out
 
 

@@ -79,7 +79,9 @@ def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
     lever, columns = np.zeros((V, m, 6)), np.zeros((B, m, landmarks.size))
     left[:V, : 3 * S] = (placed - known).reshape(V, -1)
     noise[:V, : 3 * S] = np.repeat(np.where(s.used, s.sigma**2, 0.0), 3, axis=1)
-    lever[:, : 3 * S, :3] = -frames.skew(placed - centre).reshape(V, -1, 3)
+    # At the landmark, not where the view puts it: a turn of all views must look exactly as the same turn of the
+    # landmarks does, or what is left would lend itself to parameters that nothing shows. The normal equations agree.
+    lever[:, : 3 * S, :3] = -frames.skew(known - centre).reshape(V, -1, 3)
     lever[:, : 3 * S, 3:] = np.tile(np.eye(3), (V, S, 1))
     for axis in range(3):
         v, slot = np.nonzero(s.used)

@@ -18,7 +18,7 @@ _LISTED = 12
 def sentence(found: LabelledFit, after: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
     """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
     to_um = _MICROMETRES[length_unit]
-    left, out, noise = (f"{x * to_um:.3g} µm" for x in (found.rms, found.heldout_rms, floor))
+    left, out, noise = (f"{x * to_um:.4g} µm" for x in (found.rms, found.heldout_rms, floor))
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (

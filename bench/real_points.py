@@ -1,0 +1,119 @@
+"""Labelled points of real robots: what `stitch add --suggested` finds, judged on poses left out in several ways.
+
+Run: python bench/real_points.py [NAME...] [--at-most N] [--models ";a;a,b"]; writes the tables of docs/points.md.
+With --models these are judged instead of what the diagnosis finds. Needs the measured data beside the project.
+"""
+
+import argparse
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stitch.diagnosis.suggest import suggest
+from stitch.pipeline import run
+from stitch.result import Run
+from stitch.run_folder import model_of
+from stitch.session import Session, load_session
+from stitch.state import state_of
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
+PAGE = ROOT / "docs" / "points.md"
+DATA = ("irb120-tracker", "ur10-tmac")
+_BLOCKS = 4
+
+
+def only(session: Session, index: np.ndarray) -> Session:
+    """The session with the sightings of some views; the others stay, for they say from where the arm came."""
+    kept = set(index.tolist())
+    views = tuple(view if v in kept else replace(view, sighting=None) for v, view in enumerate(session.views))
+    return replace(session, views=views)
+
+
+def splits(session: Session) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """Ways to leave poses out: pairs of views to fit on and views to judge on."""
+    count = len(session.views)
+    everything = np.arange(count)
+
+    def without(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.setdiff1d(everything, index), index
+
+    drawn = np.random.default_rng(0).permutation(count)
+    turned = np.argsort([view.joints[1] for view in session.views])
+    return {
+        "even → odd": [(everything[::2], everything[1::2])],
+        "random halves": [(np.sort(drawn[::2]), np.sort(drawn[1::2]))],
+        "blocks of time": [without(block) for block in np.array_split(everything, _BLOCKS)],
+        "a fifth of joint 2": [without(np.sort(turned[-(count // 5) :]))],
+    }
+
+
+def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
+    """Rms and mean of the 3D distances in views that were not fitted."""
+    distances = []
+    for fit_on, judge_on in way:
+        model = model_of(run(only(session, fit_on), effects=effects))
+        found: Run = run(only(session, judge_on), model)
+        d = found.labelled.rows.distances(found.labelled.rows.left)
+        distances.append(d[np.isfinite(d)])
+    d = np.concatenate(distances)
+    return float(np.sqrt(np.mean(d**2))), float(d.mean())
+
+
+def suggested(session: Session, at_most: int) -> tuple[list[list[str]], str]:
+    """The way that the diagnosis takes on the even poses, and what it says of the rest."""
+    first = run(only(session, np.arange(0, len(session.views), 2)))
+    found, _, last = suggest(state_of(first), at_most)
+    return [list(step.effects) for step in (found or first).ledger], last.sentence
+
+
+def measure(name: str, at_most: int, models: list[list[str]] | None) -> dict[str, object]:
+    """Every model judged in all ways."""
+    session = load_session(SHARED / name)
+    steps, left = (models, "") if models else suggested(session, at_most)
+    ways = splits(session)
+    rows = []
+    for effects in steps:
+        rows.append({"effects": effects, "judged": {n: judged(session, effects, way) for n, way in ways.items()}})
+        print(name, rows[-1], flush=True)
+    return {"name": name, "left": left, "rows": rows}
+
+
+def table(found: dict[str, object]) -> str:
+    """Markdown: a row per step, rms / mean in mm per way of leaving poses out."""
+    ways = list(found["rows"][0]["judged"])
+    lines = [f"**{found['name']}**: 3D distance in poses that were not fitted, rms / mean (mm)", ""]
+    lines += ["| model | " + " | ".join(ways) + " |", "|---|" + "---:|" * len(ways)]
+    before: set[str] = set()
+    for row in found["rows"]:
+        told = "base and tool" if not row["effects"] else "+ " + ", ".join(e for e in row["effects"] if e not in before)
+        before = set(row["effects"])
+        numbers = " | ".join(f"{rms:.3f} / {mean:.3f}" for rms, mean in row["judged"].values())
+        lines.append(f"| {told} | {numbers} |")
+    return "\n".join([*lines, "", *([f"What is left: {found['left']}", ""] if found["left"] else [])])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=DATA)
+    parser.add_argument("--at-most", type=int, default=8)
+    parser.add_argument("--models", help="effects by commas, models by semicolons; the first may be empty")
+    parser.add_argument("--cache", type=Path, default=ROOT / "runs" / "real_points")
+    arguments = parser.parse_args()
+    arguments.cache.mkdir(parents=True, exist_ok=True)
+    models = [[e for e in m.split(",") if e] for m in arguments.models.split(";")] if arguments.models else None
+    for name in arguments.names:
+        document = measure(name, arguments.at_most, models)
+        (arguments.cache / f"{name}.json").write_text(json.dumps(document, indent=1))
+    tables = [table(json.loads(file.read_text())) for file in sorted(arguments.cache.glob("*.json"))]
+    begin, end = "<!-- tables: begin -->", "<!-- tables: end -->"
+    head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+    text = head + begin + "\n" + "\n".join(tables) + end + rest.partition(end)[2]
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
