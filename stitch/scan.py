@@ -15,10 +15,10 @@ _PLANE_NEIGHBOURS = 16
 # The quadric of the noise estimate has six coefficients; 24 neighbours leave 18 degrees of freedom.
 _QUADRIC_NEIGHBOURS = 24
 _NOISE_SAMPLES = 1500
-# Beyond 75° between ray and normal, range cameras smear; beyond 0.2 of the neighbourhood's
+# Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
 # radius, the centroid has left the point: the surface ends here.
 _GRAZING_COSINE = np.cos(np.radians(75.0))
-_EDGE_OFFSET = 0.2
+_EDGE_OFFSET = 0.35
 # Surface variation λ₀/(λ₀+λ₁+λ₂) of a crease (Pauly et al. 2002); a plane has 0.
 _CREASE_VARIATION = 0.05
 

@@ -139,7 +139,7 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = WX.reshape(-1, WX.shape[2]).T @ evidence.z.ravel()
+    b = _summed(WX, evidence.z[..., None])[:, 0]
     beta = half @ (half.T @ b)
     rest = evidence.z - problem.X @ beta
     Wr = np.matmul(inverse, rest[..., None])
@@ -158,4 +158,5 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
 
 def _summed(X: Array, Y: Array) -> Array:
     """Σ_b XᵀY, (a, c)."""
-    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
+    rows = X.shape[0] * X.shape[1]
+    return np.asarray(X.reshape(rows, X.shape[2]).T @ Y.reshape(rows, Y.shape[2]))

@@ -215,9 +215,6 @@ def test_prediction_of_the_null_is_the_present_residual():
     assert np.sqrt(null_left(evidence) / g.weight.sum()) == pytest.approx(result.residual_rms, rel=0.15)
 
 
-on_disk = pytest.mark.xdist_group("session on disk")
-
-
 @pytest.fixture(scope="module")
 def session_on_disk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
@@ -229,7 +226,6 @@ def session_on_disk(tmp_path_factory):
     return folder
 
 
-@on_disk
 def test_the_whole_way_by_command_line(session_on_disk, capsys):
     folder = session_on_disk
     main_(["run", str(folder / "s"), "-o", str(folder / "r"), "--no-recording"])
@@ -261,7 +257,6 @@ def test_the_whole_way_by_command_line(session_on_disk, capsys):
     assert json.loads((folder / "r" / "result.json").read_text())["effects"] == {}
 
 
-@on_disk
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -300,7 +295,6 @@ def test_document_has_no_infinite_number():
     assert json.loads(text)["verdict"] == "adequate"
 
 
-@on_disk
 def test_state_of_a_vanished_session_is_refused(tmp_path, session_on_disk):
     folder = session_on_disk
     if not (folder / "r0").exists():

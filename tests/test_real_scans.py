@@ -17,9 +17,6 @@ from stitch.session import load_session
 IN_HAND = ("david", "cone", "sphere", "rubik")
 OBJECTS = (*IN_HAND, "gripperopen")
 
-# One process: the runs are shared by all tests of this file.
-pytestmark = pytest.mark.xdist_group("real scans")
-
 
 @pytest.fixture(scope="module")
 def runs(reghec):
