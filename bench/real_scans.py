@@ -17,7 +17,7 @@ from stitch.match import sample
 from stitch.overlaps import collect
 from stitch.pipeline import run, run_rig
 from stitch.scan import prepare_view
-from stitch.session import load_session
+from stitch.session_folder import load_session
 from stitch.stages.coarse import part_size
 from stitch.stages.correct import correct
 from stitch.stages.register import register

@@ -1,14 +1,10 @@
 """Is the scale right? Metres read as millimetres, or the reverse, are off by 1000."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.robot import METRES
-
-if TYPE_CHECKING:
-    from stitch.session import Session
+from stitch.session import Session
 
 # Working distances of scanners on robots, in metres: from a borescope to a hall.
 _RANGE_M = (0.01, 20.0)
@@ -19,7 +15,7 @@ _REACH_M = (0.03, 60.0)
 _OTHER = {"mm": "m", "m": "mm"}
 
 
-def check_scale(session: "Session", cloud_unit: str) -> None:
+def check_scale(session: Session, cloud_unit: str) -> None:
     """Refuse clouds or poses whose size only makes sense in the other unit.
 
     Raises:
@@ -50,7 +46,7 @@ def _refuse(size_m: float, limits: tuple[float, float], what: str, key: str, uni
     raise InputError(f'{what} {shown} away with {key} = "{unit}"; {hint}')
 
 
-def _compare(session: "Session", cloud_unit: str) -> None:
+def _compare(session: Session, cloud_unit: str) -> None:
     """Against the sizes that the session itself states."""
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     if not clouds or not session.scanner.standoff:

@@ -16,7 +16,8 @@ from stitch.frames import Array
 from stitch.labelled.document import without_outliers
 from stitch.model import read_model
 from stitch.result import Run, Step
-from stitch.session import Session, load_session
+from stitch.session import Session
+from stitch.session_folder import load_session
 from stitch.stages.coarse import part_size
 from stitch.stages.reuse import REUSE_GATE, settle
 from stitch.thin import thinned

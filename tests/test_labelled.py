@@ -24,7 +24,8 @@ from stitch.pipeline import run
 from stitch.points_csv import Sighting
 from stitch.robot import forward, robot_from_dh
 from stitch.run_folder import model_of
-from stitch.session import Scanner, Session, View, load_session
+from stitch.session import Scanner, Session, View
+from stitch.session_folder import load_session
 from stitch.state import state_of
 from stitch.urdf import robot_from_urdf
 from stitch.urdf_write import to_urdf

@@ -12,7 +12,7 @@ from stitch.match import sample
 from stitch.model import read_model
 from stitch.overlaps import collect
 from stitch.pipeline import run, run_rig
-from stitch.session import load_session
+from stitch.session_folder import load_session
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
 OBJECTS = (*IN_HAND, "gripperopen")

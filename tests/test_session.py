@@ -14,7 +14,7 @@ from data_synth.write import write_session
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.robot import forward, robot_from_dh
-from stitch.session import load_session
+from stitch.session_folder import load_session
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from stitch import pipeline
 from stitch.capture import capture
 from stitch.match import sample
 from stitch.overlaps import FINE_SAMPLES, collect
-from stitch.session import load_session
+from stitch.session_folder import load_session
 from stitch.threads import library_threads_off
 
 VIEWS = 8

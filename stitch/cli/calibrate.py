@@ -23,7 +23,7 @@ from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
 from stitch.result import Run
 from stitch.run_folder import write_json
-from stitch.session import load_session
+from stitch.session_folder import load_session
 from stitch.state import state_of
 
 calibrate = typer.Typer(

@@ -19,7 +19,8 @@ from stitch.model import read_model, write_model
 from stitch.pipeline import run_rig
 from stitch.recorder import Recorder
 from stitch.result import Run
-from stitch.session import Session, load_session
+from stitch.session import Session
+from stitch.session_folder import load_session
 
 
 def run(

@@ -16,7 +16,7 @@ from stitch.errors import InputError
 from stitch.frames import Array, Indices
 from stitch.robot import METRES
 from stitch.scan import Scan, prepare_view
-from stitch.session import load_session
+from stitch.session_folder import load_session
 
 # Fewer points have no neighbourhoods from which normals could be taken.
 _FEWEST = 50
