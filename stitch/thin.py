@@ -14,6 +14,7 @@ from stitch.frames import Indices
 from stitch.overlaps import FINE_SAMPLES
 from stitch.scan import Scan, prepare_view
 from stitch.session import Session
+from stitch.sightings import sightings_of
 from stitch.threads import parallel
 
 # Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most.
@@ -35,7 +36,8 @@ def thinned(session: Session, at_most: int = ENOUGH) -> tuple[Session, Capture]:
 
     scans = list(parallel(scan_of, [v for v, view in enumerate(session.views) if view.cloud is not None]))
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    return replace(session, views=tuple(views)), place(session.name, scans, T_base_flange, session.mount)
+    placed = place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
+    return replace(session, views=tuple(views)), placed
 
 
 def _pick(count: int, at_most: int) -> Indices:
