@@ -26,6 +26,9 @@ class Capture:
     T_reference_flange: Array  # (V, 4, 4) carries a twist of the flange into the reference frame
     T_behind_mount: Array | None = None  # (V, 4, 4) what moves the scanner on its mount; None: nothing does
     sightings: Sightings | None = None  # labelled points; scans may be empty then
+    # How much more the views scatter than the variance of the surfaces' distances says, for so many of them:
+    # what clouds weigh beside labelled points.
+    noise_factor: float = 1.0
 
     @property
     def point_sets(self) -> list[Array]:

@@ -49,6 +49,7 @@ class CaptureEvidence:
         fewer = replace(
             g, views=g.views - len(views), pairs=number[g.pairs[keep]], matrix=g.matrix[keep], vector=g.vector[keep],
             square=g.square[keep], weight=g.weight[keep], count=g.count[keep], raw_square=g.raw_square[keep],
+            labelled=g.labelled[keep],
         )  # fmt: skip
         return CaptureEvidence(
             self.capture.without(views), fewer, np.delete(self.twists, views, 0), np.delete(self.carriers, views, 0),

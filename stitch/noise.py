@@ -14,6 +14,7 @@ def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = Non
     """
     sigma = np.array([scan.noise for scan in capture.scans])
     sigma = np.where(np.isfinite(sigma), sigma, np.nan if stated is None else stated)
-    pairs = overlaps.gram.pairs
+    pairs = overlaps.gram.pairs[~overlaps.gram.labelled]
+    count = overlaps.gram.count[~overlaps.gram.labelled]
     variance = sigma[pairs[:, 0]] ** 2 + sigma[pairs[:, 1]] ** 2
-    return float(np.sqrt(np.average(variance, weights=np.maximum(overlaps.gram.count, 1))))
+    return float(np.sqrt(np.average(variance, weights=np.maximum(count, 1))))

@@ -10,6 +10,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.match import Match, match, overlapping_pairs
 from stitch.solve import Gram, gram, robust_scale
+from stitch.target_pairs import TargetPairs, joined, target_pairs
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000
@@ -20,12 +21,13 @@ _GATE_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Correspondences of all overlapping pairs with their normal equations."""
+    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both."""
 
     pairs: list[tuple[int, int]]
     matches: list[Match]
     gram: Gram
     gate: float
+    targets: TargetPairs | None = None
 
 
 def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> Overlaps:
@@ -42,7 +44,9 @@ def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indic
             "and scanner.pose, or leave scanner.pose out to have it searched"
         )
     centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
-    return Overlaps(pairs, matches, gram(matches, len(capture.scans), centre, robust_scale(matches)), gate)
+    surfaces = gram(matches, len(capture.scans), centre, robust_scale(matches))
+    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
+    return Overlaps(pairs, matches, joined(surfaces, targets, capture.noise_factor), gate, targets)
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:

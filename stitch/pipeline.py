@@ -9,7 +9,9 @@ from stitch.effects.chain import Chain, Term, chain_of, corrected
 from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.labelled.beside import Beside, fitted_beside, weighed
 from stitch.labelled.run import change_labelled, run_labelled
+from stitch.labelled.words import beside_notes
 from stitch.match import sample
 from stitch.model import Model, in_unit
 from stitch.overlaps import collect
@@ -24,8 +26,6 @@ from stitch.stages.reuse import reuse
 from stitch.state import State
 from stitch.threads import Clock, library_threads_off
 from stitch.verdict import coarse_note
-
-_CLOUDS_ONLY = "The labelled points beside the clouds were read and checked, but only the clouds were fitted."
 
 
 def run(
@@ -66,12 +66,12 @@ def run_rig(
         seconds = clock.lap()
         before = [_begin(c, start, seconds, r) for c, r in zip(chains, recorders, strict=True)]
         clock.lap()
-        correction = _correct(chains, start, model, effects, recorders[0])
+        correction, both = fitted_beside(chains, lambda own: _correct(own, start, model, effects, recorders[0]))
         seconds = clock.lap()
         place = _Place(start, correction, (), model.effects_file if model else None)
         return [
-            _finish(session, chain, i, place, before[i], recorders[i], seconds)
-            for i, (session, chain) in enumerate(zip(sessions, chains, strict=True))
+            _finish(session, own, i, place, before[i], recorders[i], seconds)
+            for i, (session, own) in enumerate(zip(sessions, both, strict=True))
         ]
 
 
@@ -99,10 +99,12 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         start = Coarse(state.T_mount_coarse, part_size([chain.capture]) * COARSE_GATE, "of the first run", ())
         before = _begin(chain, start, clock.lap(), recorder)
         clock.lap()
-        refined = refine([chain], terms, state.T_mount, [state.gate])
-        place = _Place(start, refined.as_correction(), state.ledger, state.effects_file)
+        correction, both = fitted_beside(
+            [chain], lambda own: refine(own, terms, state.T_mount, [state.gate]).as_correction()
+        )
+        place = _Place(start, correction, state.ledger, state.effects_file)
         poses_before = corrected(chain, state.terms, state.T_mount).poses(state.T_mount)
-        return _finish(state.session, chain, 0, place, before, recorder, clock.lap(), poses_before)
+        return _finish(state.session, both[0], 0, place, before, recorder, clock.lap(), poses_before)
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ def _correct(
     if not effects:
         return first
     terms = [empty_term(chains[0], known(name)) for name in effects]
+    chains = [weighed(chain, own.noise_factor) for chain, own in zip(chains, first.captures, strict=True)]
     gates = [overlaps.gate for overlaps in first.overlaps]
     return refine(chains, terms, first.hand_eye.T_mount, gates).as_correction()
 
@@ -150,12 +153,13 @@ def _begin(chain: Chain, start: Coarse, seconds: float, recorder: Recorder) -> S
 
 
 def _finish(
-    session: Session, chain: Chain, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float,
+    session: Session, both: Beside, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float,
     poses_before: Array | None = None,
 ) -> Run:  # fmt: skip
-    result = finish(session, chain, index, place.start, place.correction, before, recorder, seconds)
-    if session.has_sightings:
-        result = replace(result, notes=(*result.notes, _CLOUDS_ONLY))
+    result = finish(session, both.chain, index, place.start, place.correction, before, recorder, seconds)
+    if both.found is not None:
+        notes = (*result.notes, *beside_notes(both.found, both.outliers, session))
+        result = replace(result, labelled=both.found, outliers=both.outliers, notes=notes)
     return _in_ledger(replace(result, poses_before=poses_before), place.ledger, place.effects_file, recorder)
 
 

@@ -19,7 +19,7 @@ from stitch.variance import Evidence, fit_variances
 
 @dataclass(frozen=True)
 class PoseChannel:
-    """What the overlaps say about the poses of the views, reduced to n visible directions."""
+    """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
 
     left: Array  # (n, 6V) from twists of the views to visible directions
     z: Array  # (n,) observed twists, left @ twists

@@ -222,7 +222,8 @@ def write_residuals(run: Run, path: Path) -> None:
             add("time_s", np.full(size, run.session.views[m.v].time_s))
     if run.labelled is not None:
         for key, values in residual_columns(run.labelled, run.session).items():
-            add(key, values)
+            if run.overlaps is None or key in table:
+                add(key, values)
     columns = {key: np.concatenate(parts) for key, parts in table.items()}
     arrays = {
         key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.match import Match
 
 _MAD_TO_SIGMA = 1.4826
@@ -32,11 +32,12 @@ class Gram:
     matrix: Array  # (P, 6, 6) Σ w BᵀB
     vector: Array  # (P, 6) Σ w Bᵀe
     square: Array  # (P,) Σ w e²
-    weight: Array  # (P,) Σ w
-    count: Array  # (P,) correspondences inside the robust gate
+    weight: Array  # (P,) Σ w; 0 for labelled points
+    count: Array  # (P,) correspondences inside the robust gate; 0 for labelled points
     raw_square: Array  # (P,) Σ e² inside the robust gate
     scale: float  # robust sigma of e
     centre: Array  # (3,)
+    labelled: Mask  # (P,) pairs of labelled points (`target_pairs.py`), in the surfaces' unit of variance
 
     @property
     def rms(self) -> float:
@@ -51,8 +52,8 @@ class Gram:
 
     @property
     def variance(self) -> float:
-        """Weighted mean of e²."""
-        return float(self.square.sum() / max(self.weight.sum(), 1e-300))
+        """Weighted mean of e² between surfaces."""
+        return float(self.square[~self.labelled].sum() / max(self.weight.sum(), 1e-300))
 
 
 def robust_scale(matches: Iterable[Match]) -> float:
@@ -73,7 +74,7 @@ def gram(
     rows = [_accumulate(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
     matrix, vector, square, weight, count, raw = (np.array(column) for column in zip(*rows, strict=True))
     pairs = np.array([(m.v, m.w) for m in matches])
-    return Gram(views, pairs, matrix, vector, square, weight, count, raw, scale, centre)
+    return Gram(views, pairs, matrix, vector, square, weight, count, raw, scale, centre, np.zeros(len(pairs), bool))
 
 
 def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> tuple[Array | float, ...]:
@@ -89,7 +90,7 @@ def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> 
     )  # fmt: skip
 
 
-def assemble(g: Gram, keep: Array | None = None) -> tuple[Array, Array]:
+def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
     """H (6V, 6V) and b (6V,) of all pairs: the cost is ½ δᵀHδ + bᵀδ; `keep` masks pairs."""
     H = np.zeros((g.views, 6, g.views, 6))
     b = np.zeros((g.views, 6))

@@ -13,7 +13,7 @@ from stitch.effects.terms import terms_of
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.labelled.document import without_outliers
+from stitch.labelled.document import as_counted
 from stitch.model import read_model
 from stitch.result import Run, Step
 from stitch.session import Session
@@ -68,7 +68,7 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         session, scans = thinned(session) if thin else (session, capture(session))
         chain = chain_of(session, scans)
         terms = tuple(terms_of(model, chain))
-        chain = without_outliers(chain, session, document.get("outliers", ()))
+        chain = as_counted(chain, session, document)
         own = corrected(chain, terms, model.T_mount)
         gate = settle(own, model.T_mount, REUSE_GATE * part_size([own])).gate if own.scans else float("nan")
     return State(

@@ -36,9 +36,8 @@ def thinned(session: Session, at_most: int = ENOUGH) -> tuple[Session, Capture]:
 
     scans = list(parallel(scan_of, [v for v, view in enumerate(session.views) if view.cloud is not None]))
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    return replace(session, views=tuple(views)), place(
-        session.name, scans, T_base_flange, session.mount, sightings_of(session)
-    )
+    placed = place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
+    return replace(session, views=tuple(views)), placed
 
 
 def _pick(count: int, at_most: int) -> Indices:

@@ -74,7 +74,7 @@ def _targets(run: Run) -> list[dict[str, object]]:
     return [
         {"name": name, "seen": int(n), "rms": rms * um, "position": position}
         for name, n, rms, position in zip(
-            sightings.targets, sightings.seen, run.fused.residual, run.fused.points, strict=True)
+            sightings.targets, sightings.seen, run.labelled.target_rms, run.labelled.landmarks.positions, strict=True)
     ]  # fmt: skip
 
 

@@ -41,7 +41,7 @@ def errors(run: Run) -> Figure:
     for values, colour, name in ((distances, _BLUE, "in the fit"), (run.labelled.heldout * um, _RED, "left out")):
         ordered = np.sort(values[np.isfinite(values)])
         share.plot(ordered, np.linspace(0, 100, len(ordered)), color=colour, label=name)
-    share.axvline(run.noise_floor * um, color=_GREY, lw=1, ls="--", label="noise floor")
+    share.axvline(run.labelled.noise_floor * um, color=_GREY, lw=1, ls="--", label="noise floor")
     share.set(xlabel="3D distance (µm)", ylabel="share of targets (%)", xlim=(0, None))
     share.legend(frameon=False, fontsize=8)
     return _plain(figure)

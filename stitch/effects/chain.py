@@ -98,10 +98,11 @@ def chain_of(session: Session, capture: Capture) -> Chain:
     )  # fmt: skip
     target_views: tuple[ScanView, ...] = ()
     if capture.sightings is not None:
-        # Nobody knows at what slant a target was seen: an effect of incidence has nothing to say about it.
+        # Nobody knows at what slant a target was seen, or how bright: effects of these have nothing to say about it.
         straight = np.ones(capture.sightings.used.shape[1])
+        usual = None if intensity[0] is None else np.zeros(len(straight))
         target_views = tuple(
-            ScanView(v, views, straight, None, gravity if down is None else down[v], size) for v in range(views.count)
+            ScanView(v, views, straight, usual, gravity if down is None else down[v], size) for v in range(views.count)
         )
     return Chain(
         capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit, target_views

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.effects.chain import Chain, Term, shifts, twists
+from stitch.effects.chain import Chain, Term, shifts, target_shifts, twists
 from stitch.frames import Array, Indices
-from stitch.free_poses import FreePoses, visible_directions
+from stitch.free_poses import FreePoses, answer
 from stitch.match import Match
 from stitch.solve import tukey
+from stitch.target_pairs import by_pair
 from stitch.threads import parallel
 
 POINTS = ("sensor", "shape")
@@ -60,22 +61,31 @@ def point_gram(chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], 
         vector, residual, square = (sum(p) for p in zip(*parts, strict=True))
         return vector, residual, square
 
-    sums = list(parallel(of_pair, freed.overlaps.matches))
+    sums = [*parallel(of_pair, freed.overlaps.matches), *_of_targets(chain, terms, candidates, freed)]
     return PointGram(*(np.array([s[i] for s in sums]) for i in range(3)))
 
 
+def _of_targets(
+    chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], freed: FreePoses
+) -> list[tuple[Array, ...]]:
+    """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
+    targets, g = freed.overlaps.targets, freed.overlaps.gram
+    if targets is None:
+        return []
+    slopes = np.concatenate([target_shifts(chain, terms, term, freed.poses) for term in candidates])
+    moved = np.moveaxis(frames.rotate(freed.poses, slopes), 0, -1)  # (V, S, 3, K)
+    (v, w), (slot_v, slot_w) = targets.views.T, targets.slots.T
+    change = moved[v, slot_v] - moved[w, slot_w]
+    weighted = change * (chain.capture.noise_factor * g.variance * targets.information)[:, None, None]
+    vector = by_pair(targets, np.einsum("nia,nik->nak", targets.lever(g.centre), weighted))[1]
+    residual = by_pair(targets, np.einsum("ni,nik->nk", targets.apart, weighted))[1]
+    square = by_pair(targets, np.einsum("nik,nil->nkl", change, weighted))[1]
+    return list(zip(vector, residual, square, strict=True))
+
+
 def seen_twists(points: PointGram, freed: FreePoses) -> Array:
-    """(6V, K) H⁺BᵀWg: what point effects do to poses that the overlaps alone determine."""
-    g = freed.overlaps.gram
-    K = points.vector.shape[2]
-    b = np.zeros((g.views, 6, K))
-    v, w = g.pairs.astype(np.int64).T
-    np.add.at(b, v, points.vector)
-    np.subtract.at(b, w, points.vector)
-    values, vectors, scale = visible_directions(g)
-    return np.asarray(
-        scale[:, None] * (vectors @ ((vectors.T @ (scale[:, None] * b.reshape(-1, K))) / values[:, None]))
-    )
+    """(6V, K) H⁺BᵀWg: what point effects do to poses that overlaps and targets alone determine."""
+    return answer(freed.overlaps.gram, points.vector)
 
 
 def all_columns(

@@ -1,6 +1,5 @@
 """What labelled points add to model.toml, result.json and residuals.parquet, and back."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -49,14 +48,19 @@ def labelled_facts(run: Run) -> dict[str, Any]:
     if run.labelled is None:
         return {}
     rows = run.labelled.rows
-    return {
-        "rms_of": "3D distances of the targets from their place",
+    facts = {
         "position_error": _sizes(rows.distances(rows.left)),
-        "heldout_position_error": _sizes(run.labelled.heldout),
         "outliers": [
             {"view": run.session.views[o.view].name, "target": o.target, "distance": o.distance, "times_usual": o.times}
             for o in run.outliers
         ],
+    }
+    if run.overlaps is not None:
+        # The rms of the run is that of its surfaces, and views are left out with both.
+        return facts | {"cloud_noise_factor": run.chain.capture.noise_factor}
+    return facts | {
+        "rms_of": "3D distances of the targets from their place",
+        "heldout_position_error": _sizes(run.labelled.heldout),
     }
 
 
@@ -84,9 +88,9 @@ def residual_columns(found: LabelledFit, session: Session) -> dict[str, Array]:
     return out
 
 
-def without_outliers(chain: Chain, session: Session, outliers: Iterable[dict[str, Any]]) -> Chain:
-    """The chain less the labelled points that result.json lists as outliers."""
-    s = chain.capture.sightings
+def as_counted(chain: Chain, session: Session, document: dict[str, Any]) -> Chain:
+    """The chain as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
+    s, outliers = chain.capture.sightings, document.get("outliers", ())
     if s is None:
         return chain
     number = {view.name: v for v, view in enumerate(session.views)}
@@ -95,4 +99,6 @@ def without_outliers(chain: Chain, session: Session, outliers: Iterable[dict[str
         v = number.get(o["view"])
         if v is not None:
             used[v] &= False if o["target"] is None else s.target[v] != s.targets.index(o["target"])
-    return replace(chain, capture=replace(chain.capture, sightings=replace(s, used=used)))
+    factor = document.get("cloud_noise_factor", chain.capture.noise_factor)
+    own = replace(chain.capture, sightings=replace(s, used=used), noise_factor=factor)
+    return replace(chain, capture=own)

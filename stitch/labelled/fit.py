@@ -48,6 +48,19 @@ class LabelledFit:
         """The same for targets predicted without their own views."""
         return rms_of(self.heldout)
 
+    @property
+    def noise_floor(self) -> float:
+        """What the sensor's own noise would leave of it if every pose were perfect."""
+        noise = self.rows.noise[: len(self.rows.lever), : self.rows.positions]
+        return float(np.sqrt(3 * np.mean(noise[noise > 0])))
+
+    @property
+    def target_rms(self) -> Array:
+        """(K,) rms distance of the views from every target; NaN for one that nobody sees."""
+        s, distances = self.rows.capture.sightings, self.rows.distances(self.rows.left)
+        assert s is not None
+        return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)])
+
 
 def rms_of(distances: Array) -> float:
     """Root mean square, NaN left out."""
@@ -173,19 +186,29 @@ def without_gross(chain: Chain, examine: Callable[[Chain], LabelledFit]) -> tupl
         NoResultError: more than a third of what was seen would have to go.
     """
     assert chain.capture.sightings is not None
-    everything = chain.capture.sightings.everything
-    sightings, taken = everything, list[Outlier]()
+    chain = replace(chain, capture=replace(chain.capture, sightings=chain.capture.sightings.everything))
+    taken = list[Outlier]()
     while True:
-        chain = replace(chain, capture=replace(chain.capture, sightings=sightings))
         found = examine(chain)
         worse = gross(found.rows, found.variances)
         if not worse:
             return found, chain, taken
         taken += worse
-        used = outside(sightings.used, worse, sightings.targets, sightings.target)
-        if used.sum() < 2 * everything.used.sum() / 3:
-            raise NoResultError(
-                f"{chain.capture.name}: more than a third of the labelled points contradict the rest; check the names "
-                "of the targets, the order of the views, mount and pose convention"
-            )
-        sightings = replace(everything, used=used)
+        chain = taken_out(chain, worse)
+
+
+def taken_out(chain: Chain, worse: Sequence[Outlier]) -> Chain:
+    """The chain without some of its labelled points.
+
+    Raises:
+        NoResultError: more than a third of what was seen would be gone.
+    """
+    sightings = chain.capture.sightings
+    assert sightings is not None
+    used = outside(sightings.used, worse, sightings.targets, sightings.target)
+    if used.sum() < 2 * sightings.everything.used.sum() / 3:
+        raise NoResultError(
+            f"{chain.capture.name}: more than a third of the labelled points contradict the rest; check the names "
+            "of the targets, the order of the views, mount and pose convention"
+        )
+    return replace(chain, capture=replace(chain.capture, sightings=replace(sightings, used=used)))

@@ -5,6 +5,7 @@ scatter of the poses foretell least. A view whose targets agree but lie far off 
 by what is usual in these data (median), so that outliers do not hide behind the scatter they cause.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +75,7 @@ def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
     return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
 
 
-def outside(used: Mask, found: list[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
+def outside(used: Mask, found: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
     """(V, S) bool: what is in use without the outliers."""
     used = used.copy()
     for o in found:

@@ -93,7 +93,6 @@ def finish_labelled(
     ]
     recorder.stage(stages[1], poses_model, list(distances))
     recorder.stage(stages[2], poses, list(after))
-    floor = float(np.sqrt(3 * np.mean(rows.noise[: len(poses), : rows.positions][rows.used[:, : rows.positions]])))
     scatter = scatter_from(found.variances)
     with_joints = session.robot is not None and all(view.joints is not None for view in session.views)
     joints = np.array([view.joints for view in session.views]) if with_joints else None
@@ -102,9 +101,9 @@ def finish_labelled(
         session=session, chain=chain, T_mount=found.T_mount, T_mount_coarse=T_coarse, mount_covariance=found.covariance,
         unobservable=unobservable([own], found.T_mount, session.robot, joints),
         stages=tuple(stages), poses_model=poses_model, poses=poses, corrections=corrections, view_rms=per_view,
-        residual_rms=found.rms, heldout_rms=found.heldout_rms, noise_floor=floor, fused=_targets_as_cloud(own, found),
-        repeatability=scatter, overlaps=None,
-        verdict=sentence(found, rms_of(after), floor, scatter, session.length_unit),
+        residual_rms=found.rms, heldout_rms=found.heldout_rms, noise_floor=found.noise_floor,
+        fused=_targets_as_cloud(own, found), repeatability=scatter, overlaps=None,
+        verdict=sentence(found, rms_of(after), found.noise_floor, scatter, session.length_unit),
         terms=found.terms, sigmas=found.sigmas,
         convergence={"correct": list(found.history), "register": [rms_of(after)]},
         notes=notes_of(found, outliers, session), labelled=found, outliers=tuple(outliers),
@@ -131,8 +130,6 @@ def registered(rows: Rows, variances: Array, poses: Array) -> tuple[Array, Array
 
 def _targets_as_cloud(own: Capture, found: LabelledFit) -> FusedCloud:
     """The targets in place of a fused cloud: position, rms distance of the views from it, number of views."""
-    s, distances = own.sightings, found.rows.distances(found.rows.left)
-    assert s is not None
-    rms = [rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)]
-    positions = found.landmarks.positions
-    return FusedCloud(positions, np.zeros_like(positions), np.array(rms), np.minimum(s.seen, 65535).astype(np.int32))
+    assert own.sightings is not None
+    positions, seen = found.landmarks.positions, np.minimum(own.sightings.seen, 65535)
+    return FusedCloud(positions, np.zeros_like(positions), found.target_rms, seen.astype(np.int32))

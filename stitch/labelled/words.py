@@ -30,7 +30,29 @@ def sentence(found: LabelledFit, after: float, floor: float, scatter: Repeatabil
 
 
 def notes_of(found: LabelledFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
-    """Outliers by name, targets seen once, and a covariance that had to be widened."""
+    """Outliers by name, targets seen once, clouds that were not used, and a covariance that had to be widened."""
+    notes = _left_out(found, outliers, session)
+    if any(view.cloud is not None for view in session.views):
+        notes.append("Some views have no cloud: only the labelled points were fitted.")
+    if found.inflation > 2.5:
+        notes.append(
+            f"Views near each other err alike: all sigmas are {np.sqrt(found.inflation):.1f} times those of "
+            "independent pose errors."
+        )
+    return tuple(notes)
+
+
+def beside_notes(found: LabelledFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+    """Outliers by name, targets seen once, and what is not used of labelled points beside clouds."""
+    notes = _left_out(found, outliers, session)
+    if session.nominal is not None:
+        notes.append("Nominal positions (targets.csv) are not used beside clouds; the targets' places were free.")
+    if found.landmarks.orientation is not None:
+        notes.append("Of the probe in frames.csv only the place counts beside clouds, not its turn.")
+    return tuple(notes)
+
+
+def _left_out(found: LabelledFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
     to_um = _MICROMETRES[session.length_unit]
     notes = []
     if outliers:
@@ -42,12 +64,7 @@ def notes_of(found: LabelledFit, outliers: Sequence[Outlier], session: Session) 
     once = [name for name, n in zip(sightings.targets, sightings.seen, strict=True) if n < 2]
     if once:
         notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(once)}.")
-    if found.inflation > 2.5:
-        notes.append(
-            f"Views near each other err alike: all sigmas are {np.sqrt(found.inflation):.1f} times those of "
-            "independent pose errors."
-        )
-    return tuple(notes)
+    return notes
 
 
 def named(outlier: Outlier, session: Session) -> str:

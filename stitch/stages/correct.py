@@ -6,7 +6,7 @@ generalised least-squares step weighs the views by the robot's own scatter (`han
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from stitch.hand_eye import HandEye, fit_hand_eye
 from stitch.match import sample
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.recorder import Recorder, Silent
+from stitch.repeatability import Repeatability
 from stitch.solve import assemble, least_squares
 
 # Queries per view while the gate closes; the final normal equations take FINE_SAMPLES.
@@ -104,7 +105,11 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
     freed = tuple(free_poses(c, c.poses(T_mount), o.gate) for c, o in zip(captures, overlaps, strict=True))
     first = fit_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
-    freed = tuple(f.seen_from(c.poses(first.T_mount)) for c, f in zip(captures, freed, strict=True))
+    captures = [weighing(c, scatter) for c, scatter in zip(captures, first.repeatability, strict=True)]
+    freed = tuple(
+        f.seen_from(c.poses(first.T_mount)) if c.sightings is None else free_poses(c, c.poses(first.T_mount), o.gate)
+        for c, f, o in zip(captures, freed, overlaps, strict=True)
+    )
     hand_eye = fit_hand_eye(captures, freed, first.T_mount)
     final = tuple(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
@@ -112,3 +117,11 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
     )
     poses = tuple(f.poses for f in freed)
     return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)), tuple(captures))
+
+
+def weighing(capture: Capture, scatter: Repeatability) -> Capture:
+    """The capture with clouds that weigh beside its labelled points by the scatter that they have shown.
+
+    Correspondences share points and normals, so that they never know more than as many independent distances.
+    """
+    return capture if capture.sightings is None else replace(capture, noise_factor=max(scatter.noise_factor, 1.0))

@@ -26,6 +26,7 @@ from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.scan import Scan
 from stitch.solve import assemble, gram
+from stitch.target_pairs import joined
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
@@ -101,7 +102,8 @@ def register(
         recorder.iteration("register", index, poses, overlaps.gram.rms, gate)
         centre = overlaps.gram.centre
         weights = pair_weights(overlaps.matches, capture.scans)
-        g = gram(overlaps.matches, views, centre, overlaps.gram.scale, weights)
+        surfaces = gram(overlaps.matches, views, centre, overlaps.gram.scale, weights)
+        g = joined(surfaces, overlaps.targets, capture.noise_factor)
         to_centre = frames.make(np.eye(3), -centre)
         moved = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
         step = _step(g.variance * scatter.noise_factor, assemble(g), prior_precision(capture, scatter, centre), moved)

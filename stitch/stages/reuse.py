@@ -13,7 +13,7 @@ from stitch.match import sample
 from stitch.model import Model
 from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.stages.coarse import part_size
-from stitch.stages.correct import Correction
+from stitch.stages.correct import Correction, weighing
 
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
@@ -41,7 +41,7 @@ def reuse(captures: Sequence[Capture], model: Model, terms: Sequence[Term] = ())
         overlaps,
         tuple(f.poses for f in freed),
         (pooled_rms(overlaps),),
-        tuple(captures),
+        tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
         tuple(terms),
         sigmas,
     )
