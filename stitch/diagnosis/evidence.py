@@ -9,6 +9,7 @@ from typing import Protocol
 
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram
+from stitch.folds import JointEnd
 from stitch.frames import Array, Indices
 from stitch.variance import Evidence, VarianceFit
 
@@ -99,6 +100,10 @@ class ViewEvidence(Protocol):
 
     def folds(self) -> list[Array]:
         """Groups of views to leave out."""
+        ...
+
+    def ends(self) -> list[JointEnd]:
+        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
         ...
 
     def at_part(self, numbers: Array) -> Array:

@@ -45,12 +45,17 @@ def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> 
         scatter = np.column_stack([scatter, off])
     return Left(
         float(trial.squares(whole).sum() / null_left(evidence)), float(np.average(shares, weights=weights)),
-        *_share(*scatter), _steadiness(evidence, trial, X, whole),
+        *share_of(*scatter), _steadiness(evidence, trial, X, whole),
     )  # fmt: skip
 
 
-def _share(with_it: Array, without: Array) -> tuple[float, float]:
-    """How far left-out views lie from one prediction over the other, squared, and its standard error over folds."""
+def share_of(with_it: Array, without: Array) -> tuple[float, float]:
+    """How far left-out views lie from one prediction over the other, squared, and its standard error over groups.
+
+    Args:
+        with_it: (G,) sum of squares of each group under one prediction.
+        without: (G,) under the other.
+    """
     share = float(with_it.sum() / max(without.sum(), 1e-300))
     spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
     return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))

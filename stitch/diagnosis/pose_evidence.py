@@ -13,7 +13,7 @@ from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
 from stitch.effects.scanner_field import field_scatter
 from stitch.effects.visible import independent, project_out
-from stitch.folds import grouped_folds
+from stitch.folds import JointEnd, grouped_folds
 from stitch.frames import Array
 from stitch.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
@@ -106,6 +106,10 @@ class PoseEvidence:
     def touched(self, views: Array) -> Array:
         """(pairs,) bool: pairs with one of the views."""
         return np.asarray(np.isin(self.freed.overlaps.gram.pairs, views).any(axis=1))
+
+    def ends(self) -> list[JointEnd]:
+        """None: what overlaps leave belongs to pairs of views."""
+        return []
 
     def at_part(self, numbers: Array) -> Array:
         """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""

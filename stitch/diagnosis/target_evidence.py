@@ -10,7 +10,7 @@ from stitch.diagnosis.target_trial import TargetTrial
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import PointGram
 from stitch.effects.visible import independent
-from stitch.folds import grouped_folds
+from stitch.folds import JointEnd, grouped_folds, joint_ends
 from stitch.frames import Array
 from stitch.labelled.landmarks import Drawing, Landmarks, settled
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
@@ -108,6 +108,11 @@ class TargetEvidence:
     def folds(self) -> list[Array]:
         """Groups of views to leave out."""
         return [np.asarray(f) for f in grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)]
+
+    def ends(self) -> list[JointEnd]:
+        """Both ends of every joint's range, of the views that show a target."""
+        T, seen = self.rows.capture.T_reference_mount, np.flatnonzero(self.rows.used.any(axis=1))
+        return joint_ends(self.chain.views.joints, T, self.rows.reach, seen)
 
     def at_part(self, numbers: Array) -> Array:
         """(V, 3) mean displacement of the targets that a view shows; zero for one that shows none."""
