@@ -28,7 +28,6 @@ class JointEnd:
     joint: int  # counted from 0
     upper: bool
     views: Indices
-    groups: tuple[Indices, ...]  # the same views, neighbours together: they err alike
 
     @property
     def name(self) -> str:
@@ -59,13 +58,11 @@ def places(T_reference_mount: Array, lever: float) -> list[Indices]:
     return [f for f in _regions(T_reference_mount, lever, _PLACES) if len(f)]
 
 
-def joint_ends(joints: Array, T_reference_mount: Array, lever: float, seen: Indices) -> list[JointEnd]:
+def joint_ends(joints: Array, seen: Indices) -> list[JointEnd]:
     """Both ends of every joint's range; none of a joint that stands still, or where views are few.
 
     Args:
         joints: (V, n) rad.
-        T_reference_mount: (V, 4, 4).
-        lever: length that makes a radian of orientation comparable with a distance.
         seen: indices of the views that show something.
     """
     out = []
@@ -74,8 +71,7 @@ def joint_ends(joints: Array, T_reference_mount: Array, lever: float, seen: Indi
         for upper, views in ((False, seen[q <= low]), (True, seen[q >= high])):
             # Where many views share one angle, an end may be most of them.
             if _VIEWS_PER_END <= len(views) <= len(seen) // 2:
-                groups = [views[g] for g in _regions(T_reference_mount[views], lever, _GROUPS) if len(g)]
-                out.append(JointEnd(joint, upper, views, tuple(groups)))
+                out.append(JointEnd(joint, upper, views))
     return out
 
 

@@ -20,7 +20,7 @@ class Beyond:
 
     end: JointEnd
     share: float  # mean square distance over that of the present model
-    sigma: float  # standard error of `share`, groups of neighbours as samples
+    sigma: float  # standard error of `share`, views as samples
 
     @property
     def worse(self) -> bool:
@@ -34,7 +34,5 @@ def errs_beyond(evidence: ViewEvidence, scored: Score) -> Beyond | None:
     present = evidence.trial(evidence.model)
     found = []
     for end in evidence.ends():
-        squares = [t.squares(t.solve(np.asarray(end.views))) for t in (trial, present)]
-        sums = [np.array([own[group].sum() for group in end.groups]) for own in squares]
-        found.append(Beyond(end, *share_of(*sums)))
+        found.append(Beyond(end, *share_of(*(t.squares(t.solve(end.views))[end.views] for t in (trial, present)))))
     return max((beyond for beyond in found if beyond.worse), key=lambda beyond: beyond.share, default=None)

@@ -115,7 +115,7 @@ def _refused(named: Ranked, left: Left | None, implausible: bool) -> tuple[str, 
     if left.steadiness < _STEADY:
         note = f"{named.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
         return "unknown_effect" if implausible or named.adjusted < _BEYOND_CHANCE else "adequate", note
-    if left.poses > 1 - left.poses_sigma:
+    if not left.helps:
         share = f"{left.poses:.2f} ± {left.poses_sigma:.2f}"
         note = f"{named.name} would not help on views left out (mean square pose error {share} of now)"
         return "unknown_effect" if implausible else "adequate", note

@@ -20,6 +20,11 @@ class Left:
     poses_sigma: float  # standard error of `poses` over folds
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
 
+    @property
+    def helps(self) -> bool:
+        """True if views left out are predicted better, by more than a standard error."""
+        return self.poses <= 1 - self.poses_sigma
+
 
 def null_left(evidence: ViewEvidence) -> float:
     """Weighted sum of squares of the present model."""
@@ -50,10 +55,10 @@ def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> 
 
 
 def share_of(with_it: Array, without: Array) -> tuple[float, float]:
-    """How far left-out views lie from one prediction over the other, squared, and its standard error over groups.
+    """How far left-out views lie from one prediction over the other, squared, and its standard error.
 
     Args:
-        with_it: (G,) sum of squares of each group under one prediction.
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under one prediction.
         without: (G,) under the other.
     """
     share = float(with_it.sum() / max(without.sum(), 1e-300))

@@ -39,24 +39,26 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
         return Selection(verdict, (), ranked, empirical)
     if not contenders:
         return Selection("unknown_effect", (), ranked, empirical)
-    best, notes = contenders[0], tuple[str, ...]()
-    second: Ranked | None = None
+    best, second, refused = contenders[0], None, dict[str, str]()
     if evidence.chain.views.count >= MANY:
-        found = together(evidence, candidates, best)
-        if (stray is not None and stray.log_posterior > found.explained + ODDS) or (found.notes and not found.effects):
-            return Selection("unknown_effect", (), ranked, empirical, notes=found.notes)
-        notes = found.notes
-        best, *further = found.effects or (best,)
-        second = further[0] if further else None
+        found = together(evidence, candidates, ranked)
+        refused = found.refused
+        explained = max(found.explained, best.log_posterior)
+        if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):
+            return Selection("unknown_effect", (), ranked, empirical, notes=tuple(refused.values()))
+        best = found.effects[0] if found.effects else best
+        second = found.effects[1] if len(found.effects) > 1 else None
     elif stray is not None and stray.log_posterior > best.log_posterior + ODDS:
         # Two known effects at once may look like none of them: try the best with a second one.
         best, second = _pair(evidence, candidates, best)
         both = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(PHYSICAL / len(ranked)))
         if stray.log_posterior > both + ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
-    others = (r for r in contenders if r.name != best.name and r.log_posterior > best.log_posterior - ODDS)
+    likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
+    others = (r for r in likely if r.name != best.name and r.name not in refused)
     group = (best, *(() if second is not None else others))
-    return Selection("missing_effect" if len(group) == 1 else "cannot_tell", group, ranked, empirical, second, notes)
+    verdict, notes = "missing_effect" if len(group) == 1 else "cannot_tell", tuple(refused.values())
+    return Selection(verdict, group, ranked, empirical, second, notes)
 
 
 def implausible(evidence: ViewEvidence, length_unit: str) -> bool:

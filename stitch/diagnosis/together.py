@@ -21,29 +21,34 @@ class Together:
 
     effects: tuple[Ranked, ...]
     explained: float  # log posterior of what was found one by one
-    notes: tuple[str, ...]  # why what explains much is not among them
+    refused: dict[str, str]  # effects that explain much and are not among them, and why
 
 
-def together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> Together:
+def together(evidence: ViewEvidence, candidates: Sequence[Candidate], ranked: Sequence[Ranked]) -> Together:
     """Effects that are missing at once.
 
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
-    effects are added one by one as long as one can be named beside those before; then each must hold its
-    place beside all the others. One that errs at an end of a joint's range is left out and the search goes on,
-    for what it imitated may be explained by another.
+    effects are added one by one as long as one can be named beside those before and does not err at an end of a
+    joint's range that was left out; then each must hold its place beside all the others.
+
+    Args:
+        ranked: the candidates alone, best first.
     """
-    candidates = [c for c in candidates if c.effect.tier != "empirical"]
-    chain, notes = _grown(evidence, candidates, [best]), list[str]()
+    physical = [c for c in candidates if c.effect.tier != "empirical"]
+    chain, notes = list[Ranked](), dict[str, str]()
+    while len(chain) < _AT_ONCE:
+        beside = _beside(evidence, chain)
+        if chain:
+            others = [c for c in physical if c.name not in {r.name for r in chain}]
+            ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
+        following = _first_sound(beside, ranked, notes)
+        if following is None:
+            break
+        chain.append(following)
     explained = sum(r.log_posterior for r in chain)
-    while True:
-        chain = _holding(evidence, chain)
-        erring = [(beyond.share, r.name, beyond) for r, beyond in _errors_beyond(evidence, chain) if beyond is not None]
-        if not erring:
-            return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, tuple(notes))
-        _, name, beyond = max(erring, key=lambda e: e[:2])
-        notes.append(told(name, beyond))
-        candidates = [c for c in candidates if c.name != name]
-        chain = _grown(evidence, candidates, [r for r in chain if r.name != name])
+    chain = _holding(evidence, chain)
+    refused = {name: note for name, note in notes.items() if name not in {r.name for r in chain}}
+    return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
 
 
 def told(name: str, beyond: Beyond) -> str:
@@ -54,18 +59,15 @@ def told(name: str, beyond: Beyond) -> str:
     )
 
 
-def _grown(evidence: ViewEvidence, candidates: Sequence[Candidate], chain: Sequence[Ranked]) -> list[Ranked]:
-    """Further effects, one by one, as long as one can be named beside those before."""
-    chain = list(chain)
-    while len(chain) < _AT_ONCE:
-        beside = _beside(evidence, chain)
-        others = [c for c in candidates if c.name not in {r.name for r in chain}]
-        ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
-        following = next((r for r in ranked if certain(r)), None)
-        if following is None:
-            break
-        chain.append(following)
-    return chain
+def _first_sound(beside: ViewEvidence, ranked: Sequence[Ranked], notes: dict[str, str]) -> Ranked | None:
+    """The best that can be named and does not err beyond; of those before it `notes` says where they do."""
+    for r in ranked:
+        if certain(r):
+            beyond = errs_beyond(beside, r.score)
+            if beyond is None:
+                return r
+            notes[r.name] = told(r.name, beyond)
+    return None
 
 
 def _holding(evidence: ViewEvidence, chain: list[Ranked]) -> list[Ranked]:
@@ -76,11 +78,6 @@ def _holding(evidence: ViewEvidence, chain: list[Ranked]) -> list[Ranked]:
         own = rank(score_all(_beside(evidence, others), [candidate]))[0][0]
         chain = [*others, own] if certain(own) else others
     return chain
-
-
-def _errors_beyond(evidence: ViewEvidence, chain: Sequence[Ranked]) -> list[tuple[Ranked, Beyond | None]]:
-    """Where each effect, beside the others, errs at an end of a joint's range that was left out."""
-    return [(r, errs_beyond(_beside(evidence, [other for other in chain if other is not r]), r.score)) for r in chain]
 
 
 def _beside(evidence: ViewEvidence, chain: Sequence[Ranked]) -> ViewEvidence:
