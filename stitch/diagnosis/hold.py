@@ -3,12 +3,11 @@
 from collections.abc import Collection
 from dataclasses import replace
 
-from stitch.diagnosis.beyond import errs_beyond
+from stitch.diagnosis.beyond import beyond
 from stitch.diagnosis.candidates import as_fitted
 from stitch.diagnosis.heldout import left_by
 from stitch.diagnosis.ranking import certain, rank, score_all
 from stitch.diagnosis.start import evidence_of_state
-from stitch.diagnosis.together import told
 from stitch.effects.chain import Term
 from stitch.state import State
 
@@ -37,9 +36,9 @@ def _doubt(state: State, term: Term) -> tuple[float, str, str | None]:
     own = rank(score_all(evidence, [candidate]))[0][0]
     if not certain(own):
         return own.score.gain, name, f"{name} explains too little beside the others"
-    beyond = errs_beyond(evidence, own.score)
-    if beyond is not None:
-        return own.score.gain, name, told(name, beyond)
+    at_ends = beyond(evidence, own.score)
+    if at_ends is not None and not at_ends.helps:
+        return own.score.gain, name, at_ends.told(name)
     left = left_by(evidence, own.score, None)
     if not left.helps:
         share = f"{left.poses:.3f} ± {left.poses_sigma:.3f}"

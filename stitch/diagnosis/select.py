@@ -41,7 +41,7 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
         return Selection("unknown_effect", (), ranked, empirical)
     best, second, refused = contenders[0], None, dict[str, str]()
     if evidence.chain.views.count >= MANY:
-        found = together(evidence, candidates, ranked)
+        found = together(evidence, candidates, best)
         refused = found.refused
         explained = max(found.explained, best.log_posterior)
         if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.beyond import Beyond, errs_beyond
+from stitch.diagnosis.beyond import beyond
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.ranking import Ranked, certain, rank, score_all
@@ -24,60 +24,56 @@ class Together:
     refused: dict[str, str]  # effects that explain much and are not among them, and why
 
 
-def together(evidence: ViewEvidence, candidates: Sequence[Candidate], ranked: Sequence[Ranked]) -> Together:
+def together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> Together:
     """Effects that are missing at once.
 
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
-    effects are added one by one as long as one can be named beside those before and does not err at an end of a
-    joint's range that was left out; then each must hold its place beside all the others.
-
-    Args:
-        ranked: the candidates alone, best first.
+    effects are added one by one as long as one can be named beside those before; then each must hold its
+    place beside all the others. The one that errs most beyond the measured poses is left out, and the search
+    goes on: what it imitated others may explain.
     """
-    physical = [c for c in candidates if c.effect.tier != "empirical"]
-    chain, notes = list[Ranked](), dict[str, str]()
+    candidates = [c for c in candidates if c.effect.tier != "empirical"]
+    chain, refused = _grown(evidence, candidates, [best]), dict[str, str]()
+    explained = sum(r.log_posterior for r in chain)
+    while True:
+        chain = _holding(evidence, chain)
+        tried = [(r.name, beyond(_without(evidence, chain, r), r.score)) for r in chain]
+        erring = {name: found for name, found in tried if found is not None and not found.helps}
+        if not erring:
+            return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
+        name = max(erring, key=lambda name: erring[name].share)
+        refused[name] = erring[name].told(name)
+        candidates = [c for c in candidates if c.name != name]
+        chain = _grown(evidence, candidates, [r for r in chain if r.name != name])
+
+
+def _grown(evidence: ViewEvidence, candidates: Sequence[Candidate], chain: Sequence[Ranked]) -> list[Ranked]:
+    """Further effects, one by one, as long as one can be named beside those before."""
+    chain = list(chain)
     while len(chain) < _AT_ONCE:
         beside = _beside(evidence, chain)
-        if chain:
-            others = [c for c in physical if c.name not in {r.name for r in chain}]
-            ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
-        following = _first_sound(beside, ranked, notes)
+        others = [c for c in candidates if c.name not in {r.name for r in chain}]
+        ranked, _ = rank(score_all(beside, promising(beside, others, _TRIED)))
+        following = next((r for r in ranked if certain(r)), None)
         if following is None:
             break
         chain.append(following)
-    explained = sum(r.log_posterior for r in chain)
-    chain = _holding(evidence, chain)
-    refused = {name: note for name, note in notes.items() if name not in {r.name for r in chain}}
-    return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
+    return chain
 
 
-def told(name: str, beyond: Beyond) -> str:
-    """Why an effect is not named though it explains much."""
-    return (
-        f"{name} would help among the poses that were measured, but not beyond: predicted from all others, "
-        f"{beyond.end.name} would err by {beyond.share:.2f} ± {beyond.sigma:.2f} times as much (mean square)"
-    )
-
-
-def _first_sound(beside: ViewEvidence, ranked: Sequence[Ranked], notes: dict[str, str]) -> Ranked | None:
-    """The best that can be named and does not err beyond; of those before it `notes` says where they do."""
-    for r in ranked:
-        if certain(r):
-            beyond = errs_beyond(beside, r.score)
-            if beyond is None:
-                return r
-            notes[r.name] = told(r.name, beyond)
-    return None
-
-
-def _holding(evidence: ViewEvidence, chain: list[Ranked]) -> list[Ranked]:
+def _holding(evidence: ViewEvidence, chain: Sequence[Ranked]) -> list[Ranked]:
     """The effects that can still be named beside all the others."""
-    for name in [r.name for r in chain]:
-        others = [r for r in chain if r.name != name]
-        candidate = next(r.score.candidate for r in chain if r.name == name)
-        own = rank(score_all(_beside(evidence, others), [candidate]))[0][0]
+    chain = list(chain)
+    for r in list(chain):
+        own = rank(score_all(_without(evidence, chain, r), [r.score.candidate]))[0][0]
+        others = [other for other in chain if other.name != r.name]
         chain = [*others, own] if certain(own) else others
     return chain
+
+
+def _without(evidence: ViewEvidence, chain: Sequence[Ranked], one: Ranked) -> ViewEvidence:
+    """The evidence beside all effects but one."""
+    return _beside(evidence, [r for r in chain if r.name != one.name])
 
 
 def _beside(evidence: ViewEvidence, chain: Sequence[Ranked]) -> ViewEvidence:
