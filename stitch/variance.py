@@ -143,7 +143,7 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = WX.reshape(-1, WX.shape[2]).T @ evidence.z.ravel()
+    b = _rows(WX).T @ evidence.z.ravel()
     beta = half @ (half.T @ b)
     rest = evidence.z - problem.X @ beta
     Wr = np.matmul(inverse, rest[..., None])
@@ -162,4 +162,9 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
 
 def _summed(X: Array, Y: Array) -> Array:
     """Σ_b XᵀY, (a, c)."""
-    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
+    return np.asarray(_rows(X).T @ _rows(Y))
+
+
+def _rows(X: Array) -> Array:
+    """(B·m, a) of (B, m, a); a model that is only judged has no columns."""
+    return X.reshape(X.shape[0] * X.shape[1], X.shape[2])

@@ -41,7 +41,7 @@ def together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Rank
         erring = {name: found for name, found in tried if found is not None and not found.helps}
         if not erring:
             return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
-        name = max(erring, key=lambda name: erring[name].share)
+        name = max(erring, key=lambda name: erring[name].worst_share)
         refused[name] = erring[name].told(name)
         candidates = [c for c in candidates if c.name != name]
         chain = _grown(evidence, candidates, [r for r in chain if r.name != name])
