@@ -169,7 +169,7 @@ def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     for i, (axis, colour, marker) in enumerate(zip("xyz", (ORANGE, GREEN, BLUE), "osv", strict=True)):
         axes.plot(moved[:, i], marker=marker, ms=4, lw=0.8, color=colour, label=axis)
     axes.axhline(0, color="k", lw=0.6)
-    names = [scan.name for scan in found.evidence.capture.scans]
+    names = [scan.name for scan in found.evidence.chain.capture.scans]
     if 0 < len(names) <= _NAMED:
         axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     axes.set_ylabel("displaced (µm)")
