@@ -319,7 +319,7 @@ def written(folder, session, kind="points"):
 
 
 @pytest.mark.parametrize("kind", ["points", "frames"])
-def test_every_command_works(kind, tmp_path, capsys, monkeypatch):
+def test_every_command_works(kind, tmp_path, capsys, monkeypatch, few_effects):
     monkeypatch.chdir(tmp_path)
     session, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
     folder, out = str(written(tmp_path / "s", session, kind)), str(tmp_path / "r")
@@ -355,7 +355,7 @@ def test_every_command_works(kind, tmp_path, capsys, monkeypatch):
     assert "Targets" in (tmp_path / "r" / "report.html").read_text()
 
 
-def test_calibrate_robot_writes_rows_and_urdf_of_the_same_arm(tmp_path, capsys):
+def test_calibrate_robot_writes_rows_and_urdf_of_the_same_arm(tmp_path, capsys, few_effects):
     session, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]))
     folder = written(tmp_path / "s", session)
     with pytest.raises(SystemExit) as stop:
