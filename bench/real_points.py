@@ -64,23 +64,24 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     return float(np.sqrt(np.mean(d**2))), float(d.mean())
 
 
-def suggested(session: Session, at_most: int) -> tuple[list[list[str]], str]:
-    """The way that the diagnosis takes on the even poses, and what it says of the rest."""
+def suggested(session: Session, at_most: int) -> tuple[list[list[str]], list[str]]:
+    """The way that the diagnosis takes on the even poses alone, and what it says on it."""
     first = run(only(session, np.arange(0, len(session.views), 2)))
-    found, _, last = suggest(state_of(first), at_most)
-    return [list(step.effects) for step in (found or first).ledger], last.sentence
+    found, lines, last = suggest(state_of(first), at_most)
+    return [list(step.effects) for step in (found or first).ledger], [*lines, last.sentence]
 
 
-def measure(name: str, at_most: int, models: list[list[str]] | None) -> dict[str, object]:
-    """Every model judged in all ways."""
+def measure(name: str, at_most: int, models: list[list[str]] | None, target: Path) -> None:
+    """Every model judged in all ways; each row is written as it comes."""
     session = load_session(SHARED / name)
-    steps, left = (models, "") if models else suggested(session, at_most)
+    steps, told = (models, []) if models else suggested(session, at_most)
+    print(name, steps, *told, sep="\n", flush=True)
     ways = splits(session)
-    rows = []
+    rows: list[dict[str, object]] = []
     for effects in steps:
         rows.append({"effects": effects, "judged": {n: judged(session, effects, way) for n, way in ways.items()}})
         print(name, rows[-1], flush=True)
-    return {"name": name, "left": left, "rows": rows}
+        target.write_text(json.dumps({"name": name, "told": told, "rows": rows}, indent=1))
 
 
 def table(found: dict[str, object]) -> str:
@@ -90,11 +91,14 @@ def table(found: dict[str, object]) -> str:
     lines += ["| model | " + " | ".join(ways) + " |", "|---|" + "---:|" * len(ways)]
     before: set[str] = set()
     for row in found["rows"]:
-        told = "base and tool" if not row["effects"] else "+ " + ", ".join(e for e in row["effects"] if e not in before)
-        before = set(row["effects"])
+        own = set(row["effects"])
+        changes = [
+            f"{sign} {', '.join(sorted(names))}" for sign, names in (("+", own - before), ("−", before - own)) if names
+        ]
+        told, before = "; ".join(changes) or "base and tool", own
         numbers = " | ".join(f"{rms:.3f} / {mean:.3f}" for rms, mean in row["judged"].values())
         lines.append(f"| {told} | {numbers} |")
-    return "\n".join([*lines, "", *([f"What is left: {found['left']}", ""] if found["left"] else [])])
+    return "\n".join([*lines, ""])
 
 
 def main() -> None:
@@ -107,8 +111,7 @@ def main() -> None:
     arguments.cache.mkdir(parents=True, exist_ok=True)
     models = [[e for e in m.split(",") if e] for m in arguments.models.split(";")] if arguments.models else None
     for name in arguments.names:
-        document = measure(name, arguments.at_most, models)
-        (arguments.cache / f"{name}.json").write_text(json.dumps(document, indent=1))
+        measure(name, arguments.at_most, models, arguments.cache / f"{name}.json")
     tables = [table(json.loads(file.read_text())) for file in sorted(arguments.cache.glob("*.json"))]
     begin, end = "<!-- tables: begin -->", "<!-- tables: end -->"
     head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)

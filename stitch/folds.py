@@ -1,9 +1,10 @@
-"""Groups of views to leave out: neighbours in time, and neighbours in pose.
+"""Groups of views to leave out: neighbours in time, neighbours in pose, ends of a joint's range.
 
 Leaving out random views would leave their neighbours in, which share their error.
 """
 
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -16,6 +17,22 @@ _GROUPS = 5
 _FEW = 10
 # Enough places for a spread among them, enough views in each to lose it without loss of rank.
 _PLACES, _VIEWS_PER_PLACE = 25, 6
+# A fifth of the views at either end, if these are enough to tell their mean error from another.
+_END, _VIEWS_PER_END = 0.2, 20
+
+
+@dataclass(frozen=True)
+class JointEnd:
+    """Views at one end of what a joint has driven: without them, a model has to extrapolate to them."""
+
+    joint: int  # counted from 0
+    upper: bool
+    views: Indices
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return f"the {'highest' if self.upper else 'lowest'} fifth of joint {self.joint + 1}"
 
 
 def grouped_folds(T_reference_mount: Array, lever: float) -> list[Indices]:
@@ -39,6 +56,23 @@ def places(T_reference_mount: Array, lever: float) -> list[Indices]:
     if count < _PLACES * _VIEWS_PER_PLACE:
         return [np.array([v]) for v in range(count)]
     return [f for f in _regions(T_reference_mount, lever, _PLACES) if len(f)]
+
+
+def joint_ends(joints: Array, seen: Indices) -> list[JointEnd]:
+    """Both ends of every joint's range; none of a joint that stands still, or where views are few.
+
+    Args:
+        joints: (V, n) rad.
+        seen: indices of the views that show something.
+    """
+    out = []
+    for joint, q in enumerate(joints[seen].T):
+        low, high = np.quantile(q, [_END, 1 - _END])
+        for upper, views in ((False, seen[q <= low]), (True, seen[q >= high])):
+            # Where many views share one angle, an end may be most of them.
+            if _VIEWS_PER_END <= len(views) <= len(seen) // 2:
+                out.append(JointEnd(joint, upper, views))
+    return out
 
 
 def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indices]:

@@ -65,7 +65,7 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
     session = load_session(path)
     with library_threads_off():
-        session, scans = thinned(session) if thin else (session, capture(session))
+        session, scans = thinned(session) if thin and session.has_clouds else (session, capture(session))
         chain = chain_of(session, scans)
         terms = tuple(terms_of(model, chain))
         chain = as_counted(chain, session, document)

@@ -24,7 +24,7 @@ from stitch.diagnosis.start import evidence_of_state
 from stitch.effects.supported import supported
 from stitch.effects.visible import independent
 from stitch.errors import InputError
-from stitch.folds import grouped_folds
+from stitch.folds import grouped_folds, joint_ends
 from stitch.pipeline import run
 from stitch.run_folder import to_json
 from stitch.state import load_state, state_of
@@ -183,6 +183,18 @@ def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
         [[0], [1], [2]], [0, 0, 1],
     )  # fmt: skip
     assert chosen[2] and chosen[:2].sum() == 1
+
+
+def test_ends_of_joints_are_fifths_of_what_was_driven():
+    rng = np.random.default_rng(0)
+    joints = np.column_stack([rng.permutation(200), np.zeros(200)])
+    seen = np.arange(0, 200, 2)
+    low, high = joint_ends(joints, seen)  # none of the joint that stands still
+    assert (low.joint, low.upper, high.upper) == (0, False, True)
+    assert np.isin(low.views, seen).all() and 19 <= len(low.views) <= 21
+    assert joints[low.views, 0].max() < np.quantile(joints[seen, 0], 0.21)
+    assert joints[high.views, 0].min() > np.quantile(joints[seen, 0], 0.79)
+    assert joint_ends(joints, seen[:60]) == []
 
 
 def test_folds_leave_out_neighbours():

@@ -275,5 +275,7 @@ def test_every_command_works(tmp_path, capsys, monkeypatch):
     second = json.loads(stitch("add", out, "joint_offset", "--no-recording", "--json"))
     assert "joint_offset" in second["effects"] and second["targets"]
     assert "Targets" in (tmp_path / "r" / "report.html").read_text()
-    judged = json.loads(stitch("run", str(tmp_path / "s"), "--hand-eye", out, "-o", str(tmp_path / "q"), "--no-recording", "--json"))
+    judged = json.loads(
+        stitch("run", str(tmp_path / "s"), "--hand-eye", out, "-o", str(tmp_path / "q"), "--no-recording", "--json")
+    )
     assert len(judged["targets"]) == len(first["targets"])

@@ -73,6 +73,17 @@ def candidate_of(evidence: ViewEvidence, effect: Effect) -> Candidate | None:
     return Candidate(effect, parameters, tuple(forms), columns[0], where[0]) if forms else None
 
 
+def as_fitted(evidence: ViewEvidence, term: Term) -> Candidate:
+    """An effect with those of its parameters that a fit left in use, as the one form it may have."""
+    parameters = evidence.chain.parameters(term.effect)
+    held = np.array([bool(p.grid) for p in parameters])
+    zero, keep = replace(term, values=np.where(held, term.values, 0.0)), ~held & (term.values != 0)
+    twists = evidence.columns([zero])[0][0]
+    sizes = np.array([p.typical for p in parameters])[keep]
+    form = Form(zero, keep, twists[:, keep], evidence.in_channel(twists)[:, keep], sizes)
+    return Candidate(term.effect, parameters, (form,), twists, None)
+
+
 def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
     """The effect at zero, once for every combination of its gridded parameters."""
     grids = [p.grid or (0.0,) for p in parameters]

@@ -9,7 +9,8 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.heldout import Left, left_by
 from stitch.diagnosis.next_view import Proposal, propose
-from stitch.diagnosis.select import Ranked, Selection, implausible, select
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.select import Selection, implausible, select
 from stitch.diagnosis.start import evidence_of_state
 from stitch.diagnosis.unknown import Dependence, dependences
 from stitch.diagnosis.words import sentence_of
@@ -92,19 +93,19 @@ def checked(selection: Selection, suspects: list[Suspect], implausible: bool) ->
     beyond chance.
     """
     if selection.verdict != "missing_effect":
-        return selection, ()
-    verdicts, notes = list[str](), list[str]()
+        return selection, selection.notes
+    verdicts, notes = list[str](), list(selection.notes)
     for named in (selection.named[0], selection.second):
         if named is None:
             continue
         refusal = _refused(named, next((s.left for s in suspects if s.name == named.name), None), implausible)
         if refusal is None:
             if named is selection.named[0]:
-                return selection, ()
+                return selection, selection.notes
             return replace(selection, named=(named,), second=None), tuple(notes)
         verdicts.append(refusal[0])
         notes.append(refusal[1])
-    return Selection(verdicts[0], (), selection.ranked, selection.empirical), (notes[0],)
+    return Selection(verdicts[0], (), selection.ranked, selection.empirical), tuple(notes[: len(selection.notes) + 1])
 
 
 def _refused(named: Ranked, left: Left | None, implausible: bool) -> tuple[str, str] | None:
@@ -114,7 +115,7 @@ def _refused(named: Ranked, left: Left | None, implausible: bool) -> tuple[str, 
     if left.steadiness < _STEADY:
         note = f"{named.name} rests on a single view: without it {max(left.steadiness, 0):.0%} of it remain"
         return "unknown_effect" if implausible or named.adjusted < _BEYOND_CHANCE else "adequate", note
-    if left.poses > 1 - left.poses_sigma:
+    if not left.helps:
         share = f"{left.poses:.2f} ± {left.poses_sigma:.2f}"
         note = f"{named.name} would not help on views left out (mean square pose error {share} of now)"
         return "unknown_effect" if implausible else "adequate", note

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram
+from stitch.folds import JointEnd
 from stitch.frames import Array, Indices
 from stitch.variance import Evidence, VarianceFit
 
@@ -16,7 +17,7 @@ from stitch.variance import Evidence, VarianceFit
 class Trial(Protocol):
     """A model with some columns, in the linear approximation."""
 
-    def solve(self, left_out: Array | None) -> Array:
+    def solve(self, left_out: Indices | None) -> Array:
         """Coefficients by least squares, without some views."""
         ...
 
@@ -24,7 +25,7 @@ class Trial(Protocol):
         """(units,) sums of squares of what is left, in the terms of residual_rms."""
         ...
 
-    def scatter(self, left_out: Array, coefficients: Array) -> float:
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Sum of squares by which left-out views lie off, in units of their scatter."""
         ...
 
@@ -93,12 +94,16 @@ class ViewEvidence(Protocol):
         """A model with the columns of a response; `points` belong to its last ones."""
         ...
 
-    def touched(self, views: Array) -> Array:
+    def touched(self, views: Indices) -> Array:
         """(units,) bool: which squares of a trial some views have a part in."""
         ...
 
-    def folds(self) -> list[Array]:
+    def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
+        ...
+
+    def ends(self) -> list[JointEnd]:
+        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
         ...
 
     def at_part(self, numbers: Array) -> Array:

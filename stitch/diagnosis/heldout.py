@@ -20,6 +20,11 @@ class Left:
     poses_sigma: float  # standard error of `poses` over folds
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
 
+    @property
+    def helps(self) -> bool:
+        """True if views left out are predicted better, by more than a standard error."""
+        return self.poses <= 1 - self.poses_sigma
+
 
 def null_left(evidence: ViewEvidence) -> float:
     """Weighted sum of squares of the present model."""
@@ -45,12 +50,17 @@ def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> 
         scatter = np.column_stack([scatter, off])
     return Left(
         float(trial.squares(whole).sum() / null_left(evidence)), float(np.average(shares, weights=weights)),
-        *_share(*scatter), _steadiness(evidence, trial, X, whole),
+        *share_of(*scatter), _steadiness(evidence, trial, X, whole),
     )  # fmt: skip
 
 
-def _share(with_it: Array, without: Array) -> tuple[float, float]:
-    """How far left-out views lie from one prediction over the other, squared, and its standard error over folds."""
+def share_of(with_it: Array, without: Array) -> tuple[float, float]:
+    """How far left-out views lie from one prediction over the other, squared, and its standard error.
+
+    Args:
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under one prediction.
+        without: (G,) under the other.
+    """
     share = float(with_it.sum() / max(without.sum(), 1e-300))
     spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
     return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))

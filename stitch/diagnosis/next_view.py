@@ -12,8 +12,9 @@ import numpy as np
 from stitch.diagnosis.aliases import SIMILAR, alias_matrix
 from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.imagined import IMAGINE
+from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.select import Ranked, Selection
+from stitch.diagnosis.select import Selection
 from stitch.effects.chain import Chain
 from stitch.frames import Array
 

@@ -13,8 +13,8 @@ from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
 from stitch.effects.scanner_field import field_scatter
 from stitch.effects.visible import independent, project_out
-from stitch.folds import grouped_folds
-from stitch.frames import Array
+from stitch.folds import JointEnd, grouped_folds
+from stitch.frames import Array, Indices
 from stitch.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
 from stitch.variance import Evidence, VarianceFit, fit_variances
@@ -103,9 +103,13 @@ class PoseEvidence:
         """A model with the columns of twists (6V, k)."""
         return PoseTrial(self, response, points)
 
-    def touched(self, views: Array) -> Array:
+    def touched(self, views: Indices) -> Array:
         """(pairs,) bool: pairs with one of the views."""
         return np.asarray(np.isin(self.freed.overlaps.gram.pairs, views).any(axis=1))
+
+    def ends(self) -> list[JointEnd]:
+        """None: what overlaps leave belongs to pairs of views."""
+        return []
 
     def at_part(self, numbers: Array) -> Array:
         """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
@@ -123,7 +127,7 @@ class PoseEvidence:
         x = np.linalg.lstsq(white[:, :-1] / scale, white[:, -1], rcond=1e-10)[0] / scale
         return self.at_part(self.channel.z - columns @ x)
 
-    def folds(self) -> list[Array]:
+    def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
         return [np.asarray(f) for f in grouped_folds(self.capture.T_reference_mount, self.freed.overlaps.gram.lever)]
 

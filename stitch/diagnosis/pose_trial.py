@@ -23,7 +23,7 @@ class PoseTrial:
     X: Array
     points: PointGram | None
 
-    def solve(self, left_out: Array | None) -> Array:
+    def solve(self, left_out: Indices | None) -> Array:
         """Coefficients (k,) by generalised least squares without some views."""
         e = self.evidence
         white = e.white_left @ self.X
@@ -48,7 +48,7 @@ class PoseTrial:
             + np.einsum("k,pkl,l->p", theta, points.square, theta)
         )  # fmt: skip
 
-    def scatter(self, left_out: Array, coefficients: Array) -> float:
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """In the directions of the whitened channel that the left-out views alone move."""
         e = self.evidence
         own = _orthonormal(e.white_left[:, _columns_of(left_out)])
@@ -67,5 +67,5 @@ def _orthonormal(columns: Array) -> Array:
     return np.asarray(U[:, s > 1e-9 * s[0]])
 
 
-def _columns_of(views: Array) -> Array:
+def _columns_of(views: Indices) -> Array:
     return np.asarray((6 * np.asarray(views)[:, None] + np.arange(6)).ravel())

@@ -16,7 +16,7 @@ from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.detectable import smallest_sizes
 from stitch.diagnosis.evidence import ViewEvidence
 from stitch.frames import Array
-from stitch.variance import VarianceFit, fit_variances
+from stitch.variance import MANY_NUMBERS, VarianceFit, at_variances, fit_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 _SEEN = 0.5
@@ -24,8 +24,9 @@ _SEEN = 0.5
 _FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
 _HOPELESS = -4.0
-# With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do.
-_REFITTED, _FEWEST = 20_000, 2
+# With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do, and a
+# wide prior in place of that of plausible sizes moves the variances not at all.
+_REFITTED, _AMONG_MANY = 20_000, 2
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,9 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     white = evidence.whiten(candidate.twists)[:, full.keep]
     seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
     quick = np.array([_null_gain(evidence, form) for form in candidate.forms])
-    worth = np.argsort(-quick, kind="stable")[: max(_REFITTED // evidence.evidence.size, _FEWEST)]
+    size = evidence.evidence.size
+    count = _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
+    worth = np.argsort(-quick, kind="stable")[:count]
     tried = [
         _try(evidence, form) if i in worth and quick[i] >= _HOPELESS else (float(quick[i]), 1.0, evidence.null)
         for i, form in enumerate(candidate.forms)
@@ -85,7 +88,9 @@ def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]
     G = evidence.in_blocks(form.columns)
     integrated = fit_variances(e, G, form.sizes, start=evidence.null.variances)
     gain = 0.5 * (evidence.null.deviance - integrated.deviance)
-    free = fit_variances(e, G, _FREE * form.sizes, start=integrated.variances)
+    many = e.size > MANY_NUMBERS
+    wide = _FREE * form.sizes
+    free = at_variances(e, integrated.variances, G, wide) if many else fit_variances(e, G, wide, integrated.variances)
     a = e.A.shape[2]
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
     rank, square = _wald(theta, covariance, form.sizes)

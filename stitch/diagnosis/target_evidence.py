@@ -10,8 +10,8 @@ from stitch.diagnosis.target_trial import TargetTrial
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import PointGram
 from stitch.effects.visible import independent
-from stitch.folds import grouped_folds
-from stitch.frames import Array
+from stitch.folds import JointEnd, grouped_folds, joint_ends
+from stitch.frames import Array, Indices
 from stitch.labelled.landmarks import Drawing, Landmarks, settled
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
 from stitch.labelled.solve import whitener
@@ -101,13 +101,17 @@ class TargetEvidence:
         """The model as it is, asked for every candidate."""
         return TargetTrial(self.rows, self._covariance, self.in_blocks(self.model))
 
-    def touched(self, views: Array) -> Array:
+    def touched(self, views: Indices) -> Array:
         """(V,) bool."""
         return np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
 
-    def folds(self) -> list[Array]:
+    def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
-        return [np.asarray(f) for f in grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)]
+        return grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)
+
+    def ends(self) -> list[JointEnd]:
+        """Both ends of every joint's range, of the views that show a target."""
+        return joint_ends(self.chain.views.joints, np.flatnonzero(self.rows.used.any(axis=1)))
 
     def at_part(self, numbers: Array) -> Array:
         """(V, 3) mean displacement of the targets that a view shows; zero for one that shows none."""

@@ -26,7 +26,7 @@ class TargetTrial:
         k = self.X.shape[2]
         return Blocks(-self.rows.left, self.X, self.covariance, np.zeros(k), np.zeros(k))
 
-    def solve(self, left_out: Array | None) -> Array:
+    def solve(self, left_out: Indices | None) -> Array:
         """Coefficients (k,) without some views."""
         return self.blocks.solve(left_out)
 
@@ -34,7 +34,7 @@ class TargetTrial:
         """(V,) squares of the 3D distances of a view's targets."""
         return np.asarray(np.nansum(self.rows.distances(self.rows.left + self.X @ coefficients) ** 2, axis=1))
 
-    def scatter(self, left_out: Array, coefficients: Array) -> float:
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Of the distances at the left-out views' targets, in units of the sensor's noise: each is seen as it is."""
         own = self.rows.used[left_out, : self.rows.positions]
         rest = (self.rows.left + self.X @ coefficients)[left_out, : self.rows.positions]

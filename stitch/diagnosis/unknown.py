@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.evidence import ViewEvidence
-from stitch.diagnosis.select import Ranked
+from stitch.diagnosis.ranking import Ranked
 from stitch.effects.views import Views
 from stitch.frames import Array
 

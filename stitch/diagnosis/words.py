@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stitch.diagnosis.select import IMPLAUSIBLE, Ranked
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.select import IMPLAUSIBLE
 from stitch.rounding import rounded
 
 if TYPE_CHECKING:
