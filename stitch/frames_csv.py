@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
+from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
 
@@ -52,7 +53,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
             raise InputError(f"{file} line {line}: {len(cells)} cells, the header has {len(header)}")
         row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
         _check_name(file, line, row["view"], names, allowed)
-        table[i] = [_number(file, line, name, row[name]) for name in _POSE]
+        table[i] = [number(file, line, name, row[name]) for name in _POSE]
         norm = float(np.linalg.norm(table[i, 3:]))
         if abs(norm - 1) > _UNIT_TOLERANCE:
             raise InputError(
@@ -60,7 +61,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
                 "write a unit quaternion, w last"
             )
         for name, values in spread.items():
-            values[i] = _number(file, line, name, row[name])
+            values[i] = number(file, line, name, row[name])
             if values[i] <= 0:
                 raise InputError(f"{file} line {line}: {name} is {values[i]:g}; write a positive number")
     T = frames.from_quaternion(table[:, :3], table[:, 3:])
@@ -74,13 +75,3 @@ def _check_name(file: Path, line: int, name: str, names: dict[str, int], allowed
     if name not in allowed:
         raise InputError(f"{file} line {line}: view {name!r} is not in views.csv; add it there or remove the row")
     names[name] = line
-
-
-def _number(file: Path, line: int, column: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise InputError(f"{file} line {line}: {column} is {cell!r}; write a finite number")
-    return value

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
 
@@ -121,13 +122,7 @@ def _numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
         if column == "sigma" and not cell:
             out.append(float("nan"))
             continue
-        try:
-            value = float(cell)
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            raise InputError(f"{file} line {line}: {column} is {cell!r}; write a finite number")
-        out.append(value)
+        out.append(number(file, line, column, cell))
     if out[3] <= 0:
         raise InputError(f"{file} line {line}: sigma is {out[3]:g}; write a positive number or leave it empty")
     return out

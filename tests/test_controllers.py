@@ -219,7 +219,7 @@ def test_tracker_angles_and_reflectors(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.ls", FANUC.replace("1363.305", "********"), r"a.ls line 7: P\[1\] Y is '\*+', not a number"),
+        ("a.ls", FANUC.replace("1363.305", "********"), r"a.ls line 7: P\[1\] Y is '\*+'; teach the point"),
         ("a.ls", FANUC.split("/POS")[0], r"a.ls: no /POS section"),
         ("a.ls", FANUC.replace("UT : 2,\t\tC", "UT : 3,\t\tC").replace("J1=    10.000 deg", "X=1 mm,Y=2 mm,Z=3 mm,W=0 deg,P=0 deg,R=0 deg"),
          r"line 13: P2 is taught in UF 1, UT 2, above in UF 1, UT 3"),

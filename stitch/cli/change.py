@@ -116,7 +116,7 @@ def show_ledger(result: Run) -> None:
     console.print(table)
     for term, sigmas in zip(result.terms, result.sigmas, strict=True):
         for p, value, sigma in zip(result.chain.parameters(term.effect), term.values, sigmas, strict=True):
-            told = f"± {sigma:.1g}" if np.isfinite(sigma) else "(not seen by these views)"
+            told = f"± {sigma:.1g}" if np.isfinite(sigma) else "(explains most)"
             if np.isfinite(sigma) or p.grid:
                 console.print(
                     f"  {term.effect.name}.{p.name} = {rounded(value, sigma)} {told} {p.unit}", highlight=False

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, number, quaternion_w_first
+from stitch.controllers.taught import Taught, line_of, quaternion_w_first
+from stitch.csv_number import number
 from stitch.errors import InputError
 
 CONVENTION = "quaternion q1, q2, q3, q4 with q1 = w; mm"

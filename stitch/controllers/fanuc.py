@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, fixed_xyz, line_of, number
+from stitch.controllers.taught import Taught, fixed_xyz, line_of
+from stitch.csv_number import number
 from stitch.errors import InputError
 
 CONVENTION = "W, P, R in degrees about fixed x, y, z: Rz(R)·Ry(P)·Rx(W); mm"
@@ -40,7 +41,10 @@ def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
     group = _GROUP.search(body)
     if group is None:
         raise InputError(f"{file} line {line}: P[{index}] has no GP1; the arm's own group is read")
-    fields = {key: number(file, line, f"P[{index}] {key}", value) for key, value in _FIELD.findall(group[1])}
+    fields = {
+        key: number(file, line, f"P[{index}] {key}", value, "teach the point or remove it")
+        for key, value in _FIELD.findall(group[1])
+    }
     taught_in = _FRAME.search(group[1])
     frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
     if all(key in fields for key in "XYZWPR"):

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, number, zyx
+from stitch.controllers.taught import Taught, line_of, zyx
+from stitch.csv_number import number
 from stitch.errors import InputError
 
 CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"

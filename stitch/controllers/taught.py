@@ -1,13 +1,11 @@
 """A taught point, and how each controller writes an orientation. Lengths in mm, angles in rad."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.errors import InputError
 from stitch.frames import Array
 
 
@@ -49,21 +47,6 @@ def rotation_vector(numbers: Array) -> Array:
     """UR x, y, z, rx, ry, rz (m, rad): turn by the vector's length about its direction."""
     numbers = np.asarray(numbers, float)
     return frames.make(Rotation.from_rotvec(numbers[3:6]).as_matrix(), numbers[:3] * 1000)
-
-
-def number(file: Path, line: int, what: str, cell: str) -> float:
-    """A finite number.
-
-    Raises:
-        InputError: names file, line and the mend.
-    """
-    try:
-        value = float(cell)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise InputError(f"{file} line {line}: {what} is {cell.strip()!r}, not a number; teach the point or remove it")
-    return value
 
 
 def line_of(text: str, position: int) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.controllers.taught import number
+from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, number, rotation_vector
+from stitch.controllers.taught import Taught, line_of, rotation_vector
+from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
 
