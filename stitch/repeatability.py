@@ -13,8 +13,11 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.free_poses import visible_directions
-from stitch.solve import Gram
+from stitch.solve import Gram, column_space
 from stitch.variance import Evidence, fit_variances
+
+# Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
+_TOLD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def evidence_of(channel: PoseChannel, further: Array | None = None) -> Evidence:
     """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
     mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
     components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
-    return Evidence(channel.z[None], _column_space(mean)[None], components)
+    return Evidence(channel.z[None], column_space(mean, _TOLD)[None], components)
 
 
 def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:
@@ -87,10 +90,3 @@ def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
         + scatter.translation**2 * channel.translation
         + scatter.noise_factor * channel.noise
     )
-
-
-def _column_space(design: Array) -> Array:
-    """Orthonormal basis of the columns, so that unobservable combinations drop out."""
-    scaled = design / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(U[:, s > 1e-6 * s[0]])

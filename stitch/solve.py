@@ -115,6 +115,13 @@ def pair_squares(g: Gram, twists: Array) -> Array:
     return np.asarray(g.square + 2 * linear + quadratic)
 
 
+def column_space(columns: Array, relative: float = 1e-9) -> Array:
+    """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(U[:, s > relative * s[0]])
+
+
 def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
     """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))

@@ -12,11 +12,12 @@ from stitch.diagnosis.pose_trial import PoseTrial
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
 from stitch.effects.scanner_field import field_scatter
-from stitch.effects.visible import independent, project_out
+from stitch.effects.visible import independent
 from stitch.folds import JointEnd, grouped_folds
 from stitch.frames import Array, Indices
 from stitch.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
+from stitch.solve import column_space
 from stitch.variance import Evidence, VarianceFit, fit_variances
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
@@ -67,6 +68,11 @@ class PoseEvidence:
         return np.asarray(np.linalg.solve(self.half, self.channel.left @ self.model))
 
     @cached_property
+    def _explained(self) -> Array:
+        """(n, r) orthonormal basis of `white_model`."""
+        return column_space(self.white_model)
+
+    @cached_property
     def white_z(self) -> Array:
         """(n,) what was seen, in the same units, without what hand-eye and model explain."""
         return self.whiten_channel(self.channel.z[:, None])[:, 0]
@@ -77,7 +83,8 @@ class PoseEvidence:
 
     def whiten_channel(self, columns: Array) -> Array:
         """(n, P) columns of the channel in those units, what hand-eye and model explain projected out."""
-        return project_out(self.white_model, self.whiten_raw(columns))
+        white = self.whiten_raw(columns)
+        return np.asarray(white - self._explained @ (self._explained.T @ white))
 
     def whiten(self, twists: Array) -> Array:
         """The same from twists (6V, P)."""

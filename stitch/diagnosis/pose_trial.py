@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.effects.columns import PointGram
 from stitch.frames import Array, Indices
-from stitch.solve import pair_squares
+from stitch.solve import column_space, pair_squares
 
 if TYPE_CHECKING:
     from stitch.diagnosis.pose_evidence import PoseEvidence
@@ -51,7 +51,7 @@ class PoseTrial:
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """In the directions of the whitened channel that the left-out views alone move."""
         e = self.evidence
-        own = _orthonormal(e.white_left[:, _columns_of(left_out)])
+        own = column_space(e.white_left[:, _columns_of(left_out)])
         return float(np.sum((own.T @ (e.raw_white_z - e.white_left @ (self.X @ coefficients))) ** 2))
 
     def carriers(self, coefficients: Array) -> Indices:
@@ -60,11 +60,6 @@ class PoseTrial:
 
     def _moved(self, X: Array, coefficients: Array) -> Array:
         return np.asarray((X @ coefficients).reshape(-1, 6) - self.evidence.freed.twists)
-
-
-def _orthonormal(columns: Array) -> Array:
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, s > 1e-9 * s[0]])
 
 
 def _columns_of(views: Indices) -> Array:

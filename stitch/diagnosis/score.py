@@ -56,9 +56,9 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
         tests: number of candidates, for the smallest detectable size.
     """
     full = candidate.forms[0]
-    white = evidence.whiten(candidate.twists)[:, full.keep]
-    seen = bool((np.linalg.norm(white, axis=0) * full.sizes > _SEEN).any()) if white.size else False
-    quick = np.array([_null_gain(evidence, form) for form in candidate.forms])
+    whites = [evidence.whiten_channel(form.columns) for form in candidate.forms]
+    seen = bool((np.linalg.norm(whites[0], axis=0) * full.sizes > _SEEN).any()) if whites[0].size else False
+    quick = np.array([_null_gain(evidence, form, w) for form, w in zip(candidate.forms, whites, strict=True)])
     size = evidence.evidence.size
     count = _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
     worth = np.argsort(-quick, kind="stable")[:count]
@@ -69,7 +69,7 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     singles = len(candidate.forms)
     best = max(range(singles), key=lambda i: tried[i][0])
     gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
-    detectable = _detectable(evidence, candidate, weights, tests)
+    detectable = _detectable(evidence, candidate, whites, weights, tests)
     gain = float(logsumexp(gains + np.log(weights)))
     p_values = np.array([p for _, p, _ in tried])
     p = float(min(1.0, np.min(p_values / weights)))
@@ -78,7 +78,9 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
 
 def promising(evidence: ViewEvidence, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
     """The candidates that gain most at the null's variances, with all their parameters or those of one joint."""
-    gains = [max(_null_gain(evidence, form) for form in c.forms) for c in candidates]
+    gains = [
+        max(_null_gain(evidence, form, evidence.whiten_channel(form.columns)) for form in c.forms) for c in candidates
+    ]
     return [candidates[k] for k in np.argsort(-np.array(gains), kind="stable")[:count]]
 
 
@@ -98,9 +100,9 @@ def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]
     return gain, float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest)), free
 
 
-def _null_gain(evidence: ViewEvidence, form: Form) -> float:
+def _null_gain(evidence: ViewEvidence, form: Form, white: Array) -> float:
     """Log evidence gained at the null's variances: cheap, and an upper hand for what cannot help."""
-    white = evidence.whiten_channel(form.columns) * form.sizes
+    white = white * form.sizes
     information = np.eye(white.shape[1]) + white.T @ white
     b = white.T @ evidence.white_z
     return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
@@ -121,15 +123,17 @@ def form_weights(candidate: Candidate) -> Array:
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
 
 
-def _detectable(evidence: ViewEvidence, candidate: Candidate, weights: Array, tests: int) -> dict[str, float]:
+def _detectable(
+    evidence: ViewEvidence, candidate: Candidate, whites: Sequence[Array], weights: Array, tests: int
+) -> dict[str, float]:
     """Smallest detectable size of every free parameter."""
     e = evidence.evidence
     told = [
         (
             tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep),
-            evidence.whiten_channel(form.columns), form.sizes, float(weight),
+            white, form.sizes, float(weight),
         )
-        for form, weight in zip(candidate.forms, weights, strict=True)
+        for form, white, weight in zip(candidate.forms, whites, weights, strict=True)
     ]  # fmt: skip
     return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
 

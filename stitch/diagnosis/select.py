@@ -50,7 +50,7 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
         second = found.effects[1] if len(found.effects) > 1 else None
     elif stray is not None and stray.log_posterior > best.log_posterior + ODDS:
         # Two known effects at once may look like none of them: try the best with a second one.
-        best, second = _pair(evidence, candidates, best)
+        second = _second(evidence, candidates, best)
         both = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(PHYSICAL / len(ranked)))
         if stray.log_posterior > both + ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
@@ -67,11 +67,8 @@ def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
 
 
-def _pair(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked | None]:
-    """The best effect and the one that explains most beside it; of the two the stronger comes first."""
+def _second(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
+    """The effect that explains most beside the best one, if it is certain."""
     others = [c for c in candidates if c.name != best.name and c.effect.tier != "empirical"]
     ranked, _ = rank(score_all(evidence.beside(best.score.form.columns), others))
-    second = next((r for r in ranked if certain(r)), None)
-    if second is None:
-        return best, None
-    return best, second
+    return next((r for r in ranked if certain(r)), None)

@@ -15,6 +15,7 @@ from stitch.frames import Array, Indices
 from stitch.labelled.landmarks import Drawing, Landmarks, settled
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
 from stitch.labelled.solve import whitener
+from stitch.solve import column_space
 from stitch.stages.refine import UNSEEN
 from stitch.variance import Evidence, VarianceFit, fit_variances
 
@@ -58,9 +59,7 @@ class TargetEvidence:
     @cached_property
     def _explained(self) -> Array:
         """(n, r) orthonormal basis of `white_model`."""
-        scaled = self.white_model / np.maximum(np.linalg.norm(self.white_model, axis=0), 1e-300)
-        U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-        return np.asarray(U[:, s > 1e-9 * s[0]])
+        return column_space(self.white_model)
 
     @cached_property
     def white_z(self) -> Array:

@@ -8,6 +8,7 @@ from stitch.capture import Capture
 from stitch.frames import Array
 from stitch.free_poses import FreePoses
 from stitch.repeatability import covariance_of, estimate, pose_channel
+from stitch.solve import column_space
 
 
 def whitened(
@@ -57,7 +58,5 @@ def project_out(base: Array, columns: Array) -> Array:
     """What is left of `columns` beside the column space of `base`."""
     if not base.shape[1]:
         return columns
-    scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
-    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    U = U[:, s > 1e-9 * s[0]]
+    U = column_space(base)
     return np.asarray(columns - U @ (U.T @ columns))
