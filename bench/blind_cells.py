@@ -97,7 +97,8 @@ def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> flo
         off = np.abs(form.term.values - values)[~fitted].sum()
         if not values[fitted & ~form.keep].any():
             white = evidence.whiten_channel(form.columns)
-            least = least_noncentrality(white * form.sizes, float(weight), tests, e.size - e.A.shape[2])
+            freedom = evidence.freedom.of(evidence.in_blocks(white))
+            least = least_noncentrality(white * form.sizes, float(weight), tests, e.size - e.A.shape[2], freedom)
             found.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
     nearest = min(off for off, _ in found)
     amplitude = float(min(size for off, size in found if off == nearest))

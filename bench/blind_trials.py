@@ -16,6 +16,7 @@ from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
 from stitch.diagnosis.diagnose import Diagnosis, diagnose
+from stitch.diagnosis.heldout import Left
 from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.start import evidence_of_state
 from stitch.diagnosis.suggest import suggest
@@ -94,8 +95,14 @@ def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measu
         "follows": [d.covariate for d in found.depends_on[:3] if d.p_value < 0.05], "notes": list(found.notes),
         "scatter": [found.rotation * 1e6, found.translation * 1e3],
         "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.suspects[:3]],
+        "left": [_left(s.left) for s in found.suspects[:3]],
     }  # fmt: skip
     return measured, first, found, row
+
+
+def _left(left: Left | None) -> list[float]:
+    """Share of the mean square pose error of left-out views, its sigma, steadiness."""
+    return [] if left is None else [round(x, 3) for x in (left.poses, left.poses_sigma, left.steadiness)]
 
 
 def _effect(job: Row) -> Row:

@@ -19,7 +19,7 @@ from stitch.frames import Array
 _OFF_BOUNDARY = np.array([1.0, 1.0, 0.0])
 # The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
-_USUAL_FACTOR, _FACTOR_SPREAD = float(np.log(2.0)), 1.5
+_USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 # The search ends where the deviance's slope is below the first; with thousands of numbers below the second: the
 # curvature grows with their count, and 0.1 then costs the deviance less than 1e-5.
@@ -155,8 +155,8 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
-    off = (log_variances[2] - _USUAL_FACTOR) / _FACTOR_SPREAD
-    slope[2] += 2 * off / _FACTOR_SPREAD
+    off = (log_variances[2] - _USUAL_FACTOR) / FACTOR_SPREAD
+    slope[2] += 2 * off / FACTOR_SPREAD
     return logdet + square + off**2 - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
 
 

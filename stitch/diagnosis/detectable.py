@@ -1,8 +1,9 @@
 """The smallest size of an effect that these views would show: both tests in use pass with 80 % probability.
 
-An effect of true parameters θ shifts the squared length of its whitened columns' projection by θᵀIθ: the test
-statistic is non-central χ² of as many degrees of freedom as the form has parameters. For one parameter and the
-F test alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
+An effect of true parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The
+scatter is known to ν degrees of freedom only, and takes its share of what the effect does: the test statistic q
+is non-central F, and the log evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the
+p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
 """
 
 from collections.abc import Sequence
@@ -10,42 +11,44 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import f as f_distribution
-from scipy.stats import ncx2
+from scipy.stats import ncf
 
 from stitch.diagnosis.thresholds import ALPHA_NAME, GAIN, POWER
 from stitch.frames import Array
 
 
-def least_noncentrality(white: Array, weight: float, tests: int, rest: int) -> float:
+def least_noncentrality(white: Array, weight: float, tests: int, rest: int, freedom: float) -> float:
     """θᵀIθ that a form needs to be detected.
 
     Args:
         white: (n, p) whitened columns at their plausible sizes.
         weight: share of the candidate's prior that the form has.
         tests: number of candidates.
-        rest: degrees of freedom that are left for the scatter.
+        rest: numbers that are left beside the model.
+        freedom: degrees of freedom of the scatter along the columns.
     """
     information = np.linalg.eigvalsh(white.T @ white)
     rank = int((information > 1e-2).sum())
     if rank == 0:
         return float("inf")
     by_p = rank * float(f_distribution.isf(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1)))
-    by_evidence = 2 * (GAIN - np.log(weight)) + float(np.log1p(information.clip(0)).sum())
-    needed = max(by_p, by_evidence)
-    return float(brentq(lambda size: ncx2.sf(needed, rank, size) - POWER, 1e-9, 4 * needed + 50))
+    evidence = GAIN - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
+    needed = max(by_p, freedom * float(np.expm1(2 * evidence / freedom)))
+    return float(brentq(lambda size: ncf.sf(needed / rank, rank, freedom, size) - POWER, 1e-9, 9 * needed + 99))
 
 
 def smallest_sizes(
-    forms: Sequence[tuple[tuple[str, ...], Array, Array, float]], tests: int, rest: int
+    forms: Sequence[tuple[tuple[str, ...], Array, Array, float, float]], tests: int, rest: int
 ) -> dict[str, float]:
     """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best.
 
     Args:
-        forms: names of the parameters (p,), their whitened columns (n, p) per unit, plausible sizes (p,), weight.
+        forms: names of the parameters (p,), their whitened columns (n, p) per unit, plausible sizes (p,), weight,
+            degrees of freedom of the scatter along them.
     """
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
-    for names, white, sizes, weight in forms:
-        least = least_noncentrality(white * sizes, weight, tests, rest)
+    for names, white, sizes, weight, freedom in forms:
+        least = least_noncentrality(white * sizes, weight, tests, rest, freedom)
         for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
             found.setdefault(name, {}).setdefault(names, []).append(size)

@@ -7,6 +7,7 @@ or rows of labelled points); `columns` (n, P) is the same in the channel, the nu
 from collections.abc import Sequence
 from typing import Protocol
 
+from stitch.diagnosis.freedom import Freedom
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram
 from stitch.folds import JointEnd
@@ -62,6 +63,11 @@ class ViewEvidence(Protocol):
         """(n,) what was seen, in the same units, without what the model explains."""
         ...
 
+    @property
+    def freedom(self) -> Freedom:
+        """How well the null's scatter is known."""
+        ...
+
     def columns(self, candidates: Sequence[Term]) -> tuple[list[Array], PointGram | None, list[slice | None]]:
         """Responses (·, P) of candidates, the sums of point effects, and where each candidate's are in them."""
         ...
@@ -90,8 +96,8 @@ class ViewEvidence(Protocol):
         """The evidence with further free columns (n, p) in its model."""
         ...
 
-    def trial(self, response: Array, points: PointGram | None = None) -> Trial:
-        """A model with the columns of a response; `points` belong to its last ones."""
+    def trial(self, response: Array, points: PointGram | None = None, precision: Array | None = None) -> Trial:
+        """A model with the columns of a response (·, k); `points` belong to its last ones; (k,) prior around zero."""
         ...
 
     def touched(self, views: Indices) -> Array:

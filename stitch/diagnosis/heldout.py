@@ -33,16 +33,24 @@ def null_left(evidence: ViewEvidence) -> float:
 
 
 def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> Left:
-    """Add the best form of a candidate to the model, in the linear approximation."""
+    """Add the best form of a candidate to the model, in the linear approximation.
+
+    A fold that carries most of an effect leaves little to predict it from. So without it the effect is believed to be
+    as large as it was found with all views, of either sign, and no larger: what little is left to see does not count
+    for more than that.
+    """
     X = np.hstack([evidence.model, scored.form.twists])
+    size = np.sqrt(scored.values**2 + scored.sigmas**2)
+    precision = np.append(np.zeros(evidence.model.shape[1]), 1 / np.maximum(size, 1e-300) ** 2)
     own = None if points is None or scored.candidate.points is None else _own(points, scored)
     trial, present = evidence.trial(X, own), evidence.trial(evidence.model)
+    believed = evidence.trial(X, own, precision)
     whole = trial.solve(None)
     shares, weights = [], []
     scatter = np.zeros((2, 0))
     for fold in evidence.folds():
         touched = evidence.touched(fold)
-        without = [t.solve(fold) for t in (trial, present)]
+        without = [t.solve(fold) for t in (believed, present)]
         squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
         shares.append(squares[0] / max(squares[1], 1e-300))
         weights.append(squares[1])

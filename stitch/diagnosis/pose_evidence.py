@@ -8,6 +8,7 @@ import numpy as np
 
 from stitch.capture import Capture
 from stitch.capture_evidence import jacobian
+from stitch.diagnosis.freedom import Freedom, freedom_of
 from stitch.diagnosis.pose_trial import PoseTrial
 from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram, all_columns
@@ -42,6 +43,11 @@ class PoseEvidence:
     def covariance(self) -> Array:
         """(n, n) of the channel under the null."""
         return np.asarray(self.evidence.covariance(self.null.variances)[0])
+
+    @cached_property
+    def freedom(self) -> Freedom:
+        """How well the null's scatter is known."""
+        return freedom_of(self.evidence, self.null)
 
     def columns(self, candidates: Sequence[Term]) -> tuple[list[Array], PointGram | None, list[slice | None]]:
         """Twists (6V, P) of each candidate, and the sums of point effects."""
@@ -106,9 +112,11 @@ class PoseEvidence:
         null = fit_variances(more, start=self.null.variances)
         return replace(self, model=np.hstack([self.model, back]), evidence=more, null=null)
 
-    def trial(self, response: Array, points: PointGram | None = None) -> PoseTrial:
+    def trial(
+        self, response: Array, points: PointGram | None = None, precision: Array | None = None
+    ) -> PoseTrial:  # fmt: skip
         """A model with the columns of twists (6V, k)."""
-        return PoseTrial(self, response, points)
+        return PoseTrial(self, response, points, precision)
 
     def touched(self, views: Indices) -> Array:
         """(pairs,) bool: pairs with one of the views."""

@@ -22,16 +22,20 @@ class PoseTrial:
     evidence: PoseEvidence
     X: Array
     points: PointGram | None
+    precision: Array | None = None  # (k,) of a prior around zero
 
     def solve(self, left_out: Indices | None) -> Array:
         """Coefficients (k,) by generalised least squares without some views."""
         e = self.evidence
-        white = e.white_left @ self.X
+        white, z = e.white_left @ self.X, e.raw_white_z
+        if self.precision is not None:
+            white, z = np.vstack([white, np.diag(np.sqrt(self.precision))]), np.append(z, np.zeros(self.X.shape[1]))
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
-            white = np.hstack([white, e.white_left[:, _columns_of(left_out)]])
+            free = e.white_left[:, _columns_of(left_out)]
+            white = np.hstack([white, np.vstack([free, np.zeros((len(z) - len(free), free.shape[1]))])])
         scale = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
-        return np.asarray((np.linalg.lstsq(white / scale, e.raw_white_z, rcond=1e-10)[0] / scale)[: self.X.shape[1]])
+        return np.asarray((np.linalg.lstsq(white / scale, z, rcond=1e-10)[0] / scale)[: self.X.shape[1]])
 
     def squares(self, coefficients: Array) -> Array:
         """Σ w e² per pair after the model moved; point effects change e itself and do not move the views."""

@@ -131,7 +131,7 @@ def _detectable(
     told = [
         (
             tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep),
-            white, form.sizes, float(weight),
+            white, form.sizes, float(weight), evidence.freedom.of(evidence.in_blocks(white)),
         )
         for form, white, weight in zip(candidate.forms, whites, weights, strict=True)
     ]  # fmt: skip

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stitch.diagnosis.freedom import Freedom, freedom_of
 from stitch.diagnosis.target_trial import TargetTrial
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import PointGram
@@ -32,6 +33,11 @@ class TargetEvidence:
     model: Array  # (n, a) of hand-eye, landmarks and effects in use that the views can see
     evidence: Evidence
     null: VarianceFit
+
+    @cached_property
+    def freedom(self) -> Freedom:
+        """How well the null's scatter is known."""
+        return freedom_of(self.evidence, self.null)
 
     def columns(self, candidates: Sequence[Term]) -> tuple[list[Array], PointGram | None, list[slice | None]]:
         """Rows (n, P) of each candidate; point effects need no sums over pairs here."""
@@ -85,11 +91,13 @@ class TargetEvidence:
         null = fit_variances(more, start=self.null.variances)
         return replace(self, model=np.hstack([self.model, columns]), evidence=more, null=null)
 
-    def trial(self, response: Array, points: PointGram | None = None) -> TargetTrial:
+    def trial(
+        self, response: Array, points: PointGram | None = None, precision: Array | None = None
+    ) -> TargetTrial:  # fmt: skip
         """A model with the columns of rows (n, k)."""
         if response is self.model:
             return self._present
-        return TargetTrial(self.rows, self._covariance, self.in_blocks(response))
+        return TargetTrial(self.rows, self._covariance, self.in_blocks(response), precision)
 
     @cached_property
     def _covariance(self) -> Array:

@@ -20,11 +20,13 @@ class TargetTrial:
     rows: Rows
     covariance: Array  # (B, m, m)
     X: Array
+    precision: Array | None = None  # (k,) of a prior around zero
 
     @cached_property
     def blocks(self) -> Blocks:
-        k = self.X.shape[2]
-        return Blocks(-self.rows.left, self.X, self.covariance, np.zeros(k), np.zeros(k))
+        zero = np.zeros(self.X.shape[2])
+        prior = zero if self.precision is None else self.precision
+        return Blocks(-self.rows.left, self.X, self.covariance, prior, zero)
 
     def solve(self, left_out: Indices | None) -> Array:
         """Coefficients (k,) without some views."""
