@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import norm
 
 from stitch.diagnosis.evidence import ViewEvidence
-from stitch.diagnosis.heldout import share_of
+from stitch.diagnosis.heldout import believed_size, share_of
 from stitch.diagnosis.score import Score
 from stitch.folds import JointEnd
 
@@ -47,7 +47,8 @@ class Beyond:
 
 def beyond(evidence: ViewEvidence, scored: Score) -> Beyond | None:
     """The best form of a candidate at the ends; None where the views are too few to leave one out."""
-    trial = evidence.trial(np.hstack([evidence.model, scored.form.twists]))
+    X = np.hstack([evidence.model, scored.form.twists])
+    trial = evidence.trial(X, precision=believed_size(evidence, scored))
     present = evidence.trial(evidence.model)
     ends = evidence.ends()
     if not ends:

@@ -33,18 +33,11 @@ def null_left(evidence: ViewEvidence) -> float:
 
 
 def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> Left:
-    """Add the best form of a candidate to the model, in the linear approximation.
-
-    A fold that carries most of an effect leaves little to predict it from. So without it the effect is believed to be
-    as large as it was found with all views, of either sign, and no larger: what little is left to see does not count
-    for more than that.
-    """
+    """Add the best form of a candidate to the model, in the linear approximation."""
     X = np.hstack([evidence.model, scored.form.twists])
-    size = np.sqrt(scored.values**2 + scored.sigmas**2)
-    precision = np.append(np.zeros(evidence.model.shape[1]), 1 / np.maximum(size, 1e-300) ** 2)
     own = None if points is None or scored.candidate.points is None else _own(points, scored)
     trial, present = evidence.trial(X, own), evidence.trial(evidence.model)
-    believed = evidence.trial(X, own, precision)
+    believed = evidence.trial(X, own, believed_size(evidence, scored))
     whole = trial.solve(None)
     shares, weights = [], []
     scatter = np.zeros((2, 0))
@@ -60,6 +53,17 @@ def left_by(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> 
         float(trial.squares(whole).sum() / null_left(evidence)), float(np.average(shares, weights=weights)),
         *share_of(*scatter), _steadiness(evidence, trial, X, whole),
     )  # fmt: skip
+
+
+def believed_size(evidence: ViewEvidence, scored: Score) -> Array:
+    """(k,) precision of a prior for model and candidate in fits without some views.
+
+    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
+    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
+    left to see does not count for more than that.
+    """
+    size = np.sqrt(scored.values**2 + scored.sigmas**2)
+    return np.append(np.zeros(evidence.model.shape[1]), 1 / np.maximum(size, 1e-300) ** 2)
 
 
 def share_of(with_it: Array, without: Array) -> tuple[float, float]:
