@@ -15,7 +15,8 @@ from blind_cells import OUTSIDE, drawn, hand_eye_error, hand_eye_sigma, in_sessi
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
-from stitch.diagnosis.diagnose import Diagnosis, diagnose
+from stitch.diagnosis.answer import Diagnosis
+from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.heldout import Left
 from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.start import evidence_of_state
@@ -51,7 +52,7 @@ def trial(job: Row) -> Row:
 
 
 @dataclass(frozen=True)
-class _EmptyCell:
+class EmptyCell:
     """A cell with nothing hidden: what can be seen in it, and its floor."""
 
     plan: Plan
@@ -61,15 +62,16 @@ class _EmptyCell:
 
 
 @lru_cache(maxsize=8)
-def _empty_cell(scene: str, seed: int) -> _EmptyCell:
+def cell_without(scene: str, seed: int) -> EmptyCell:
+    """The cell of a scene and a seed, with nothing hidden."""
     measured = measure(scene, seed, {})
     calm = run(session_of(measured))
-    return _EmptyCell(measured.plan, evidence_of_state(state_of(calm)), calm.residual_rms, calm.heldout_rms)
+    return EmptyCell(measured.plan, evidence_of_state(state_of(calm)), calm.residual_rms, calm.heldout_rms)
 
 
 def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     """Amplitudes of the laws at the job's multiple of their smallest detectable size."""
-    cell = _empty_cell(job["scene"], job["seed"])
+    cell = cell_without(job["scene"], job["seed"])
     true = drawn(cell.plan, laws, job["seed"])
     out = {}
     for law in laws:
@@ -160,7 +162,7 @@ def _outside(job: Row) -> Row:
             added = change(state_of(first), [name])
         finally:
             del EFFECTS[name]
-        floor = _empty_cell(job["scene"], job["seed"])
+        floor = cell_without(job["scene"], job["seed"])
         row["user"] = {
             "named": list(again.effects), "heldout": [first.heldout_rms, added.heldout_rms, floor.heldout_rms],
             "residual": [first.residual_rms, added.residual_rms, floor.residual_rms],

@@ -25,9 +25,9 @@ from stitch.diagnosis.candidates import _grid_terms
 from stitch.effects.chain import corrected
 from stitch.effects.columns import POINTS, point_gram
 from stitch.effects.contract import EFFECTS
-from stitch.free_poses import FreePoses
-from stitch.match import sample
-from stitch.overlaps import collect
+from stitch.overlap.free_poses import FreePoses
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import collect
 from stitch.state import load_state
 from stitch.threads import library_threads_off
 

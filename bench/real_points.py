@@ -14,10 +14,10 @@ import numpy as np
 
 from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
+from stitch.reading.session_folder import load_session
 from stitch.result import Run
 from stitch.run_folder import model_of
 from stitch.session import Session
-from stitch.session_folder import load_session
 from stitch.state import state_of
 
 ROOT = Path(__file__).resolve().parents[1]

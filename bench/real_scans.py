@@ -12,12 +12,12 @@ import numpy as np
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from stitch import frames
-from stitch.capture import capture, place
-from stitch.match import sample
-from stitch.overlaps import collect
+from stitch.overlap.capture import capture, place
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import collect
+from stitch.overlap.scan import prepare_view
 from stitch.pipeline import run, run_rig
-from stitch.scan import prepare_view
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 from stitch.stages.coarse import part_size
 from stitch.stages.correct import correct
 from stitch.stages.register import register

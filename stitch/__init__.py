@@ -6,6 +6,6 @@ run = run.add("joint_compliance")
 """
 
 from stitch.pipeline import run, run_rig
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 __all__ = ["load_session", "run", "run_rig"]

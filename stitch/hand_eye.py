@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
-from stitch.capture_evidence import DRAWS, CaptureEvidence, drop, information, measured_and_drawn
 from stitch.frames import Array, Indices
-from stitch.free_poses import FreePoses
+from stitch.overlap.capture import Capture
+from stitch.overlap.capture_evidence import DRAWS, CaptureEvidence, drop, information, measured_and_drawn
+from stitch.overlap.free_poses import FreePoses
 from stitch.repeatability import Repeatability, estimate
 
 

@@ -1,6 +1,5 @@
 """The model of a cell: hand-eye and effects in use; `model.toml` is its form for people."""
 
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import tomli_w
 
 from stitch.errors import InputError
 from stitch.frames import Array, is_rigid
+from stitch.reading.toml_file import read_toml
 
 FORMAT = "stitch-model/1"
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
@@ -80,12 +80,7 @@ def read_model(path: Path) -> Model:
         InputError: the file is missing, not a model, or its hand-eye is not a rigid motion.
     """
     path = path / "model.toml" if path.is_dir() else path
-    if not path.is_file():
-        raise InputError(f"{path}: no such model; name a run folder that `stitch run` wrote")
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    document = read_toml(path, "name a run folder that `stitch run` wrote")
     if document.get("format") != FORMAT:
         raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"')
     hand_eye = document.get("hand_eye", {})

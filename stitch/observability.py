@@ -12,8 +12,8 @@ import numpy as np
 
 from stitch import frames
 from stitch import robot as kinematics
-from stitch.capture import Capture
 from stitch.frames import Array
+from stitch.overlap.capture import Capture
 from stitch.robot import Robot
 
 _VISIBLE = 0.01

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from stitch.capture import Capture, capture
 from stitch.diagnosis.start import start_values
 from stitch.effects.chain import Chain, Term, chain_of, corrected
 from stitch.effects.terms import empty_term, known, require, terms_of
@@ -12,9 +11,10 @@ from stitch.frames import Array
 from stitch.labelled.beside import Beside, fitted_beside, weighed
 from stitch.labelled.run import change_labelled, run_labelled
 from stitch.labelled.words import beside_notes
-from stitch.match import sample
 from stitch.model import Model, in_unit
-from stitch.overlaps import collect
+from stitch.overlap.capture import Capture, capture
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import collect
 from stitch.recorder import Recorder, Silent
 from stitch.result import Run, StageResult, Step
 from stitch.session import Session

@@ -13,10 +13,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.calibrate.axxb import SOLVERS
-from stitch.capture import Capture
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.native import load_open3d
+from stitch.overlap.capture import Capture
 
 # The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
 _ANGLE_TOLERANCE = np.radians(3.0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.free_poses import visible_directions
+from stitch.overlap.free_poses import visible_directions
 from stitch.solve import Gram, column_space
 from stitch.variance import Evidence, fit_variances
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from stitch.effects.chain import Chain, Term
 from stitch.frames import Array
-from stitch.overlaps import Overlaps
+from stitch.overlap.overlaps import Overlaps
 from stitch.repeatability import Repeatability
 from stitch.session import Session
 
 if TYPE_CHECKING:
-    from stitch.diagnosis.diagnose import Diagnosis
+    from stitch.diagnosis.answer import Diagnosis
     from stitch.labelled.fit import LabelledFit
     from stitch.labelled.gross import Outlier
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.robot_table import gravity_of, known_keys, numbers, payload_of, point_mass
+from stitch.reading.robot_table import gravity_of, known_keys, numbers, payload_of, point_mass
 
 METRES = {"mm": 1e-3, "m": 1.0}
 _DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from stitch.cloud import Cloud
 from stitch.frames import Array
-from stitch.points_csv import Nominal, Sighting
+from stitch.reading.cloud import Cloud
+from stitch.reading.points_csv import Nominal, Sighting
 from stitch.robot import Robot
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]

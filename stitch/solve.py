@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array, Mask
-from stitch.match import Match
+from stitch.overlap.match import Match
 
 _MAD_TO_SIGMA = 1.4826
 # Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from stitch.capture import capture
 from stitch.effects.chain import Chain, Term, chain_of, corrected
 from stitch.effects.terms import terms_of
 from stitch.effects.user_file import load
@@ -15,12 +14,13 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.labelled.document import as_counted
 from stitch.model import read_model
+from stitch.overlap.capture import capture
+from stitch.overlap.thin import thinned
+from stitch.reading.session_folder import load_session
 from stitch.result import Run, Step
 from stitch.session import Session
-from stitch.session_folder import load_session
 from stitch.stages.coarse import part_size
 from stitch.stages.reuse import REUSE_GATE, settle
-from stitch.thin import thinned
 from stitch.threads import library_threads_off
 
 

@@ -11,8 +11,8 @@ import pytest
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, part_mesh, simulate
 from stitch import frames
-from stitch.capture import Capture, place
-from stitch.scan import prepare_view
+from stitch.overlap.capture import Capture, place
+from stitch.overlap.scan import prepare_view
 from stitch.threads import library_threads_off
 
 # Two test processes that each use all cores would fight for them.

@@ -6,7 +6,7 @@ import numpy as np
 
 from data_synth.simulate import Measured
 from data_synth.write import robot_table
-from stitch.cloud import Cloud
+from stitch.reading.cloud import Cloud
 from stitch.robot import robot_from_dh
 from stitch.session import Scanner, Session, View
 

@@ -26,7 +26,7 @@ from data_synth.drilling_job import write_job
 from stitch.cli import outputs
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 JOBS = {

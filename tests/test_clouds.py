@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from stitch import lzf
-from stitch.clouds import read_cloud
 from stitch.errors import InputError
 from stitch.native import load_open3d
+from stitch.reading import lzf
+from stitch.reading.clouds import read_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
 

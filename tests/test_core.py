@@ -6,13 +6,13 @@ from conftest import disturbed, synthetic
 from scipy.spatial import cKDTree
 
 from stitch import frames
-from stitch.capture_evidence import jacobian
-from stitch.free_poses import free_poses
 from stitch.hand_eye import scatter_of
-from stitch.match import match, overlapping_pairs, sample
-from stitch.overlaps import collect
+from stitch.overlap.capture_evidence import jacobian
+from stitch.overlap.free_poses import free_poses
+from stitch.overlap.match import match, overlapping_pairs, sample
+from stitch.overlap.overlaps import collect
+from stitch.overlap.scan import prepare_view
 from stitch.rounding import rounded
-from stitch.scan import prepare_view
 from stitch.solve import assemble, gram, pair_squares
 
 

@@ -6,12 +6,12 @@ from conftest import measured_blade
 from in_memory import session_of
 
 from stitch import frames
-from stitch.capture import capture
 from stitch.effects import EFFECTS
 from stitch.effects.chain import Term, chain_of, corrected, placed, shifts, twists
 from stitch.effects.terms import known, require
 from stitch.effects.user_file import load
 from stitch.errors import InputError
+from stitch.overlap.capture import capture
 from stitch.robot import forward, forward_with_errors
 
 # Amplitude 1 is a tenth of a millimetre; a hundredth of that must remain: second-order terms are smaller still.

@@ -11,7 +11,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stitch.calibrate.robot import calibrated, dh_rows
-from stitch.capture import capture
 from stitch.cli.main import main
 from stitch.diagnosis import candidates
 from stitch.diagnosis.beyond import beyond
@@ -27,14 +26,15 @@ from stitch.errors import InputError
 from stitch.labelled.landmarks import settled
 from stitch.labelled.rows import effect_rows, rows_of
 from stitch.labelled.start import closed_form
+from stitch.overlap.capture import capture
 from stitch.pipeline import run
-from stitch.points_csv import Sighting
+from stitch.reading.points_csv import Sighting
+from stitch.reading.session_folder import load_session
+from stitch.reading.urdf import robot_from_urdf
 from stitch.robot import forward, robot_from_dh
 from stitch.run_folder import model_of
 from stitch.session import Scanner, Session, View
-from stitch.session_folder import load_session
 from stitch.state import state_of
-from stitch.urdf import robot_from_urdf
 from stitch.urdf_write import to_urdf
 
 ROWS = [

@@ -13,17 +13,17 @@ from synthetic_cells import simulated
 from data_synth.scene import load_scene
 from data_synth.write import write_session
 from stitch import frames
-from stitch.capture import capture
 from stitch.cli.main import main
 from stitch.effects.chain import Term, chain_of, corrected
 from stitch.effects.columns import point_gram
 from stitch.effects.contract import EFFECTS
-from stitch.free_poses import answer, free_poses
+from stitch.overlap.capture import capture
+from stitch.overlap.free_poses import answer, free_poses
+from stitch.overlap.target_pairs import joined, target_pairs
 from stitch.pipeline import run
-from stitch.points_csv import Sighting
+from stitch.reading.points_csv import Sighting
 from stitch.sightings import Sightings
 from stitch.solve import Gram, assemble
-from stitch.target_pairs import joined, target_pairs
 
 VIEWS = 12
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from stitch.capture import capture
 from stitch.cli.main import main
-from stitch.match import sample
 from stitch.model import read_model
-from stitch.overlaps import collect
+from stitch.overlap.capture import capture
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import collect
 from stitch.pipeline import run, run_rig
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
 OBJECTS = (*IN_HAND, "gripperopen")

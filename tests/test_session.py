@@ -13,8 +13,8 @@ from conftest import measured_blade
 from data_synth.write import write_session
 from stitch.cli.main import main
 from stitch.errors import InputError
+from stitch.reading.session_folder import load_session
 from stitch.robot import forward, robot_from_dh
-from stitch.session_folder import load_session
 
 
 @pytest.fixture

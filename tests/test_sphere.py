@@ -15,7 +15,7 @@ from stitch.calibrate.sphere_start import decoupled, global_start
 from stitch.calibrate.sphere_views import arc_normal, centres, sphere_view
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 
 def views_of(cell, side=0.0):

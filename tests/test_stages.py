@@ -5,12 +5,12 @@ import pytest
 from conftest import blade_mesh, disturbed, synthetic
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.errors import NoResultError
-from stitch.match import sample
 from stitch.native import load_open3d
 from stitch.observability import unobservable
-from stitch.overlaps import collect
+from stitch.overlap.capture import Capture
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import collect
 from stitch.stages.coarse import coarse, part_size
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse, view_residuals

@@ -17,7 +17,7 @@ from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 SMALL_SCENE = """
 mount = "eye_to_hand"

@@ -8,10 +8,10 @@ from synthetic_cells import clean, simulated
 
 from data_synth.write import write_session
 from stitch import pipeline
-from stitch.capture import capture
-from stitch.match import sample
-from stitch.overlaps import FINE_SAMPLES, collect
-from stitch.session_folder import load_session
+from stitch.overlap.capture import capture
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import FINE_SAMPLES, collect
+from stitch.reading.session_folder import load_session
 from stitch.threads import library_threads_off
 
 VIEWS = 8

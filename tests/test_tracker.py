@@ -10,7 +10,7 @@ from stitch import frames
 from stitch.calibrate.tracker import calibrate_tracker, document_of
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 HEADER = "view,x,y,z,qx,qy,qz,qw"
 

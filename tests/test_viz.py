@@ -13,7 +13,7 @@ from conftest import measured_blade
 
 from data_synth.write import write_session
 from stitch.pipeline import run
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 from viz.colours import UNSEEN, signed_colours
 from viz.recording import RerunRecorder
 from viz.report import write_report

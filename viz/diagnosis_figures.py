@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.compare import Comparison, Table
-from stitch.diagnosis.diagnose import Diagnosis, Suspect
 from stitch.result import Step
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, covariate, plain

@@ -19,7 +19,7 @@ from stitch.calibrate.refine import Refined, refine_axzb
 from stitch.calibrate.weak import hardly_turned, turned, weak_components
 from stitch.errors import NoResultError
 from stitch.frames import Array
-from stitch.frames_csv import MeasuredFrames, read_frames
+from stitch.reading.frames_csv import MeasuredFrames, read_frames
 from stitch.session import Session
 
 # Second opinions further off than this many sigmas speak against independent errors.

@@ -1,7 +1,6 @@
 """Checks of tables and numbers that the cells' TOML files share."""
 
 import math
-import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -10,20 +9,6 @@ from stitch.errors import InputError
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
 SMALLEST, LARGEST = 1e-12, 1e9
-
-
-def read_toml(file: Path, hint: str) -> dict[str, Any]:
-    """The document of a file; `hint` says where an example is.
-
-    Raises:
-        InputError: the file is missing or not TOML.
-    """
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; see {hint}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
 
 
 def table(file: Path, document: dict[str, Any], name: str) -> dict[str, Any]:

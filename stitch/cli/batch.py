@@ -14,7 +14,7 @@ from stitch import run_folder
 from stitch.cli.progress import MICROMETRES
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.pipeline import run
-from stitch.session_folder import load_session
+from stitch.reading.session_folder import load_session
 
 
 def batch(

@@ -21,9 +21,9 @@ from stitch.cli.change import show_ledger
 from stitch.cli.diagnose import write_diagnosis
 from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
+from stitch.reading.session_folder import load_session
 from stitch.result import Run
 from stitch.run_folder import write_json
-from stitch.session_folder import load_session
 from stitch.state import state_of
 
 calibrate = typer.Typer(

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.errors import InputError
+from stitch.reading.session_folder import load_session
 from stitch.session import Session
-from stitch.session_folder import load_session
 
 
 def check(

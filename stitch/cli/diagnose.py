@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.cli.progress import MICROMETRES
-from stitch.diagnosis.diagnose import Diagnosis, Suspect, diagnose
+from stitch.diagnosis.answer import Diagnosis, Suspect
+from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.words import amounts_of
 from stitch.run_folder import extend, to_json, write_json

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from stitch.cells.panel import Job, JobResult, handover, read_job, solve_job
 from stitch.cells.panel.report import document, write_folder
+from stitch.cells.panel.words import leg_sentence, shape_sentence
 from stitch.cells.session_folder import write_sessions
 from stitch.cli.outputs import RecordingOption, ReportOption, SessionOption, show
 
@@ -56,12 +57,7 @@ def _print_model(console: Console, result: JobResult) -> None:
 def _print_legs(console: Console, result: JobResult) -> None:
     found = [offset for offset in result.legs if offset.found]
     for o in found:
-        # A likelihood ratio of 100 is a chi-square of 9.2.
-        doubt = "" if o.gain - o.runner_up_gain > 9.2 else f"; leg {o.runner_up} explains it nearly as well"
-        console.print(
-            f"Robot {o.robot}: leg {o.leg} is {o.offset:+.3f} ± {o.sigma:.3f} mm longer than its controller believes"
-            f"{doubt}. Taken out of its model and put into its commands."
-        )
+        console.print(leg_sentence(o))
     for model in result.models:
         if model.p_value < 1e-4:
             times = np.sqrt(model.chi_square / model.redundancy)
@@ -88,12 +84,8 @@ def _print_moves(console: Console, job: Job, result: JobResult) -> None:
         x, y, z = result.pose_error[3:]
         turns = " ".join(f"{value:+.4f}" for value in np.degrees(result.pose_error[:3]))
         console.print(f"Panel off its target by x {x:+.3f}, y {y:+.3f}, z {z:+.3f} mm and {turns} °.")
-    if result.shape_largest is not None:
-        worst = int(np.argmax(result.shape_largest))
-        verdict = "within" if result.shape_largest[worst] <= job.tolerance else "beyond"
-        console.print(
-            f"Shape: {result.shape_largest[worst]:.3f} mm at clamp {job.robots[worst]}, {verdict} {job.tolerance:g} mm."
-        )
+    if (shape := shape_sentence(job, result)) is not None:
+        console.print(shape)
     if job.forces is not None:
         size = np.linalg.norm(job.forces[:, 3:], axis=1)
         console.print(f"Largest change of force: {size.max():.1f} N at clamp {job.robots[int(np.argmax(size))]}.")

@@ -17,10 +17,10 @@ from stitch.errors import InputError
 from stitch.mesh import write_mesh
 from stitch.model import read_model, write_model
 from stitch.pipeline import run_rig
+from stitch.reading.session_folder import load_session
 from stitch.recorder import Recorder
 from stitch.result import Run
 from stitch.session import Session
-from stitch.session_folder import load_session
 
 
 def run(

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from stitch.controllers.taught import Taught, line_of, quaternion_w_first
-from stitch.csv_number import number
 from stitch.errors import InputError
+from stitch.reading.csv_number import number
 
 CONVENTION = "quaternion q1, q2, q3, q4 with q1 = w; mm"
 pose = quaternion_w_first

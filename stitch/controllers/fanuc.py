@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from stitch.controllers.taught import Taught, fixed_xyz, line_of
-from stitch.csv_number import number
 from stitch.errors import InputError
+from stitch.reading.csv_number import number
 
 CONVENTION = "W, P, R in degrees about fixed x, y, z: Rz(R)·Ry(P)·Rx(W); mm"
 pose = fixed_xyz

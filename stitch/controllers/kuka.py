@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stitch.controllers.taught import Taught, line_of, zyx
-from stitch.csv_number import number
 from stitch.errors import InputError
+from stitch.reading.csv_number import number
 
 CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"
 pose = zyx

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_number import number
 
 CONVENTION = "quaternion by its letters, or Rx, Ry, Rz in degrees about fixed x, y, z: Rz·Ry·Rx; mm or m by the header"
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch.controllers.taught import Taught, line_of, rotation_vector
-from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_number import number
 
 CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
 pose = rotation_vector

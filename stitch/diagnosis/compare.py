@@ -13,8 +13,8 @@ import numpy as np
 from stitch.effects.chain import corrected
 from stitch.effects.views import Views
 from stitch.frames import Array, Indices
-from stitch.match import Match, sample
-from stitch.overlaps import FINE_SAMPLES, collect
+from stitch.overlap.match import Match, sample
+from stitch.overlap.overlaps import FINE_SAMPLES, collect
 from stitch.solve import RMS_GATE
 from stitch.state import State
 from stitch.threads import library_threads_off

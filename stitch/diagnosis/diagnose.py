@@ -1,20 +1,19 @@
 """The whole diagnosis: evidence, candidates, selection, what to measure next, one plain sentence."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from stitch.diagnosis.aliases import Alias, alias_matrix, aliases_of
+from stitch.diagnosis.aliases import alias_matrix, aliases_of
+from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.heldout import Left, left_by
-from stitch.diagnosis.next_view import Proposal, propose
+from stitch.diagnosis.next_view import propose
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.select import Selection, implausible, select
 from stitch.diagnosis.start import evidence_of_state
-from stitch.diagnosis.unknown import Dependence, dependences
+from stitch.diagnosis.unknown import dependences
 from stitch.diagnosis.words import sentence_of
-from stitch.frames import Array
 from stitch.state import State
 from stitch.threads import library_threads_off
 
@@ -23,39 +22,6 @@ _PREDICTED = 8
 # An effect must not vanish when one view is left out.
 _STEADY = 0.25
 _BEYOND_CHANCE = 1e-5
-
-
-@dataclass(frozen=True)
-class Suspect:
-    """One candidate as diagnosis.json shows it."""
-
-    ranked: Ranked
-    aliases: tuple[Alias, ...]
-    left: Left | None
-
-    @property
-    def name(self) -> str:
-        return self.ranked.name
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Verdict, suspects, dependences, next measurement."""
-
-    verdict: str
-    effects: tuple[str, ...]
-    sentence: str
-    residual_rms: float
-    noise_floor: float
-    rotation: float  # repeatability under the present model, rad
-    translation: float  # length_unit
-    suspects: tuple[Suspect, ...]
-    matrix: Array  # (S, S) alias matrix of the suspects
-    depends_on: tuple[Dependence, ...]
-    next: tuple[Proposal, ...]
-    missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
-    evidence: ViewEvidence
-    notes: tuple[str, ...] = ()
 
 
 def diagnose(state: State) -> Diagnosis:

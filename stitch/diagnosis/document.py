@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.diagnosis.diagnose import Diagnosis, Suspect
+from stitch.diagnosis.answer import Diagnosis, Suspect
 
 FORMAT = "stitch-diagnosis/1"
 

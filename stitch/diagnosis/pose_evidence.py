@@ -6,8 +6,6 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.capture import Capture
-from stitch.capture_evidence import jacobian
 from stitch.diagnosis.freedom import Freedom, freedom_of
 from stitch.diagnosis.pose_trial import PoseTrial
 from stitch.effects.chain import Chain, Term
@@ -16,7 +14,9 @@ from stitch.effects.scanner_field import field_scatter
 from stitch.effects.visible import independent
 from stitch.folds import JointEnd, grouped_folds
 from stitch.frames import Array, Indices
-from stitch.free_poses import FreePoses
+from stitch.overlap.capture import Capture
+from stitch.overlap.capture_evidence import jacobian
+from stitch.overlap.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
 from stitch.solve import column_space
 from stitch.variance import Evidence, VarianceFit, fit_variances

@@ -12,8 +12,8 @@ from stitch.diagnosis.target_evidence import target_evidence
 from stitch.effects.chain import Term, corrected
 from stitch.effects.contract import Effect
 from stitch.effects.terms import empty_term
-from stitch.free_poses import free_poses
 from stitch.labelled.landmarks import drawing_of
+from stitch.overlap.free_poses import free_poses
 from stitch.state import State
 
 

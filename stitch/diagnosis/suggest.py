@@ -1,6 +1,7 @@
 """Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle."""
 
-from stitch.diagnosis.diagnose import Diagnosis, diagnose
+from stitch.diagnosis.answer import Diagnosis
+from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.hold import idle_effect
 from stitch.diagnosis.select import MANY
 from stitch.pipeline import change

@@ -1,17 +1,11 @@
 """The diagnosis in one plain sentence with its numbers."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from stitch.diagnosis.answer import Diagnosis
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.select import IMPLAUSIBLE
 from stitch.rounding import rounded
-
-if TYPE_CHECKING:
-    from stitch.diagnosis.diagnose import Diagnosis
 
 _MICROMETRES = {"mm": 1e3, "m": 1e6}
 

@@ -14,13 +14,13 @@ from pykdtree.kdtree import KDTree
 
 from stitch import frames
 from stitch import robot as kinematics
-from stitch.capture import Capture
 from stitch.effects.contract import EVERY_VIEW, Effect, Parameter
 from stitch.effects.robot import Links
 from stitch.effects.views import ScanView, Views, views_of
 from stitch.frames import Array, Indices
+from stitch.overlap.capture import Capture
+from stitch.overlap.scan import Scan
 from stitch.robot import Robot
-from stitch.scan import Scan
 from stitch.session import Session
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.

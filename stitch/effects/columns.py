@@ -12,10 +12,10 @@ import numpy as np
 from stitch import frames
 from stitch.effects.chain import Chain, Term, shifts, target_shifts, twists
 from stitch.frames import Array, Indices
-from stitch.free_poses import FreePoses, answer
-from stitch.match import Match
+from stitch.overlap.free_poses import FreePoses, answer
+from stitch.overlap.match import Match
+from stitch.overlap.target_pairs import by_pair
 from stitch.solve import tukey
-from stitch.target_pairs import by_pair
 from stitch.threads import parallel
 
 POINTS = ("sensor", "shape")

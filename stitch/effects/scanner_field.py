@@ -14,7 +14,7 @@ from stitch.effects.columns import all_columns
 from stitch.effects.contract import Effect, number
 from stitch.effects.views import ScanView
 from stitch.frames import Array
-from stitch.free_poses import FreePoses
+from stitch.overlap.free_poses import FreePoses
 
 # Rms over the field, as a share of the scanner's noise along the ray.
 _SHARE = 0.5

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.capture import Capture
 from stitch.frames import Array
-from stitch.free_poses import FreePoses
+from stitch.overlap.capture import Capture
+from stitch.overlap.free_poses import FreePoses
 from stitch.repeatability import covariance_of, estimate, pose_channel
 from stitch.solve import column_space
 

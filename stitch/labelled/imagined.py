@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from stitch import frames
-from stitch.capture import place
 from stitch.effects.chain import Chain, Term
 from stitch.effects.views import ScanView
 from stitch.frames import Array
 from stitch.labelled.landmarks import Landmarks
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
+from stitch.overlap.capture import place
 from stitch.sightings import Sightings
 
 

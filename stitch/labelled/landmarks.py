@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.frames import Array, Indices
-from stitch.points_csv import Nominal
+from stitch.overlap.capture import Capture
+from stitch.reading.points_csv import Nominal
 from stitch.sightings import Sightings
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.effects.chain import Chain, Term, target_shifts, twists
 from stitch.effects.columns import POINTS
 from stitch.frames import Array, Mask
 from stitch.labelled.landmarks import Landmarks
+from stitch.overlap.capture import Capture
 from stitch.variance import Evidence
 
 

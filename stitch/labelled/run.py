@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.effects.chain import Chain, Term
 from stitch.effects.terms import empty_term, known, terms_of
 from stitch.frames import Array
@@ -18,6 +17,7 @@ from stitch.labelled.start import closed_form
 from stitch.labelled.words import notes_of, sentence
 from stitch.model import Model
 from stitch.observability import unobservable
+from stitch.overlap.capture import Capture
 from stitch.recorder import Recorder
 from stitch.repeatability import scatter_from
 from stitch.result import FusedCloud, Run, StageResult

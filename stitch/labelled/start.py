@@ -9,9 +9,9 @@ import numpy as np
 
 from stitch import frames
 from stitch.calibrate.axzb import shah
-from stitch.capture import Capture
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
+from stitch.overlap.capture import Capture
 
 _REWEIGHTED = 12
 # Singular values of the equilibrated system below this share of the largest: the motions do not show it all.

@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.match import sample, search
+from stitch.overlap.capture import Capture
+from stitch.overlap.match import sample, search
 from stitch.relative_motion import motion_candidates
 from stitch.stages.correct import close_in
 from stitch.threads import parallel

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
-from stitch.capture_evidence import jacobian
 from stitch.effects.chain import Term
 from stitch.frames import Array
-from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, fit_hand_eye
-from stitch.match import sample
-from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.overlap.capture import Capture
+from stitch.overlap.capture_evidence import jacobian
+from stitch.overlap.free_poses import free_poses
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
 from stitch.solve import assemble, least_squares

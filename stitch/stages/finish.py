@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from stitch.capture import Capture
 from stitch.effects.chain import Chain
 from stitch.frames import Array
-from stitch.noise import noise_floor
 from stitch.observability import unobservable
-from stitch.overlaps import Overlaps
+from stitch.overlap.capture import Capture
+from stitch.overlap.noise import noise_floor
+from stitch.overlap.overlaps import Overlaps
 from stitch.recorder import Recorder, Silent
 from stitch.result import Run, StageResult
 from stitch.session import Session

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.frames import Array, Indices
+from stitch.overlap.capture import Capture
+from stitch.overlap.scan import Scan
 from stitch.result import FusedCloud
-from stitch.scan import Scan
 
 # Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
 _EDGE_WEIGHT = 0.05

@@ -6,17 +6,17 @@ from functools import partial
 
 import numpy as np
 
-from stitch.capture import Capture
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import all_columns
 from stitch.effects.groups import one_by_one
 from stitch.effects.supported import supported
 from stitch.effects.visible import independent, whitened
 from stitch.frames import Array
-from stitch.free_poses import FreePoses, free_poses
 from stitch.hand_eye import Columns, HandEye, fit_hand_eye
-from stitch.match import sample
-from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.overlap.capture import Capture
+from stitch.overlap.free_poses import FreePoses, free_poses
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
 from stitch.stages.correct import Correction
 
 _MAXIMUM_ITERATIONS = 6

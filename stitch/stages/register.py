@@ -18,15 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.frames import Array
-from stitch.match import Match, sample
-from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.overlap.capture import Capture
+from stitch.overlap.match import Match, sample
+from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.overlap.scan import Scan
+from stitch.overlap.target_pairs import joined
 from stitch.recorder import Recorder, Silent
 from stitch.repeatability import Repeatability
-from stitch.scan import Scan
 from stitch.solve import assemble, gram
-from stitch.target_pairs import joined
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2

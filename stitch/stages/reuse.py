@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.capture import Capture
 from stitch.effects.chain import Term
 from stitch.frames import Array
-from stitch.free_poses import free_poses
 from stitch.hand_eye import HandEye, scatter_of
-from stitch.match import sample
 from stitch.model import Model
-from stitch.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.overlap.capture import Capture
+from stitch.overlap.free_poses import free_poses
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.stages.coarse import part_size
 from stitch.stages.correct import Correction, weighing
 

@@ -8,6 +8,7 @@ from stitch import frames
 from stitch.cells.panel.figures import errors_figure
 from stitch.cells.panel.job import JobResult
 from stitch.cells.panel.reading import Job
+from stitch.cells.panel.words import leg_sentence, shape_sentence
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -46,23 +47,13 @@ def sentence(job: Job, result: JobResult) -> str:
     if result.pose_error is not None:
         off, turn = np.linalg.norm(result.pose_error[3:]), np.degrees(np.linalg.norm(result.pose_error[:3]))
         parts.append(f"The panel stands {off:.2f} mm and {turn:.3f}° off its target.")
-    if result.shape_largest is not None:
-        worst = int(np.argmax(result.shape_largest))
-        verdict = "within" if result.shape_largest[worst] <= job.tolerance else "beyond"
-        parts.append(
-            f"Its shape is {result.shape_largest[worst]:.2f} mm off at clamp {job.robots[worst]}, {verdict} the "
-            f"{job.tolerance:g} mm allowed."
-        )
+    if (shape := shape_sentence(job, result)) is not None:
+        parts.append(shape)
     return " ".join(parts) or f"{len(job.robots)} robots and the tracker are joined in one model."
 
 
 def _notes(result: JobResult) -> list[str]:
-    return [
-        f"Leg {o.leg} of robot {o.robot} is {o.offset:+.3f} ± {o.sigma:.3f} mm longer than its controller believes; it "
-        "is taken out of the model and put into the commands."
-        for o in result.legs
-        if o.found
-    ]
+    return [leg_sentence(o) for o in result.legs if o.found]
 
 
 def _tables(job: Job, result: JobResult) -> list[Table]:

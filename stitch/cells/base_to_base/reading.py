@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
-from stitch.cells.toml_tables import check_keys, choice, finite, read_toml, table
+from stitch.cells.toml_tables import check_keys, choice, finite, table
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.toml_file import read_toml
 from stitch.robot import METRES
 
 FORMAT = "stitch-base/1"
@@ -27,7 +28,7 @@ def read_stand(file: Path | str) -> Stand:
         InputError: the file is missing, not TOML, or an entry is missing, unknown, not a number or impossible.
     """
     file = Path(file)
-    document = read_toml(file, "examples/base_to_base.toml for how a stand file looks")
+    document = read_toml(file, "see examples/base_to_base.toml for how a stand file looks")
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
     check_keys(file, "", document, {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"})

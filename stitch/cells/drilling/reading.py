@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.toml_tables import check_keys, choice, finite, read_toml
+from stitch.cells.toml_tables import check_keys, choice, finite
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.toml_file import read_toml
 from stitch.robot import METRES
 
 FORMAT = "stitch-drill/1"
@@ -55,7 +56,7 @@ def read_job(file: Path | str) -> Job:
         InputError: anything missing, unknown, contradictory or not a number; names the file, the place and the mend.
     """
     file = Path(file)
-    document = read_toml(file, "examples/drilling/job.toml for how a job looks")
+    document = read_toml(file, "see examples/drilling/job.toml for how a job looks")
     check_keys(file, "", document, {"format", "length_unit", "height", "image_size", *_FILES})
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')

@@ -12,9 +12,10 @@ from stitch.cells.panel.legs import Legs
 from stitch.cells.panel.tables import Points, read_calibration, read_per_robot, read_points, read_world
 from stitch.cells.panel.tracker import Tracker
 from stitch.cells.pose_table import COLUMNS, from_numbers
-from stitch.cells.toml_tables import check_keys, choice, finite, read_toml, table
+from stitch.cells.toml_tables import check_keys, choice, finite, table
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.toml_file import read_toml
 
 FORMAT = "stitch-panel/1"
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
@@ -79,7 +80,7 @@ def read_job(file: Path | str) -> Job:
 
 
 def _document(file: Path) -> dict[str, Any]:
-    document = read_toml(file, "examples/panel/job.toml for how a job looks")
+    document = read_toml(file, "see examples/panel/job.toml for how a job looks")
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
     check_keys(

@@ -10,13 +10,14 @@ import numpy as np
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import COLUMNS, from_columns, from_numbers
-from stitch.cells.toml_tables import check_keys, choice, finite, read_toml
+from stitch.cells.toml_tables import check_keys, choice, finite
 from stitch.cells.window.cad import Surface, read_cad
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.scans import Joined, Placed, assemble, read_session, read_table
 from stitch.cells.window.seam import Limits, Station
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.toml_file import read_toml
 
 FIT, SEAM = "stitch-fit/1", "stitch-seam/1"
 _SCANS = {"scans", "session", "hand_eye"}
@@ -103,7 +104,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
 
 
 def _document(file: Path, wanted: str, known: set[str]) -> dict[str, Any]:
-    document = read_toml(file, "examples/window for how a job looks")
+    document = read_toml(file, "see examples/window for how a job looks")
     if document.get("format") != wanted:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{wanted}"')
     check_keys(file, "", document, known)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_number import number
 
 _XYZ = ("x", "y", "z")
 

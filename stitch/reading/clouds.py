@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.cloud import Cloud
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.pcd import read_pcd
+from stitch.reading.cloud import Cloud
+from stitch.reading.pcd import read_pcd
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.capture import Capture, place
-from stitch.cloud import Cloud
 from stitch.frames import Indices
-from stitch.overlaps import FINE_SAMPLES
-from stitch.scan import Scan, prepare_view
+from stitch.overlap.capture import Capture, place
+from stitch.overlap.overlaps import FINE_SAMPLES
+from stitch.overlap.scan import Scan, prepare_view
+from stitch.reading.cloud import Cloud
 from stitch.session import Session
 from stitch.sightings import sightings_of
 from stitch.threads import parallel

@@ -1,6 +1,5 @@
 """A session folder on disk -> `Session`; every check of input is made here or in the readers it calls."""
 
-import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
@@ -8,16 +7,17 @@ from typing import Any, get_args
 import numpy as np
 
 from stitch import frames
-from stitch.clouds import read_cloud
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.frames_csv import read_frames
-from stitch.plausible import check_scale
-from stitch.points_csv import Nominal, Sighting, read_points, read_targets
+from stitch.reading.clouds import read_cloud
+from stitch.reading.frames_csv import read_frames
+from stitch.reading.plausible import check_scale
+from stitch.reading.points_csv import Nominal, Sighting, read_points, read_targets
+from stitch.reading.toml_file import read_toml
+from stitch.reading.urdf import robot_from_urdf
+from stitch.reading.views_csv import Row, read_views
 from stitch.robot import METRES, Robot, robot_from_dh
 from stitch.session import Mount, Scanner, Session, View
-from stitch.urdf import robot_from_urdf
-from stitch.views_csv import Row, read_views
 
 FORMAT = "stitch-session/1"
 
@@ -39,8 +39,6 @@ def load_session(path: Path | str) -> Session:
     """
     path = Path(path)
     file = path / "session.toml"
-    if not file.is_file():
-        raise InputError(f"{file}: not found; a session is a folder with session.toml and views.csv")
     document = _parse(file)
     unit = _choice(file, document, "length_unit", tuple(METRES))
     mount = _choice(file, document, "mount", get_args(Mount))
@@ -63,10 +61,7 @@ def load_session(path: Path | str) -> Session:
 
 
 def _parse(file: Path) -> dict[str, Any]:
-    try:
-        document = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+    document = read_toml(file, "a session is a folder with session.toml and views.csv")
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
     for table, known in _KEYS.items():

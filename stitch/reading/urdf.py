@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.robot_table import gravity_of, payload_of
 from stitch.robot import METRES, Robot
-from stitch.robot_table import gravity_of, payload_of
 from stitch.urdf_write import to_urdf
 
 __all__ = ["robot_from_urdf", "to_urdf"]

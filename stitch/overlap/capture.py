@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.scan import Scan, prepare
+from stitch.overlap.scan import Scan, prepare
 from stitch.session import Session
 from stitch.sightings import Sightings, sightings_of
 

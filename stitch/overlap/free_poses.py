@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.frames import Array, Mask
-from stitch.match import sample
-from stitch.overlaps import Overlaps, collect, next_gate
+from stitch.overlap.capture import Capture
+from stitch.overlap.match import sample
+from stitch.overlap.overlaps import Overlaps, collect, next_gate
 from stitch.solve import Gram, assemble
 
 _SAMPLES = 1500

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch import lzf
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading import lzf
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 

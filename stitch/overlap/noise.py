@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from stitch.capture import Capture
-from stitch.overlaps import Overlaps
+from stitch.overlap.capture import Capture
+from stitch.overlap.overlaps import Overlaps
 
 
 def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = None) -> float:

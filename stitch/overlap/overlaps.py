@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.capture import Capture
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.match import Match, match, overlapping_pairs
+from stitch.overlap.capture import Capture
+from stitch.overlap.match import Match, match, overlapping_pairs
+from stitch.overlap.target_pairs import TargetPairs, joined, target_pairs
 from stitch.solve import Gram, gram, robust_scale
-from stitch.target_pairs import TargetPairs, joined, target_pairs
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.capture import Capture
 from stitch.folds import grouped_folds
 from stitch.frames import Array, Indices
-from stitch.free_poses import visible_directions
+from stitch.overlap.capture import Capture
+from stitch.overlap.free_poses import visible_directions
 from stitch.repeatability import PoseChannel, Repeatability, covariance_of, pose_channel
 from stitch.solve import Gram, pair_squares
 

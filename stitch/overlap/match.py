@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.scan import Scan
+from stitch.overlap.scan import Scan
 from stitch.threads import parallel
 
 # Two patches whose normals differ by more than 45° are not the same surface.

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.csv_number import number
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_number import number
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _SIGMA = ("sigma", "sigma_deg")

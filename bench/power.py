@@ -1,0 +1,79 @@
+"""Do effects of the smallest detectable size show in eight cells of ten? Noise drawn in the channel itself.
+
+Usage: python bench/power.py [--scenes blade,drill-plate] [--draws N] [--multiple M]
+
+The blind benchmark simulates every scan and has few cells for each effect. Here one cell with nothing hidden is
+simulated; what its views saw is drawn anew from their covariance, with each effect added at a multiple of its
+smallest detectable size, and diagnosed. That judges the statistics alone; some 3 minutes a scene.
+"""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+from blind_cells import drawn, smallest
+from blind_trials import LIBRARY, cell_without, pin
+
+from stitch.diagnosis.answer import Suspect
+from stitch.diagnosis.candidates import Candidate, candidates_of
+from stitch.diagnosis.diagnose import checked
+from stitch.diagnosis.heldout import left_by
+from stitch.diagnosis.pose_evidence import PoseEvidence
+from stitch.diagnosis.select import implausible, select
+from stitch.frames import Array
+from stitch.variance import fit_variances
+
+
+def verdict(evidence: PoseEvidence, candidates: list[Candidate]) -> str:
+    """As `diagnose` judges, less what it says about it."""
+    selection = select(evidence, candidates, "mm")
+    asked = {r.name: r for r in (*selection.named, selection.second) if r is not None}
+    suspects = [Suspect(r, (), left_by(evidence, r.score, None)) for r in asked.values()]
+    return checked(selection, suspects, implausible(evidence, "mm"))[0].verdict
+
+
+def redrawn(evidence: PoseEvidence, shift: Array, rng: np.random.Generator) -> PoseEvidence:
+    """The same views with other noise and a shift (n,) of what they see."""
+    z = evidence.half @ rng.standard_normal(len(evidence.half)) + shift
+    own = replace(evidence.evidence, z=z[None])
+    return replace(evidence, channel=replace(evidence.channel, z=z), evidence=own,
+                   null=fit_variances(own, both_starts=True))  # fmt: skip
+
+
+def shift_of(evidence: PoseEvidence, candidate: Candidate, true: dict[str, float]) -> Array:
+    """(n,) what true parameters do to what the views see."""
+    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
+    fitted = np.array([not p.grid for p in candidate.parameters])
+    whole = [form for form in candidate.forms if form.keep.sum() == fitted.sum()]
+    nearest = min(whole, key=lambda form: np.abs(form.term.values - values)[~fitted].sum())
+    return np.asarray(nearest.columns @ values[nearest.keep])
+
+
+def main() -> None:
+    """Print the share of draws in which something is said to be missing, effect by effect."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", default="blade,drill-plate")
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--multiple", type=float, default=1.0)
+    options = parser.parse_args()
+    pin(0)
+    shares = []
+    for scene in options.scenes.split(","):
+        cell = cell_without(scene, 0)
+        candidates, rng = candidates_of(cell.evidence)[0], np.random.default_rng(1)
+        true = drawn(cell.plan, LIBRARY, 0)
+        for candidate in candidates:
+            size = smallest(cell.evidence, candidate.name, true[candidate.name]) if candidate.name in true else None
+            if size is None:
+                continue
+            shift = options.multiple * size * shift_of(cell.evidence, candidate, true[candidate.name])
+            drawn_again = (redrawn(cell.evidence, shift, rng) for _ in range(options.draws))
+            shares.append(np.mean([verdict(e, candidates) != "adequate" for e in drawn_again]))
+            print(f"{scene:12} {candidate.name:24} {shares[-1]:.2f}", flush=True)
+        empty = [verdict(redrawn(cell.evidence, np.zeros(1), rng), candidates) for _ in range(10 * options.draws)]
+        print(f"{scene:12} {'nothing':24} {np.mean([v != 'adequate' for v in empty]):.3f}", flush=True)
+    print(f"mean over {len(shares)} effects: {np.mean(shares):.3f}")
+
+
+if __name__ == "__main__":
+    main()

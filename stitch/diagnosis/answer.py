@@ -1,0 +1,44 @@
+"""What a diagnosis says: verdict, suspects, what depends on what, what to measure next."""
+
+from dataclasses import dataclass
+
+from stitch.diagnosis.aliases import Alias
+from stitch.diagnosis.evidence import ViewEvidence
+from stitch.diagnosis.heldout import Left
+from stitch.diagnosis.next_view import Proposal
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.unknown import Dependence
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """One candidate as diagnosis.json shows it."""
+
+    ranked: Ranked
+    aliases: tuple[Alias, ...]
+    left: Left | None
+
+    @property
+    def name(self) -> str:
+        return self.ranked.name
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Verdict, suspects, dependences, next measurement."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    sentence: str
+    residual_rms: float
+    noise_floor: float
+    rotation: float  # repeatability under the present model, rad
+    translation: float  # length_unit
+    suspects: tuple[Suspect, ...]
+    matrix: Array  # (S, S) alias matrix of the suspects
+    depends_on: tuple[Dependence, ...]
+    next: tuple[Proposal, ...]
+    missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
+    evidence: ViewEvidence
+    notes: tuple[str, ...] = ()
