@@ -20,6 +20,7 @@ from stitch.diagnosis.score import form_weights
 from stitch.effects import EFFECTS
 from stitch.effects.user_file import load
 from stitch.frames import Array
+from stitch.result import Run
 
 # Evidence counts in views: a few thousand points a view show what millions would.
 _PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80}
@@ -63,17 +64,26 @@ def _last_joint_only(name: str, seed: int) -> tuple[Plan, Array]:
     return replace(plan, joints=joints, torque=torque), np.full_like(rail, rail[0])
 
 
-def measure(name: str, seed: int, hidden: dict[str, float], how: str = "", useful: tuple[int, ...] = ()) -> Measured:
-    """One session; `how` names hard noise or LAST_JOINT."""
+def measure(
+    name: str, seed: int, hidden: dict[str, float], how: str = "", useful: tuple[int, ...] = (),
+    chance: int | None = None,
+) -> Measured:  # fmt: skip
+    """One session of the views planned for a seed; `how` names hard noise or LAST_JOINT.
+
+    Args:
+        chance: seed of what nature and the instruments draw, if it is not that of the plan.
+    """
     alone = how == LAST_JOINT
     planned = _last_joint_only(name, seed) if alone else _planned(name, seed)
     planned = (replace(planned[0], useful=useful or planned[0].useful), planned[1])
-    return simulate(scene_of(name, "" if alone else how, useful), hidden, seed, planned=planned)
+    return simulate(
+        scene_of(name, "" if alone else how, useful), hidden, seed if chance is None else chance, planned=planned
+    )
 
 
-def drawn(plan: Plan, laws: Sequence[str], seed: int) -> dict[str, dict[str, float]]:
+def drawn(plan: Plan, laws: Sequence[str], chance: int) -> dict[str, dict[str, float]]:
     """What nature draws for these laws, in this order, at amplitude 1 in this very cell."""
-    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([seed, 2]))[1]
+    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
 
 
 def user_effect(law: str) -> str:
@@ -127,6 +137,12 @@ def hand_eye_sigma(measured: Measured, covariance: Array) -> float:
     """The same as a covariance (6, 6) of the right perturbation predicts it."""
     jacobians = [np.hstack([-frames.skew(p), np.eye(3)]) for p in _field(measured)]
     return float(np.sqrt(np.mean([np.trace(J @ covariance @ J.T) for J in jacobians])))
+
+
+def hand_eye_chi_square(measured: Measured, found: Run) -> float:
+    """The error of the hand-eye against its covariance; 6 on the average where that is right."""
+    xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
+    return float(xi @ np.linalg.solve(found.mount_covariance, xi))
 
 
 def _field(measured: Measured) -> Array:

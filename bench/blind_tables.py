@@ -71,6 +71,7 @@ def _added(rows: list[Row]) -> str:
         f"| SD of (found − true)/sigma | {np.sqrt(np.mean(z**2)):.2f}, of its middle {_robust(z):.2f}, n = {len(z)} |",
         f"| hand-eye nearer to the truth | {share(rows, lambda r: _ratio(r) < 1)} |",
         f"| hand-eye farther from it, by more than its sigma | {share(rows, _worse)} |",
+        f"| hand-eye: χ²/6 of its error, mean | {_chi_square([r['added'] for r in rows]):.2f} |",
         f"| hand-eye error, median, before → after | {_median(rows, 0):.3f} → {_median(rows, 1):.3f} mm |",
     ]  # fmt: skip
     return "\n".join(lines)
@@ -94,11 +95,20 @@ def _robust(z: np.ndarray) -> float:
     return float(np.subtract(*np.percentile(z, [84.13, 15.87])) / 2)
 
 
+def _alarms(name: str, rows: list[Row]) -> str:
+    return f"| {name} | {share(rows, _detected)} | {_chi_square(rows):.2f} |"
+
+
+def _chi_square(rows: list[Row]) -> float:
+    found = [r["hand_eye_chi_square"] / 6 for r in rows if "hand_eye_chi_square" in r]
+    return float(np.mean(found)) if found else float("nan")
+
+
 def _empty(rows: list[Row]) -> str:
-    lines = ["### Nothing hidden\n", "| cells | wrong alarms |", "|---|---|"]
+    lines = ["### Nothing hidden\n", "| cells | wrong alarms | hand-eye: χ²/6 of its error, mean |", "|---|---|---:|"]
     for noise in dict.fromkeys(r["noise"] for r in rows):
-        lines.append(f"| {noise or 'usual noise'} | {share([r for r in rows if r['noise'] == noise], _detected)} |")
-    lines.append(f"| all of the harder ones | {share([r for r in rows if r['noise']], _detected)} |")
+        lines.append(_alarms(noise or "usual noise", [r for r in rows if r["noise"] == noise]))
+    lines.append(_alarms("all of the harder ones", [r for r in rows if r["noise"]]))
     return "\n".join(lines)
 
 

@@ -1,5 +1,6 @@
 """Trials of the blind benchmark: one simulated session each, a flat row of what came of it."""
 
+import json
 import os
 import sys
 import time
@@ -8,9 +9,20 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
-from blind_cells import OUTSIDE, drawn, hand_eye_error, hand_eye_sigma, in_session_units, measure, smallest, user_effect
+from blind_cells import (
+    OUTSIDE,
+    drawn,
+    hand_eye_chi_square,
+    hand_eye_error,
+    hand_eye_sigma,
+    in_session_units,
+    measure,
+    smallest,
+    user_effect,
+)
 
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
@@ -53,12 +65,10 @@ def trial(job: Row) -> Row:
 
 @dataclass(frozen=True)
 class EmptyCell:
-    """A cell with nothing hidden: what can be seen in it, and its floor."""
+    """A cell with nothing hidden: what can be seen in it."""
 
     plan: Plan
     evidence: PoseEvidence
-    residual_rms: float
-    heldout_rms: float
 
 
 @lru_cache(maxsize=8)
@@ -66,13 +76,18 @@ def cell_without(scene: str, seed: int) -> EmptyCell:
     """The cell of a scene and a seed, with nothing hidden."""
     measured = measure(scene, seed, {})
     calm = run(session_of(measured))
-    return EmptyCell(measured.plan, evidence_of_state(state_of(calm)), calm.residual_rms, calm.heldout_rms)
+    return EmptyCell(measured.plan, evidence_of_state(state_of(calm)))
+
+
+def _chance(job: Row) -> int:
+    """A seed of the job's own: trials in one cell must not share their noise."""
+    return 10_000 + crc32(json.dumps(job, sort_keys=True).encode()) % 1_000_000
 
 
 def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     """Amplitudes of the laws at the job's multiple of their smallest detectable size."""
     cell = cell_without(job["scene"], job["seed"])
-    true = drawn(cell.plan, laws, job["seed"])
+    true = drawn(cell.plan, laws, _chance(job))
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law
@@ -86,7 +101,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
 
 
 def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measured, Run, Diagnosis, Row]:
-    measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())))
+    measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())), _chance(job))
     first = run(session_of(measured))
     found = diagnose(state_of(first))
     ranked = [s.name for s in found.suspects if s.ranked.score.observable]
@@ -98,6 +113,7 @@ def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measu
         "scatter": [found.rotation * 1e6, found.translation * 1e3],
         "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.suspects[:3]],
         "left": [_left(s.left) for s in found.suspects[:3]],
+        "hand_eye_chi_square": hand_eye_chi_square(measured, first),
     }  # fmt: skip
     return measured, first, found, row
 
@@ -132,6 +148,7 @@ def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
         "heldout": [first.heldout_rms, added.heldout_rms],
         "hand_eye": [hand_eye_error(measured, first.T_mount), hand_eye_error(measured, added.T_mount)],
         "hand_eye_sigma": hand_eye_sigma(measured, added.mount_covariance),
+        "hand_eye_chi_square": hand_eye_chi_square(measured, added),
         "z": {n: (values[n] - true.get(n, 0.0)) / sigmas[n] for n in names if n in true and np.isfinite(sigmas[n])},
         "unseen": [n for n in names if n in true and not np.isfinite(sigmas[n])],
     }
@@ -162,7 +179,7 @@ def _outside(job: Row) -> Row:
             added = change(state_of(first), [name])
         finally:
             del EFFECTS[name]
-        floor = cell_without(job["scene"], job["seed"])
+        floor = run(session_of(measure(job["scene"], job["seed"], {}, chance=_chance(job))))
         row["user"] = {
             "named": list(again.effects), "heldout": [first.heldout_rms, added.heldout_rms, floor.heldout_rms],
             "residual": [first.residual_rms, added.residual_rms, floor.residual_rms],
@@ -175,7 +192,7 @@ def _pair(job: Row) -> Row:
     hidden = _sizes(job, job["effects"])
     if hidden is None:
         return {"verdict": "not shown"}
-    measured = measure(job["scene"], job["seed"], hidden)
+    measured = measure(job["scene"], job["seed"], hidden, chance=_chance(job))
     state: State = state_of(run(session_of(measured)))
     result, lines, last = suggest(state, 4)
     return {

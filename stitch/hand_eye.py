@@ -1,7 +1,8 @@
 """The hand-eye and the effects in use from per-view evidence: generalised least squares, covariance, held-out error.
 
 The poses of the views scatter by the robot's repeatability, which no number of points averages
-out: views are the samples. Estimates with views left out give the held-out error and show whether the
+out: views are the samples. Errors of the scanner that repeat in every view come on top: no number of views
+averages them out either. Estimates with views left out give the held-out error and show whether the
 covariance is too small for these data (jackknife; Efron & Stein 1981): a robot whose pose errors are
 not independent from view to view has a larger one, never a smaller.
 """
@@ -42,14 +43,17 @@ class HandEye:
 
 
 def fit_hand_eye(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns | None = None
-) -> HandEye:
+    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns | None = None,
+    repeating: Sequence[Array] | None = None,
+) -> HandEye:  # fmt: skip
     """Generalised least squares over the pose channels of all captures.
 
     Args:
         freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
         T_mount: (4, 4) hand-eye at which that began.
         columns: effects to fit with it.
+        repeating: per capture (6V, K) twists that the views show for one standard deviation of each of K errors
+            that all views and captures have in common; they widen the covariance and change nothing else.
     """
     columns = columns or Columns(tuple(np.zeros((6 * len(c.scans), 0)) for c in captures), np.zeros(0), np.zeros(0))
     evidence = [
@@ -70,11 +74,17 @@ def fit_hand_eye(
         for fold in e.folds():
             fewer = _without(blocks, k, e, s, t, fold, prior)
             outside += e.squares(fold, (fewer[:, 0], x[:, 0]))
+    if repeating is not None:
+        common = [information(e, s, r)[1] for e, s, r in zip(evidence, scatter, repeating, strict=True)]
+        repeated = covariance @ np.sum(common, axis=0)
+    else:
+        repeated = np.zeros((len(prior), 0))
     inflation = _jackknife_inflation(np.array(left_out), covariance) * _student(len(left_out))
     ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+    covariance = covariance * inflation + repeated @ repeated.T
     return HandEye(
-        T_mount @ frames.exp(x[:6, 0]), covariance[:6, :6] * inflation, inflation, tuple(scatter), ratio,
-        columns.values + x[6:, 0], covariance[6:, 6:] * inflation,
+        T_mount @ frames.exp(x[:6, 0]), covariance[:6, :6], inflation, tuple(scatter), ratio,
+        columns.values + x[6:, 0], covariance[6:, 6:],
     )  # fmt: skip
 
 

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from stitch.diagnosis.start import start_values
 from stitch.effects.chain import Chain, Term, chain_of, corrected
+from stitch.effects.scanner_field import field_scatters
 from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.errors import InputError
 from stitch.frames import Array
@@ -134,7 +136,8 @@ def _correct(
         terms: list[Term] = terms_of(model, chains[0])
         captures = [corrected(chain, terms, model.T_mount) for chain in chains]
         return reuse(captures, model, terms)
-    first = correct(captures, start.T_mount, start.gate, recorder)
+    repeating = partial(field_scatters, chains, ())
+    first = correct(captures, start.T_mount, start.gate, recorder, repeating)
     if not effects:
         return first
     terms = [empty_term(chains[0], known(name)) for name in effects]

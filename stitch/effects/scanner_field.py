@@ -1,34 +1,78 @@
 """What every scanner has: a smooth error over its field and over incidence, a fraction of its noise, in all views.
 
 It repeats from view to view, so no number of views averages it out, and it pretends to be a small effect of the
-scanner. Diagnosis counts it as known scatter: what an effect must exceed.
+scanner. Diagnosis counts it as known scatter: what an effect must exceed. Hand-eye and effects are no better known
+than it lets them.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.optimize import minimize_scalar
 
 from stitch.effects.chain import Chain, Term
-from stitch.effects.columns import all_columns
+from stitch.effects.columns import PointGram, point_gram, seen_twists
 from stitch.effects.contract import Effect, number
 from stitch.effects.views import ScanView
 from stitch.frames import Array
 from stitch.overlap.free_poses import FreePoses
 
-# Rms over the field, as a share of the scanner's noise along the ray.
-_SHARE = 0.5
+# Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
+# effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.
+ALARM_SHARE = 0.5
+# What counts in a covariance is taken from them, with a log-normal prior.
+_USUAL_SHARE, _SPREAD, _SHARES = 0.3, 0.7, (0.01, 10.0)
+# Neighbouring distances share points and normals: so many times the variance of independent ones.
+_CORRELATION = 3.0
+# Combinations that the overlaps show less than this share of the clearest tell nothing.
+_TOLD = 1e-6
 _DEGREE = 3
 # Corners are seen by few points.
 _REACH = 0.98
 
 
-def field_scatter(chain: Chain, terms: Sequence[Term], T_mount: Array, freed: FreePoses) -> Array:
-    """(6V, K) twists that the views show for one standard deviation of each of K independent smooth errors."""
+def field_scatter(
+    chain: Chain, terms: Sequence[Term], freed: FreePoses, share: float | None = ALARM_SHARE
+) -> Array:  # fmt: skip
+    """(6V, K) twists that the views show for one standard deviation of each of K independent smooth errors.
+
+    Args:
+        share: rms of the errors over the scanner's noise; None takes it from what the overlaps show.
+    """
     effect = _field_effect(_half_field(chain))
-    columns = all_columns(chain, terms, [Term(effect, np.zeros(len(effect.specs)))], T_mount, freed)[0][0]
+    sums = point_gram(chain, terms, [Term(effect, np.zeros(len(effect.specs)))], freed)
+    twists = seen_twists(sums, freed)
     noise = float(np.nanmedian([scan.noise for scan in chain.capture.scans]))
-    return np.asarray(columns * (_SHARE * noise if np.isfinite(noise) else 0.0))
+    if not np.isfinite(noise):
+        return np.zeros_like(twists)
+    return np.asarray(twists * noise * (_shown(sums, twists, freed, noise) if share is None else share))
+
+
+def field_scatters(chains: Sequence[Chain], terms: Sequence[Term], freed: Sequence[FreePoses]) -> list[Array]:
+    """The same for every session of a rig, as large as each shows it."""
+    return [field_scatter(chain, terms, f, None) for chain, f in zip(chains, freed, strict=True)]
+
+
+def _shown(sums: PointGram, twists: Array, freed: FreePoses, noise: float) -> float:
+    """Share by the likelihood of what smooth errors leave within the overlaps, beside free poses, and a prior.
+
+    Within overlaps errors f of variance s² change the normal equations by M f: Mf + noise is N(0, s²M² + cσ²M).
+    """
+    g = freed.overlaps.gram
+    own = twists.reshape(g.views, 6, -1)
+    # What the poses do not follow: Σ g² less what moving the views takes away.
+    followed = np.einsum("pik,pil->kl", sums.vector, own[g.pairs[:, 0]] - own[g.pairs[:, 1]])
+    M = sums.square.sum(axis=0) - (followed + followed.T) / 2
+    values, vectors = np.linalg.eigh(M)
+    keep = values > _TOLD * values[-1]
+    squares, values = (vectors.T @ sums.residual.sum(axis=0))[keep] ** 2, values[keep]
+
+    def deviance(log_share: float) -> float:
+        spread = _CORRELATION * g.variance * values + (np.exp(log_share) * noise * values) ** 2
+        return float(np.sum(np.log(spread) + squares / spread) + ((log_share - np.log(_USUAL_SHARE)) / _SPREAD) ** 2)
+
+    return float(np.exp(minimize_scalar(deviance, bounds=np.log(_SHARES), method="bounded").x))
 
 
 def _half_field(chain: Chain) -> Array:

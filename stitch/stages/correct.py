@@ -5,7 +5,7 @@ of the rig, T ← T·exp(ξ) (source A, step 3). Matching tightens from the data
 generalised least-squares step weighs the views by the robot's own scatter (`hand_eye.py`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from stitch.frames import Array
 from stitch.hand_eye import HandEye, fit_hand_eye
 from stitch.overlap.capture import Capture
 from stitch.overlap.capture_evidence import jacobian
-from stitch.overlap.free_poses import free_poses
+from stitch.overlap.free_poses import FreePoses, free_poses
 from stitch.overlap.match import sample
 from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.recorder import Recorder, Silent
@@ -88,13 +88,21 @@ def close_in(
     return T_mount, overlaps, history
 
 
-def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None) -> Correction:
+# From freed views per capture to what `fit_hand_eye` calls `repeating`.
+Repeating = Callable[[Sequence[FreePoses]], list[Array]]
+
+
+def correct(
+    captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None,
+    repeating: Repeating | None = None,
+) -> Correction:  # fmt: skip
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
     Args:
         captures: one per session; all carry the same scanner on the same mount.
         T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
         gate: first distance between partners, length_unit: the coarse error at the part.
+        repeating: errors that all views have in common; they widen the covariance.
 
     Raises:
         NoResultError: no two views of a capture overlap.
@@ -110,7 +118,8 @@ def correct(captures: Sequence[Capture], T_mount: Array, gate: float, recorder: 
         f.seen_from(c.poses(first.T_mount)) if c.sightings is None else free_poses(c, c.poses(first.T_mount), o.gate)
         for c, f, o in zip(captures, freed, overlaps, strict=True)
     )
-    hand_eye = fit_hand_eye(captures, freed, first.T_mount)
+    common = None if repeating is None else repeating(freed)
+    hand_eye = fit_hand_eye(captures, freed, first.T_mount, repeating=common)
     final = tuple(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)

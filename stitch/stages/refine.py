@@ -9,6 +9,7 @@ import numpy as np
 from stitch.effects.chain import Chain, Term, corrected
 from stitch.effects.columns import all_columns
 from stitch.effects.groups import one_by_one
+from stitch.effects.scanner_field import field_scatters
 from stitch.effects.supported import supported
 from stitch.effects.visible import independent, whitened
 from stitch.frames import Array
@@ -73,7 +74,11 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
             whiten = partial(whitened, captures, freed, T_mount, columns, values)
             seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
         fitted = fit_hand_eye(
-            captures, freed, T_mount, Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen])
+            captures,
+            freed,
+            T_mount,
+            Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen]),
+            field_scatters(chains, terms, freed),
         )
         T_mount, before = fitted.T_mount, values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
