@@ -1,0 +1,35 @@
+"""Errors that repeat in every view: how large they are, and what they do to the hand-eye's sigmas."""
+
+from dataclasses import replace
+
+import numpy as np
+from in_memory import session_of
+from scipy.stats import chi2
+
+from data_synth.scene import load_scene
+from data_synth.simulate import simulate
+from stitch import frames, pipeline
+
+SEEDS = 2
+
+
+def chi_squares(share: float) -> tuple[list[float], list[float]]:
+    """Per seed χ² of the hand-eye's error and the sigma of its place (mm); smooth errors of `share` of the noise."""
+    scene = load_scene("drill-plate")
+    scanner = replace(scene.scanner, columns=60, rows=60, field_error=share * scene.scanner.noise)
+    squares, sigmas = [], []
+    for seed in range(SEEDS):
+        measured = simulate(replace(scene, scanner=scanner), {}, seed, views=12)
+        found = pipeline.run(session_of(measured))
+        xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
+        squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))
+        sigmas.append(float(np.sqrt(np.trace(found.mount_covariance[3:, 3:]))))
+    return squares, sigmas
+
+
+def test_sigmas_hold_whatever_the_scanner_repeats():
+    """As large as the noise, or none: the error is within its covariance, and small errors do not widen it as large."""
+    large, small = chi_squares(1.0), chi_squares(0.0)
+    for squares, _ in (large, small):
+        assert sum(squares) < chi2.ppf(0.999, 6 * SEEDS)
+    assert np.mean(large[1]) > 1.5 * np.mean(small[1])
