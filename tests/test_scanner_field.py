@@ -19,7 +19,7 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
     scanner = replace(scene.scanner, columns=60, rows=60, field_error=share * scene.scanner.noise)
     squares, sigmas = [], []
     for seed in range(SEEDS):
-        measured = simulate(replace(scene, scanner=scanner), {}, seed, views=12)
+        measured = simulate(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=12)
         found = pipeline.run(session_of(measured))
         xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
         squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))
