@@ -22,9 +22,9 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch.diagnosis.candidates import _grid_terms
-from stitch.effects.chain import corrected
 from stitch.effects.columns import POINTS, point_gram
 from stitch.effects.contract import EFFECTS
+from stitch.effects.undo import corrected
 from stitch.overlap.free_poses import FreePoses
 from stitch.overlap.match import sample
 from stitch.overlap.overlaps import collect

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from stitch.diagnosis.start import start_values
-from stitch.effects.chain import Chain, Term, chain_of, corrected
+from stitch.effects.chain import Chain, Term, chain_of
 from stitch.effects.scanner_field import field_scatters
 from stitch.effects.terms import empty_term, known, require, terms_of
+from stitch.effects.undo import corrected
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.labelled.beside import Beside, fitted_beside, weighed

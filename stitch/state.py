@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from stitch.effects.chain import Chain, Term, chain_of, corrected
+from stitch.effects.chain import Chain, Term, chain_of
 from stitch.effects.terms import terms_of
+from stitch.effects.undo import corrected
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.frames import Array

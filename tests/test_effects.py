@@ -7,8 +7,10 @@ from in_memory import session_of
 
 from stitch import frames
 from stitch.effects import EFFECTS
-from stitch.effects.chain import Term, chain_of, corrected, placed, shifts, twists
+from stitch.effects.chain import Term, chain_of
+from stitch.effects.slopes import shifts, twists
 from stitch.effects.terms import known, require
+from stitch.effects.undo import corrected, placed
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.overlap.capture import capture

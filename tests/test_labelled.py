@@ -20,8 +20,10 @@ from stitch.diagnosis.ranking import certain, rank
 from stitch.diagnosis.score import score
 from stitch.diagnosis.start import evidence_of_state
 from stitch.diagnosis.suggest import suggest
-from stitch.effects.chain import Term, chain_of, corrected, shift_targets, target_shifts
+from stitch.effects.chain import Term, chain_of
 from stitch.effects.contract import EFFECTS
+from stitch.effects.slopes import target_shifts
+from stitch.effects.undo import corrected, shift_targets
 from stitch.errors import InputError
 from stitch.labelled.landmarks import settled
 from stitch.labelled.rows import effect_rows, rows_of

@@ -14,9 +14,10 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
-from stitch.effects.chain import Term, chain_of, corrected
+from stitch.effects.chain import Term, chain_of
 from stitch.effects.columns import point_gram
 from stitch.effects.contract import EFFECTS
+from stitch.effects.undo import corrected
 from stitch.overlap.capture import capture
 from stitch.overlap.free_poses import answer, free_poses
 from stitch.overlap.target_pairs import joined, target_pairs

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.effects.chain import corrected
+from stitch.effects.undo import corrected
 from stitch.effects.views import Views
 from stitch.frames import Array, Indices
 from stitch.overlap.match import Match, sample

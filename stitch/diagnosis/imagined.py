@@ -12,8 +12,10 @@ from stitch.diagnosis.candidates import with_values
 from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.target_evidence import TargetEvidence
-from stitch.effects.chain import Chain, placed, twists
+from stitch.effects.chain import Chain
 from stitch.effects.columns import POINTS
+from stitch.effects.slopes import twists
+from stitch.effects.undo import placed
 from stitch.effects.views import torques_of
 from stitch.frames import Array
 from stitch.labelled.imagined import imagined_rows

@@ -9,9 +9,10 @@ from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.pose_evidence import pose_evidence
 from stitch.diagnosis.score import score
 from stitch.diagnosis.target_evidence import target_evidence
-from stitch.effects.chain import Term, corrected
+from stitch.effects.chain import Term
 from stitch.effects.contract import Effect
 from stitch.effects.terms import empty_term
+from stitch.effects.undo import corrected
 from stitch.labelled.landmarks import drawing_of
 from stitch.overlap.free_poses import free_poses
 from stitch.state import State

@@ -8,8 +8,9 @@ import numpy as np
 
 from stitch.diagnosis.freedom import Freedom, freedom_of
 from stitch.diagnosis.target_trial import TargetTrial
-from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import PointGram
+from stitch.effects.undo import corrected
 from stitch.effects.visible import independent
 from stitch.folds import JointEnd, grouped_folds, joint_ends
 from stitch.frames import Array, Indices

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.effects.chain import Chain, Term, shifts, target_shifts, twists
+from stitch.effects.chain import Chain, Term
+from stitch.effects.slopes import shifts, target_shifts, twists
 from stitch.frames import Array, Indices
 from stitch.overlap.free_poses import FreePoses, answer
 from stitch.overlap.match import Match

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.effects.chain import Chain, corrected
+from stitch.effects.chain import Chain
+from stitch.effects.undo import corrected
 from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of, taken_out
 from stitch.labelled.gross import Outlier, gross

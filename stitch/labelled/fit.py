@@ -6,7 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.chain import Chain, Term
+from stitch.effects.undo import corrected
 from stitch.errors import NoResultError
 from stitch.folds import grouped_folds, places
 from stitch.frames import Array, exp

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.chain import Chain, Term
+from stitch.effects.undo import corrected
 from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.landmarks import Landmarks, settled
 from stitch.labelled.rows import evidence_of_rows, rows_of

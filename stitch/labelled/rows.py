@@ -12,8 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.effects.chain import Chain, Term, target_shifts, twists
+from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import POINTS
+from stitch.effects.slopes import target_shifts, twists
 from stitch.frames import Array, Mask
 from stitch.labelled.landmarks import Landmarks
 from stitch.overlap.capture import Capture

@@ -6,11 +6,12 @@ from functools import partial
 
 import numpy as np
 
-from stitch.effects.chain import Chain, Term, corrected
+from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import all_columns
 from stitch.effects.groups import one_by_one
 from stitch.effects.scanner_field import field_scatters
 from stitch.effects.supported import supported
+from stitch.effects.undo import corrected
 from stitch.effects.visible import independent, whitened
 from stitch.frames import Array
 from stitch.hand_eye import Columns, HandEye, fit_hand_eye
