@@ -16,9 +16,9 @@ from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.result import Run
-from stitch.run_folder import model_of
 from stitch.session import Session
 from stitch.state import state_of
+from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")

@@ -1,4 +1,4 @@
-"""What a run computed, as plain frozen data; `run_folder.py` writes it to disk."""
+"""What a run computed, as plain frozen data; `writing` puts it on disk."""
 
 from __future__ import annotations
 

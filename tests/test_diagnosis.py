@@ -26,9 +26,9 @@ from stitch.effects.visible import independent
 from stitch.errors import InputError
 from stitch.folds import grouped_folds, joint_ends
 from stitch.pipeline import run
-from stitch.run_folder import to_json
 from stitch.state import load_state, state_of
 from stitch.variance import Evidence, at_variances, fit_variances
+from stitch.writing.json_file import to_json
 
 
 def blade_run(seed, hidden, mount="eye_to_hand", views=12):

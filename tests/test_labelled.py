@@ -34,10 +34,10 @@ from stitch.reading.points_csv import Sighting
 from stitch.reading.session_folder import load_session
 from stitch.reading.urdf import robot_from_urdf
 from stitch.robot import forward, robot_from_dh
-from stitch.run_folder import model_of
 from stitch.session import Scanner, Session, View
 from stitch.state import state_of
 from stitch.urdf_write import to_urdf
+from stitch.writing.result_document import model_of
 
 ROWS = [
     {"a": 0, "alpha_deg": -90, "d": 290}, {"a": 270, "alpha_deg": 0, "d": 0, "theta_deg": -90},

@@ -8,8 +8,8 @@ import tomli_w
 
 from stitch.calibrate.robot import CalibratedRobot, calibrated, dh_rows, poses_to_add
 from stitch.result import Run
-from stitch.run_folder import result_document
 from stitch.urdf_write import to_urdf
+from stitch.writing.result_document import result_document
 
 _HEADER = """# The [robot] table of session.toml with the offsets and link errors that were found: put it there in place
 # of the nominal one. {beyond}

@@ -10,11 +10,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch import run_folder
 from stitch.cli.progress import MICROMETRES
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
+from stitch.writing import run_folder
+from stitch.writing.json_file import to_json
 
 
 def batch(
@@ -30,7 +31,7 @@ def batch(
         raise InputError("two of the sessions have folders of the same name; run them with -o of their own")
     rows = list(_map(sessions, folders, workers, scheduler))
     if as_json:
-        print(run_folder.to_json(rows))
+        print(to_json(rows))
     else:
         _show(rows)
     failed = [row for row in rows if row["error"]]

@@ -9,7 +9,6 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch import run_folder
 from stitch.calibrate.robot import calibrated
 from stitch.calibrate.robot_report import beyond_sentence, write_robot
 from stitch.calibrate.robot_report import document_of as robot_document
@@ -23,8 +22,9 @@ from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.result import Run
-from stitch.run_folder import write_json
 from stitch.state import state_of
+from stitch.writing import run_folder
+from stitch.writing.json_file import to_json, write_json
 
 calibrate = typer.Typer(
     help="Find hand-eyes from known objects and from trackers, and an arm's own errors.",
@@ -104,7 +104,7 @@ def robot(
         write_diagnosis(diagnosis, state_of(result), scratch)
     document = robot_document(result, lines, diagnosis.sentence)
     if as_json:
-        print(run_folder.to_json(document))
+        print(to_json(document))
     else:
         _show_robot(result, document, lines, target)
 

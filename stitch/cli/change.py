@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch import run_folder
 from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.progress import MICROMETRES
 from stitch.cli.run import recorder_for
@@ -22,6 +21,9 @@ from stitch.recorder import Recorder
 from stitch.result import Run
 from stitch.rounding import rounded
 from stitch.state import State, load_state, state_of
+from stitch.writing import run_folder
+from stitch.writing.json_file import to_json
+from stitch.writing.result_document import result_document
 
 _SCRATCH = ".new"
 # A held-out residual falls if it does by more than new matches alone change it.
@@ -99,7 +101,7 @@ def _finish(run: Path, result: Run, as_json: bool) -> None:
     run_folder.extend("stitch.reports", result, scratch / "report.html")
     run_folder.take_over(scratch, run)
     if as_json:
-        print(run_folder.to_json(run_folder.result_document(result)))
+        print(to_json(result_document(result)))
     else:
         show_ledger(result)
 

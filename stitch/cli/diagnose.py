@@ -12,8 +12,9 @@ from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.words import amounts_of
-from stitch.run_folder import extend, to_json, write_json
 from stitch.state import State, load_state
+from stitch.writing.json_file import to_json, write_json
+from stitch.writing.run_folder import extend
 
 _SHOWN = 6
 

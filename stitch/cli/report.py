@@ -7,11 +7,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from stitch import run_folder
 from stitch.cli.diagnose import write_diagnosis
 from stitch.diagnosis.diagnose import diagnose
 from stitch.pipeline import change
 from stitch.state import load_state
+from stitch.writing import run_folder
 
 
 def report(

@@ -9,18 +9,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch import run_folder
 from stitch.cli.progress import MICROMETRES, Progress, Tee
 from stitch.effects.terms import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
-from stitch.mesh import write_mesh
 from stitch.model import read_model, write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.recorder import Recorder
 from stitch.result import Run
 from stitch.session import Session
+from stitch.writing import run_folder
+from stitch.writing.json_file import to_json
+from stitch.writing.mesh import write_mesh
+from stitch.writing.result_document import model_of, result_document
 
 
 def run(
@@ -69,10 +71,10 @@ def run(
         for result, folder in zip(runs, folders, strict=True):
             _write(result, folder, mesh)
         if len(runs) > 1:
-            write_model(run_folder.model_of(runs[0]), scratch / "model.toml")
-    documents = [run_folder.result_document(result) for result in runs]
+            write_model(model_of(runs[0]), scratch / "model.toml")
+    documents = [result_document(result) for result in runs]
     if as_json:
-        print(run_folder.to_json(documents[0] if len(documents) == 1 else documents))
+        print(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
 

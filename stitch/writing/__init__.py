@@ -1,0 +1,1 @@
+"""Runs and results as files: whole or not at all."""
