@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.diagnosis.answer import Diagnosis, Suspect
-from stitch.diagnosis.compare import Comparison, Table
+from stitch.diagnosis.comparison import Comparison, Table
 from stitch.result import Step
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, covariate, plain

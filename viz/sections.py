@@ -8,7 +8,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
 from stitch.diagnosis.answer import Diagnosis
-from stitch.diagnosis.compare import Comparison
+from stitch.diagnosis.comparison import Comparison
 from stitch.diagnosis.words import amounts_of
 from stitch.state import State
 from viz import captions

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.compare import Comparison, Table, edges_of, view_properties
+from stitch.diagnosis.comparison import Comparison, Table, edges_of, view_properties
 from stitch.effects.undo import corrected
 from stitch.frames import Array, Indices
 from stitch.labelled.landmarks import drawing_of, settled

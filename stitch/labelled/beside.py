@@ -8,9 +8,10 @@ import numpy as np
 from stitch.effects.chain import Chain
 from stitch.effects.undo import corrected
 from stitch.frames import Array
-from stitch.labelled.fit import LabelledFit, rms_of, taken_out
+from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.gross import Outlier, gross
 from stitch.labelled.landmarks import settled
+from stitch.labelled.robust import taken_out
 from stitch.labelled.rows import Rows, evidence_of_rows, rows_of
 from stitch.labelled.solve import Blocks
 from stitch.stages.correct import Correction

@@ -8,10 +8,11 @@ from stitch import frames
 from stitch.effects.chain import Chain, Term
 from stitch.effects.terms import empty_term, known, terms_of
 from stitch.frames import Array
-from stitch.labelled.fit import LabelledFit, rms_of, robust_fit, without_gross
+from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.gross import Outlier
 from stitch.labelled.landmarks import Drawing, drawing_of, settled
 from stitch.labelled.reuse import judged
+from stitch.labelled.robust import robust_fit, without_gross
 from stitch.labelled.rows import Rows, evidence_of_rows, rows_of
 from stitch.labelled.start import closed_form
 from stitch.labelled.words import notes_of, sentence
