@@ -1,8 +1,8 @@
 """Find a coarse hand-eye from nothing, or take the given one.
 
 Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
-of one fixed target, minimised from many starting rotations; (2) relative scan motions against the
-robot's (AX = XB, five solvers; `relative_motion.py`). Every candidate is then closed in on the scans
+of one fixed target, minimised from many starting rotations (`centroids.py`); (2) relative scan motions
+against the robot's (AX = XB, five solvers; `relative_motion.py`). Every candidate is then closed in on the scans
 at low resolution, and the consistency of the whole set decides: the truncated mean square distance
 between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
 """
@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
+from stitch.coarse_starts.centroids import centroid_hand_eyes, scanner_centre
+from stitch.coarse_starts.relative_motion import motion_candidates
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.overlap.capture import Capture
 from stitch.overlap.match import sample, search
-from stitch.relative_motion import motion_candidates
 from stitch.stages.correct import close_in
 from stitch.threads import parallel
 
-_STARTS = 24
 _SEARCH_SAMPLES = 120
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
 _SEARCH_ITERATIONS = 7
@@ -118,43 +117,10 @@ def _starts(captures: Sequence[Capture], tolerance: float) -> list[tuple[str, Ar
     return starts + kept
 
 
-def scanner_centre(captures: Sequence[Capture]) -> Array:
-    """Mean centroid of the scans in the scanner frame (3,)."""
-    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
-
-
 def _turn_about(rotation: Array, centre: Array) -> Array:
     T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
     T[:3, 3] = centre - T[:3, :3] @ centre
     return T
-
-
-def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
-    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
-
-    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
-    """
-    centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
-
-    def residual(x: Array) -> Array:
-        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
-        rows = []
-        for c, centroid in zip(captures, centroids, strict=True):
-            placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
-            rows.append((placed - placed.mean(axis=0)).ravel())
-        return np.concatenate(rows)
-
-    fits = []
-    for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
-        fit = least_squares(residual, np.r_[start.as_rotvec(), np.zeros(3)], method="trf", max_nfev=100, x_scale="jac")
-        fits.append((float(fit.cost), fit.x))
-    fits.sort(key=lambda pair: pair[0])
-    found: list[Array] = []
-    for _, x in fits:
-        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
-        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
-            found.append(T)
-    return found
 
 
 def _close(captures: Sequence[Capture], source: str, T_mount: Array, size: float) -> Candidate | None:
