@@ -23,7 +23,8 @@ from stitch.writing.result_document import model_of
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
 PAGE = ROOT / "docs" / "points.md"
-DATA = ("irb120-tracker", "ur10-tmac")
+# The way to leave poses out whose fitted part leads the search: odd poses of the UR10 have another elbow.
+DATA = {"irb120-tracker": "even → odd", "ur10-tmac": "random halves"}
 _BLOCKS = 4
 
 
@@ -64,9 +65,9 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     return float(np.sqrt(np.mean(d**2))), float(d.mean())
 
 
-def suggested(session: Session, at_most: int) -> tuple[list[list[str]], list[str]]:
-    """The way that the diagnosis takes on the even poses alone, and what it says on it."""
-    first = run(only(session, np.arange(0, len(session.views), 2)))
+def suggested(session: Session, at_most: int, fit_on: np.ndarray) -> tuple[list[list[str]], list[str]]:
+    """The way that the diagnosis takes on some poses alone, and what it says on it."""
+    first = run(only(session, fit_on))
     found, lines, last = suggest(state_of(first), at_most)
     return [list(step.effects) for step in (found or first).ledger], [*lines, last.sentence]
 
@@ -74,9 +75,9 @@ def suggested(session: Session, at_most: int) -> tuple[list[list[str]], list[str
 def measure(name: str, at_most: int, models: list[list[str]] | None, target: Path) -> None:
     """Every model judged in all ways; each row is written as it comes."""
     session = load_session(SHARED / name)
-    steps, told = (models, []) if models else suggested(session, at_most)
-    print(name, steps, *told, sep="\n", flush=True)
     ways = splits(session)
+    steps, told = (models, []) if models else suggested(session, at_most, ways[DATA[name]][0][0])
+    print(name, steps, *told, sep="\n", flush=True)
     rows: list[dict[str, object]] = []
     for effects in steps:
         rows.append({"effects": effects, "judged": {n: judged(session, effects, way) for n, way in ways.items()}})
@@ -103,7 +104,7 @@ def table(found: dict[str, object]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=DATA)
+    parser.add_argument("names", nargs="*", default=list(DATA))
     parser.add_argument("--at-most", type=int, default=8)
     parser.add_argument("--models", help="effects by commas, models by semicolons; the first may be empty")
     parser.add_argument("--cache", type=Path, default=ROOT / "runs" / "real_points")
