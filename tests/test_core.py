@@ -115,7 +115,7 @@ def test_repeatability_is_recovered():
     """40 µm and 60 µrad put in, over 6 cells: the mean estimate within 35 %."""
     found = []
     for seed in range(6):
-        measured, capture = synthetic(seed, views=12, repeatability=(60e-6, 0.04))
+        measured, capture = synthetic(seed, views=12, repeatability=(60e-6, 0.04), pixels=100)
         poses = capture.poses(measured.T_mount)
         scatter = scatter_of(capture, free_poses(capture, poses, 1.5), measured.T_mount)
         found.append((scatter.rotation, scatter.translation))

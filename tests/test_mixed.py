@@ -153,7 +153,7 @@ def test_surfaces_of_huge_variance_leave_the_answer_of_the_targets():
     np.testing.assert_allclose(left, A @ x + e, atol=1e-3 * np.abs(A @ x + e).max())
 
 
-SEEDS = range(3)
+SEEDS = range(2)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def test_clouds_of_huge_noise_leave_the_answer_of_the_points():
 
 
 def test_points_weigh_by_their_own_sigma():
-    measured = [plate(seed, sigma=0.3) for seed in range(2)]
+    measured = [plate(seed, sigma=0.3) for seed in range(1)]
     truths = [m.T_mount for m in measured]
     honest, boasting = ([run(mixed(m, stated)) for m in measured] for stated in (0.3, 0.003))
     assert far(honest, truths) < far(boasting, truths)

@@ -16,10 +16,10 @@ SEEDS = 2
 def chi_squares(share: float) -> tuple[list[float], list[float]]:
     """Per seed χ² of the hand-eye's error and the sigma of its place (mm); smooth errors of `share` of the noise."""
     scene = load_scene("drill-plate")
-    scanner = replace(scene.scanner, columns=60, rows=60, field_error=share * scene.scanner.noise)
+    scanner = replace(scene.scanner, columns=50, rows=50, field_error=share * scene.scanner.noise)
     squares, sigmas = [], []
     for seed in range(SEEDS):
-        measured = simulate(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=12)
+        measured = simulate(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
         found = pipeline.run(session_of(measured))
         xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
         squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))

@@ -26,6 +26,7 @@ class Beyond:
     worst_share: float  # the same at the end that is made worse most clearly
     worst_sigma: float  # standard error of `worst_share`, views as samples
     count: int  # of ends
+    believed: float  # `share` where the other views are not believed to know a larger effect than all views do
 
     @property
     def helps(self) -> bool:
@@ -48,13 +49,13 @@ class Beyond:
 def beyond(evidence: ViewEvidence, scored: Score) -> Beyond | None:
     """The best form of a candidate at the ends; None where the views are too few to leave one out."""
     X = np.hstack([evidence.model, scored.form.twists])
-    trial = evidence.trial(X, precision=believed_size(evidence, scored))
-    present = evidence.trial(evidence.model)
+    trials = evidence.trial(X), evidence.trial(evidence.model), evidence.trial(X, None, believed_size(evidence, scored))
     ends = evidence.ends()
     if not ends:
         return None
-    squares = [tuple(t.squares(t.solve(end.views))[end.views] for t in (trial, present)) for end in ends]
-    shares = [share_of(with_it, without) for with_it, without in squares]
+    squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]
+    shares = [share_of(with_it, without) for with_it, without, _ in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
-    sums = np.array([[own.sum() for own in pair] for pair in squares])
-    return Beyond(*share_of(*sums.T), ends[worst], *shares[worst], len(ends))
+    with_it, without, believed = np.array([[own.sum() for own in row] for row in squares]).T
+    total = share_of(with_it, without)
+    return Beyond(*total, ends[worst], *shares[worst], len(ends), float(believed.sum() / without.sum()))

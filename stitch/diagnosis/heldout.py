@@ -9,6 +9,9 @@ from stitch.diagnosis.score import Score
 from stitch.effects.columns import PointGram
 from stitch.frames import Array
 
+# Of a plausible size: what was not found has some size, or its prior would have none.
+_NOTHING = 1e-6
+
 
 @dataclass(frozen=True)
 class Left:
@@ -62,8 +65,9 @@ def believed_size(evidence: ViewEvidence, scored: Score) -> Array:
     effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
     left to see does not count for more than that.
     """
-    size = np.sqrt(scored.values**2 + scored.sigmas**2)
-    return np.append(np.zeros(evidence.model.shape[1]), 1 / np.maximum(size, 1e-300) ** 2)
+    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
+    size = np.maximum(size, _NOTHING * scored.form.sizes)
+    return np.append(np.zeros(evidence.model.shape[1]), 1 / size**2)
 
 
 def share_of(with_it: Array, without: Array) -> tuple[float, float]:

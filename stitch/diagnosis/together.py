@@ -30,7 +30,8 @@ def together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Rank
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
     effects are added one by one as long as one can be named beside those before; then each must hold its
     place beside all the others. Of those that err beyond the measured poses the one without which the others err
-    least is left out, and the search goes on: what it imitated others may explain.
+    least is left out, and the search goes on: what it imitated others may explain. For that choice nothing is
+    believed to be larger than found: beside an imitation the right effect is hardly known without an end.
     """
     candidates = [c for c in candidates if c.effect.tier != "empirical"]
     chain, refused = _grown(evidence, candidates, [best]), dict[str, str]()
@@ -41,7 +42,7 @@ def together(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Rank
         erring = {name: found for name, found in tried if found is not None and not found.helps}
         if not erring:
             return Together(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
-        name = max(erring, key=lambda name: erring[name].share)
+        name = max(erring, key=lambda name: erring[name].believed)
         refused[name] = erring[name].told(name)
         candidates = [c for c in candidates if c.name != name]
         chain = _grown(evidence, candidates, [r for r in chain if r.name != name])

@@ -72,6 +72,8 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
                    for chain, c, f in zip(chains, captures, freed, strict=True)]  # fmt: skip
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
         if iteration < CHOOSING:
+            # What the scanner repeats hardly changes with the last micrometres.
+            repeating = field_scatters(chains, terms, freed)
             whiten = partial(whitened, captures, freed, T_mount, columns, values)
             seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
         fitted = fit_hand_eye(
@@ -79,7 +81,7 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
             freed,
             T_mount,
             Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen]),
-            field_scatters(chains, terms, freed),
+            repeating,
         )
         T_mount, before = fitted.T_mount, values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
