@@ -57,6 +57,10 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
     others = (r for r in likely if r.name != best.name and r.name not in refused)
     group = (best, *(() if second is not None else others))
+    if len(group) > 1 and evidence.chain.views.count < MANY:
+        two = _both(evidence, candidates, best)
+        if two is not None:
+            return Selection("missing_effect", two[:1], ranked, empirical, two[1])
     verdict, notes = "missing_effect" if len(group) == 1 else "cannot_tell", tuple(refused.values())
     return Selection(verdict, group, ranked, empirical, second, notes)
 
@@ -65,6 +69,23 @@ def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     """True if the poses scatter as no arm does."""
     rotation, translation = np.sqrt(evidence.null.variances[:2])
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
+
+
+def _both(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked] | None:
+    """Two effects that are both missing, where one alone left several as likely: what one of them took for itself.
+
+    Each must be certain beside the other, and beside the second no other may come near the first.
+    """
+    second = _second(evidence, candidates, best)
+    if second is None:
+        return None
+    others = [c for c in candidates if c.name != second.name and c.effect.tier != "empirical"]
+    first, *rest = rank(score_all(evidence.beside(second.score.form.columns), others))[0]
+    if not certain(first) or any(contends(r) and r.log_posterior > first.log_posterior - ODDS for r in rest):
+        return None
+    beside_first = evidence.beside(first.score.form.columns)
+    again = rank(score_all(beside_first, [second.score.candidate]))[0][0]
+    return (first, again) if certain(again) else None
 
 
 def _second(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
