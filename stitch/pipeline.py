@@ -137,7 +137,7 @@ def _correct(
         terms: list[Term] = terms_of(model, chains[0])
         captures = [corrected(chain, terms, model.T_mount) for chain in chains]
         return reuse(captures, model, terms)
-    repeating = partial(field_scatters, chains, ())
+    repeating = partial(field_scatters, chains)
     first = correct(captures, start.T_mount, start.gate, recorder, repeating)
     if not effects:
         return first

@@ -161,7 +161,7 @@ def pose_evidence(
     hand_eye = jacobian(capture.carriers(T_mount), g.centre)
     extra = np.hstack([np.zeros((6 * g.views, 0)), *all_columns(chain, terms, terms, T_mount, freed)[0]])
     sizes = np.array([p.typical for t in terms for p in chain.parameters(t.effect)])
-    field = channel.left @ field_scatter(chain, terms, freed)
+    field = channel.left @ field_scatter(chain, freed)
     alone = replace(evidence_of(channel), fixed=(field @ field.T)[None])
     half = np.linalg.cholesky(alone.covariance(fit_variances(alone, both_starts=True).variances)[0])
     own, further = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.left @ extra))

@@ -4,7 +4,7 @@ Effects of robot, mount and part move views as a whole. Effects of points change
 measure; what they look like to the poses is H⁺BᵀWg, with g the change of the distance e per unit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,14 +40,33 @@ def pose_twists(chain: Chain, terms: Sequence[Term], term: Term, T_mount: Array,
 
 
 def point_gram(chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], freed: FreePoses) -> PointGram:
-    """Stream the pairs once for all parameters of the point effects in `candidates`, a block of rows at a time."""
+    """Sums over the correspondences for all parameters of the point effects in `candidates`."""
+
+    def of_points(v: int, index: Indices) -> Array:
+        return np.concatenate([shifts(chain, terms, term, v, freed.poses[v], index) for term in candidates])
+
+    def of_targets() -> Array:
+        return np.concatenate([target_shifts(chain, terms, term, freed.poses) for term in candidates])
+
+    return streamed(freed, chain.capture.noise_factor, of_points, of_targets)
+
+
+def streamed(
+    freed: FreePoses, noise_factor: float, of_points: Callable[[int, Indices], Array], of_targets: Callable[[], Array]
+) -> PointGram:
+    """Stream the pairs once, a block of rows at a time.
+
+    Args:
+        noise_factor: of the capture, by which labelled points count beside the surfaces.
+        of_points: (K, N, 3) how far some points of view v move per unit, scanner frame.
+        of_targets: (K, V, S, 3) the same for all labelled points.
+    """
     g = freed.overlaps.gram
 
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
         own = frames.rotate(frames.inverse(freed.poses[v]), normal)
-        found = [shifts(chain, terms, term, v, freed.poses[v], index) for term in candidates]
-        return np.concatenate([np.einsum("kni,ni->nk", f, own) for f in found], axis=1)
+        return np.asarray(np.einsum("kni,ni->nk", of_points(v, index), own))
 
     def of_pair(m: Match) -> tuple[Array, Array, Array]:
         weight = m.weight * tukey(m.residual, g.scale)
@@ -62,22 +81,19 @@ def point_gram(chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], 
         vector, residual, square = (sum(p) for p in zip(*parts, strict=True))
         return vector, residual, square
 
-    sums = [*parallel(of_pair, freed.overlaps.matches), *_of_targets(chain, terms, candidates, freed)]
+    sums = [*parallel(of_pair, freed.overlaps.matches), *_of_targets(freed, noise_factor, of_targets)]
     return PointGram(*(np.array([s[i] for s in sums]) for i in range(3)))
 
 
-def _of_targets(
-    chain: Chain, terms: Sequence[Term], candidates: Sequence[Term], freed: FreePoses
-) -> list[tuple[Array, ...]]:
+def _of_targets(freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array]) -> list[tuple[Array, ...]]:
     """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
     targets, g = freed.overlaps.targets, freed.overlaps.gram
     if targets is None:
         return []
-    slopes = np.concatenate([target_shifts(chain, terms, term, freed.poses) for term in candidates])
-    moved = np.moveaxis(frames.rotate(freed.poses, slopes), 0, -1)  # (V, S, 3, K)
+    moved = np.moveaxis(frames.rotate(freed.poses, of_targets()), 0, -1)  # (V, S, 3, K)
     (v, w), (slot_v, slot_w) = targets.views.T, targets.slots.T
     change = moved[v, slot_v] - moved[w, slot_w]
-    weighted = change * (chain.capture.noise_factor * g.variance * targets.information)[:, None, None]
+    weighted = change * (noise_factor * g.variance * targets.information)[:, None, None]
     vector = by_pair(targets, np.einsum("nia,nik->nak", targets.lever(g.centre), weighted))[1]
     residual = by_pair(targets, np.einsum("ni,nik->nk", targets.apart, weighted))[1]
     square = by_pair(targets, np.einsum("nik,nil->nkl", change, weighted))[1]

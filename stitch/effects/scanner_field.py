@@ -11,11 +11,9 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import minimize_scalar
 
-from stitch.effects.chain import Chain, Term
-from stitch.effects.columns import PointGram, point_gram, seen_twists
-from stitch.effects.contract import Effect, number
-from stitch.effects.views import ScanView
-from stitch.frames import Array
+from stitch.effects.chain import Chain
+from stitch.effects.columns import PointGram, seen_twists, streamed
+from stitch.frames import Array, Indices
 from stitch.overlap.free_poses import FreePoses
 
 # Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
@@ -32,26 +30,37 @@ _DEGREE = 3
 _REACH = 0.98
 
 
-def field_scatter(
-    chain: Chain, terms: Sequence[Term], freed: FreePoses, share: float | None = ALARM_SHARE
-) -> Array:  # fmt: skip
+def field_scatter(chain: Chain, freed: FreePoses, share: float | None = ALARM_SHARE) -> Array:
     """(6V, K) twists that the views show for one standard deviation of each of K independent smooth errors.
 
     Args:
         share: rms of the errors over the scanner's noise; None takes it from what the overlaps show.
     """
-    effect = _field_effect(_half_field(chain))
-    sums = point_gram(chain, terms, [Term(effect, np.zeros(len(effect.specs)))], freed)
+    capture, half = chain.capture, _half_field(chain)
+
+    def of_points(v: int, index: Indices) -> Array:
+        return _undone(capture.scans[v].points[index], chain.scan_views[v].cosine[index], half)
+
+    def of_targets() -> Array:
+        assert capture.sightings is not None
+        points = capture.sightings.points
+        seen = capture.sightings.target >= 0
+        # An empty slot has no ray; nobody knows at what slant a target was seen.
+        flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
+        moved = _undone(flat, np.ones(len(flat)), half).reshape(-1, *points.shape)
+        return np.where(seen[..., None], moved, 0.0)
+
+    sums = streamed(freed, capture.noise_factor, of_points, of_targets)
     twists = seen_twists(sums, freed)
-    noise = float(np.nanmedian([scan.noise for scan in chain.capture.scans]))
+    noise = float(np.nanmedian([scan.noise for scan in capture.scans]))
     if not np.isfinite(noise):
         return np.zeros_like(twists)
     return np.asarray(twists * noise * (_shown(sums, twists, freed, noise) if share is None else share))
 
 
-def field_scatters(chains: Sequence[Chain], terms: Sequence[Term], freed: Sequence[FreePoses]) -> list[Array]:
+def field_scatters(chains: Sequence[Chain], freed: Sequence[FreePoses]) -> list[Array]:
     """The same for every session of a rig, as large as each shows it."""
-    return [field_scatter(chain, terms, f, None) for chain, f in zip(chains, freed, strict=True)]
+    return [field_scatter(chain, f, None) for chain, f in zip(chains, freed, strict=True)]
 
 
 def _shown(sums: PointGram, twists: Array, freed: FreePoses, noise: float) -> float:
@@ -81,20 +90,16 @@ def _half_field(chain: Chain) -> Array:
     return np.asarray(np.maximum(np.quantile(slopes, _REACH, axis=0), 1e-6))
 
 
-def _field_effect(half: Array) -> Effect:
-    """Legendre products of the field up to the third degree, of unit rms together, and the slope with incidence."""
+def _undone(points: Array, cosine: Array, half: Array) -> Array:
+    """(K, N, 3) what undoes smooth errors along the rays of points (N, 3), scanner frame, per unit.
+
+    Legendre products over the field, of unit rms together, and the slope with incidence.
+    """
+    a, b = np.clip(points[:, :2] / points[:, 2:] / half, -1.2, 1.2).T
+    powers = [legendre.legvander(x, _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1) for x in (a, b)]
     orders = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1) if 0 < i + j <= _DEGREE]
     weights = np.array([1.0 / (i + j) for i, j in orders])
     weights /= np.linalg.norm(weights)
-
-    def smooth(points: Array, view: ScanView, **sizes: float) -> Array:
-        a, b = np.clip(points[:, :2] / points[:, 2:] / half, -1.2, 1.2).T
-        powers_a, powers_b = legendre.legvander(a, _DEGREE), legendre.legvander(b, _DEGREE)
-        shift = sizes["incidence"] * (1 / view.cosine - 1)
-        for weight, (i, j) in zip(weights, orders, strict=True):
-            unit = np.sqrt((2 * i + 1) * (2 * j + 1))
-            shift = shift + sizes[f"p{i}{j}"] * weight * unit * powers_a[:, i] * powers_b[:, j]
-        return np.asarray(points + view.along(points) * shift[:, None])
-
-    specs = {name: number("mm", typical=0.01, limit=1.0) for name in [*(f"p{i}{j}" for i, j in orders), "incidence"]}
-    return Effect("scanner_field", "sensor", specs, smooth, (), (), "empirical")
+    smooth = [w * powers[0][:, i] * powers[1][:, j] for w, (i, j) in zip(weights, orders, strict=True)]
+    rays = points / np.linalg.norm(points, axis=1)[:, None]
+    return np.asarray(-np.array([*smooth, 1 / cosine - 1])[..., None] * rays)

@@ -73,7 +73,7 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
         values = np.concatenate([np.zeros(0), *(t.values for t in terms)])
         if iteration < CHOOSING:
             # What the scanner repeats hardly changes with the last micrometres.
-            repeating = field_scatters(chains, terms, freed)
+            repeating = field_scatters(chains, freed)
             whiten = partial(whitened, captures, freed, T_mount, columns, values)
             seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
         fitted = fit_hand_eye(
