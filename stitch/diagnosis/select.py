@@ -16,6 +16,9 @@ MANY = 100
 # No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
+# Errors of one and two periods a turn have a name; those of three and four have not.
+_GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -54,6 +57,8 @@ def select(evidence: ViewEvidence, candidates: Sequence[Candidate], length_unit:
         both = best.log_posterior + (0.0 if second is None else second.score.gain + np.log(PHYSICAL / len(ranked)))
         if stray.log_posterior > both + ODDS:
             return Selection("unknown_effect", (), ranked, empirical)
+    if _order_open(best, empirical):
+        return Selection("unknown_effect", (), ranked, empirical)
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
     others = (r for r in likely if r.name != best.name and r.name not in refused)
     group = (best, *(() if second is not None else others))
@@ -69,6 +74,12 @@ def implausible(evidence: ViewEvidence, length_unit: str) -> bool:
     """True if the poses scatter as no arm does."""
     rotation, translation = np.sqrt(evidence.null.variances[:2])
     return bool(rotation > IMPLAUSIBLE[0] or translation * {"mm": 1.0, "m": 1e3}[length_unit] > IMPLAUSIBLE[1])
+
+
+def _order_open(best: Ranked, empirical: Sequence[Ranked]) -> bool:
+    """True for a gear error that over so short a range may be one of an order without a name."""
+    near = (r.name for r in empirical if r.log_posterior > best.log_posterior - ODDS)
+    return best.name in _GEARS and any(name.startswith(_NAMELESS_ORDERS) for name in near)
 
 
 def _both(evidence: ViewEvidence, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked] | None:
