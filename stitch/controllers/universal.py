@@ -13,7 +13,7 @@ import numpy as np
 from stitch.controllers.taught import Taught, line_of, rotation_vector
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import is_number, number
 
 CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
 pose = rotation_vector
@@ -44,7 +44,7 @@ def _script(file: Path, text: str) -> list[Taught]:
         if len(cells) != 6:
             continue  # A list of something else: a payload, a vector, an I/O pattern.
         line = line_of(text, position)
-        if not all(_is_number(cell) for cell in cells):
+        if not all(is_number(cell) for cell in cells):
             if name != f"line{line}":
                 continue  # Computed while the program runs: no taught point.
             raise InputError(f"{file} line {line}: the target is computed while the program runs; write its numbers")
@@ -54,14 +54,6 @@ def _script(file: Path, text: str) -> list[Taught]:
         pose = rotation_vector(values) if kind else before.T_frame_tool
         points[base] = Taught(base, before.line, pose, before.joints if kind else values)
     return list(points.values())
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def is_recording(header: list[str]) -> bool:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.cloud import Cloud
+from stitch.reading.csv_number import is_number
 from stitch.reading.pcd import read_pcd
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
@@ -70,17 +71,9 @@ def _read_text(path: Path) -> dict[str, Array]:
         return {axis: np.empty(0) for axis in "xyz"}
     separator = next((s for s in ",;" if s in lines[0]), None)
     first = [cell.strip() for cell in lines[0].split(separator)]
-    header = any(_not_number(cell) for cell in first)
+    header = any(not is_number(cell) for cell in first)
     names = [name.lower() if name.lower() in "xyz" else name for name in first]
     if not header:
         names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
     table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
     return dict(zip(names, table.T, strict=True))
-
-
-def _not_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return True
-    return False

@@ -1,10 +1,19 @@
-"""A finite number in a cell of a table, or one line that says where it is not."""
+"""Numbers in the cells of tables, or one line that says where there is none."""
 
 from pathlib import Path
 
 import numpy as np
 
 from stitch.errors import InputError
+
+
+def is_number(cell: str) -> bool:
+    """True for what Python reads as a number, finite or not."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def number(file: Path, line: int, column: str, cell: str, mend: str = "write a finite number") -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_number import is_number
 from stitch.robot import Robot, forward
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -107,19 +108,11 @@ def _row_cells(file: Path, line: int, header: Sequence[str], row: Sequence[str])
 def _covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
     known = {"view", "cloud", "time_s", *_POSE}
     rest = [n for n in header if n not in known and not _JOINT.match(n) and not _APPROACH.match(n)]
-    return [name for name in rest if any(_is_number(row[name]) for _, row in cells)]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
 
 
 def _number(file: Path, line: int, column: str, cell: str) -> float:
-    if not _is_number(cell) or not np.isfinite(float(cell)):
+    if not is_number(cell) or not np.isfinite(float(cell)):
         raise InputError(f"{file} line {line}: {column} is {cell!r}; write a number")
     return float(cell)
 
