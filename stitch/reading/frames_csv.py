@@ -1,6 +1,5 @@
 """frames.csv: measured poses of a probe or board in the sensor's frame, a row per view."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -35,10 +35,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
     """
     if not file.is_file():
         raise InputError(f"{file}: not found; a frames session needs {','.join(('view', *_POSE))} there")
-    with file.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.reader(stream, skipinitialspace=True)
-        header = [name.strip() for name in next(reader, [])]
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    header, rows = read_lines(file)
     missing = [name for name in ("view", *_POSE) if name not in header]
     if missing:
         raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")

@@ -1,6 +1,5 @@
 """points.csv and targets.csv: points that a sensor knows by name, and where a drawing puts them."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
 
 _XYZ = ("x", "y", "z")
@@ -92,13 +92,7 @@ def read_targets(file: Path, seen: Sequence[str]) -> Nominal:
 
 def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     """Line number and cells by column of every row."""
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream, skipinitialspace=True)
-            header = [name.strip() for name in next(reader, [])]
-            cells = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not UTF-8 text ({error.reason}); save it as CSV") from None
+    header, cells = read_lines(file)
     missing = [name for name in needed if name not in header]
     if missing:
         raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")

@@ -1,6 +1,5 @@
 """views.csv: one row per scan, columns by name."""
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number
 from stitch.robot import Robot, forward
 
@@ -50,10 +50,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     """
     if not file.is_file():
         raise InputError(f"{file}: not found; a session needs a row per scan there")
-    with file.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.reader(stream, skipinitialspace=True)
-        header = [name.strip() for name in next(reader, [])]
-        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    header, lines = read_lines(file)
     _check_header(file, header, robot)
     if not lines:
         raise InputError(f"{file}: no views; write one row per scan")
