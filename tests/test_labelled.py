@@ -228,7 +228,7 @@ def test_offsets_and_gravity_together_are_found_by_their_names(few_effects):
 def stands(session, name):
     """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
     evidence = evidence_of_state(state_of(run(session)))
-    own = rank([score(evidence, candidate_of(evidence, EFFECTS[name]), 1)])[0][0]
+    own = rank([score(evidence, candidate_of(evidence, EFFECTS[name]))])[0][0]
     return certain(own), beyond(evidence, own.score)
 
 

@@ -18,6 +18,7 @@ class Suspect:
     ranked: Ranked
     aliases: tuple[Alias, ...]
     left: Left | None
+    detectable: dict[str, float]  # smallest detectable size per parameter, alone
 
     @property
     def name(self) -> str:

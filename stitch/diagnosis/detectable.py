@@ -13,6 +13,9 @@ from scipy.optimize import brentq
 from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
+from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.evidence import ViewEvidence
+from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME, GAIN, POWER
 from stitch.frames import Array
 
@@ -35,6 +38,17 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, free
     evidence = GAIN - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
     needed = max(by_p, freedom * float(np.expm1(2 * evidence / freedom)))
     return float(brentq(lambda size: ncf.sf(needed / rank, rank, freedom, size) - POWER, 1e-9, 9 * needed + 99))
+
+
+def smallest_detectable(evidence: ViewEvidence, candidate: Candidate, tests: int) -> dict[str, float]:
+    """Smallest detectable size of every free parameter of a candidate among so many."""
+    told = []
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        names = tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep)
+        white = evidence.whiten_channel(form.columns)
+        told.append((names, white, form.sizes, float(weight), evidence.freedom.of(evidence.in_blocks(white))))
+    e = evidence.evidence
+    return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
 
 
 def smallest_sizes(

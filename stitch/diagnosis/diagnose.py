@@ -7,6 +7,7 @@ import numpy as np
 from stitch.diagnosis.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.detectable import smallest_detectable
 from stitch.diagnosis.heldout import Left, left_by
 from stitch.diagnosis.next_view import propose
 from stitch.diagnosis.ranking import Ranked
@@ -36,11 +37,12 @@ def diagnose(state: State) -> Diagnosis:
         selection = select(evidence, candidates, state.session.length_unit)
         scores = [r.score for r in selection.ranked]
         matrix = alias_matrix(evidence, scores)
-        suspects = []
+        tests, suspects = sum(c.effect.tier != "empirical" for c in candidates), []
         for k, ranked in enumerate(selection.ranked):
             clear = ranked.score.observable and k < _PREDICTED and np.isfinite(ranked.score.sigmas).all()
             left = left_by(evidence, ranked.score, points) if clear else None
-            suspects.append(Suspect(ranked, tuple(aliases_of(k, matrix, scores)), left))
+            detectable = smallest_detectable(evidence, ranked.score.candidate, tests)
+            suspects.append(Suspect(ranked, tuple(aliases_of(k, matrix, scores)), left, detectable))
         selection, notes = checked(selection, suspects, implausible(evidence, state.session.length_unit))
         depends = dependences(evidence, selection.empirical)
         rotation, translation = np.sqrt(evidence.null.variances[:2])

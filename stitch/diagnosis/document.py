@@ -52,7 +52,7 @@ def _candidate(d: Diagnosis, suspect: Suspect) -> dict[str, Any]:
             p.name: {"value": float(v), "sigma": float(x), "unit": p.unit}
             for p, v, x in zip(kept, s.values, s.sigmas, strict=True)
         }
-    detectable = {name: x for name, x in s.minimum_detectable.items() if np.isfinite(x)}
+    detectable = {name: x for name, x in suspect.detectable.items() if np.isfinite(x)}
     return {
         "effect": s.name,
         "p_value": r.adjusted if s.observable else None,
@@ -72,5 +72,5 @@ def _candidate(d: Diagnosis, suspect: Suspect) -> dict[str, Any]:
 
 def _clearest(suspect: Suspect) -> str | None:
     sizes = {p.name: p.typical for p in suspect.ranked.score.candidate.parameters}
-    found = suspect.ranked.score.minimum_detectable
+    found = suspect.detectable
     return min(found, key=lambda name: found[name] / sizes[name]) if found else None

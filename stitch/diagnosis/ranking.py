@@ -35,8 +35,7 @@ class Ranked:
 
 def score_all(evidence: ViewEvidence, candidates: Sequence[Candidate]) -> list[Score]:
     """Scores in the order of the candidates."""
-    tests = sum(c.effect.tier != "empirical" for c in candidates)
-    return [score(evidence, c, tests) for c in candidates]
+    return [score(evidence, c) for c in candidates]
 
 
 def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:

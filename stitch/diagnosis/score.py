@@ -1,4 +1,4 @@
-"""How well each candidate explains the views: evidence, p-value, amplitude, smallest detectable size.
+"""How well each candidate explains the views: evidence, p-value, amplitude.
 
 Every form of a candidate is fitted with the variances estimated anew (`variance.py`). The p-value is that of
 the Wald F test under the form's own REML; forms are counted (Bonferroni). The evidence is the likelihood
@@ -13,7 +13,6 @@ from scipy.special import logsumexp
 from scipy.stats import f as f_distribution
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.detectable import smallest_sizes
 from stitch.diagnosis.evidence import ViewEvidence
 from stitch.frames import Array
 from stitch.variance import MANY_NUMBERS, VarianceFit, at_variances, fit_variances
@@ -42,19 +41,14 @@ class Score:
     sigmas: Array  # (p,)
     covariance: Array  # (p, p)
     fit: VarianceFit
-    minimum_detectable: dict[str, float]  # per parameter, alone
 
     @property
     def name(self) -> str:
         return self.candidate.name
 
 
-def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
-    """Try all forms of a candidate.
-
-    Args:
-        tests: number of candidates, for the smallest detectable size.
-    """
+def score(evidence: ViewEvidence, candidate: Candidate) -> Score:
+    """Try all forms of a candidate."""
     full = candidate.forms[0]
     whites = [evidence.whiten_channel(form.columns) for form in candidate.forms]
     seen = bool((np.linalg.norm(whites[0], axis=0) * full.sizes > _SEEN).any()) if whites[0].size else False
@@ -69,11 +63,10 @@ def score(evidence: ViewEvidence, candidate: Candidate, tests: int) -> Score:
     singles = len(candidate.forms)
     best = max(range(singles), key=lambda i: tried[i][0])
     gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
-    detectable = _detectable(evidence, candidate, whites, weights, tests)
     gain = float(logsumexp(gains + np.log(weights)))
     p_values = np.array([p for _, p, _ in tried])
     p = float(min(1.0, np.min(p_values / weights)))
-    return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain, detectable)
+    return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain)
 
 
 def promising(evidence: ViewEvidence, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
@@ -123,34 +116,17 @@ def form_weights(candidate: Candidate) -> Array:
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
 
 
-def _detectable(
-    evidence: ViewEvidence, candidate: Candidate, whites: Sequence[Array], weights: Array, tests: int
-) -> dict[str, float]:
-    """Smallest detectable size of every free parameter."""
-    e = evidence.evidence
-    told = [
-        (
-            tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep),
-            white, form.sizes, float(weight), evidence.freedom.of(evidence.in_blocks(white)),
-        )
-        for form, white, weight in zip(candidate.forms, whites, weights, strict=True)
-    ]  # fmt: skip
-    return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
-
-
 def _fill(
     evidence: ViewEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
-    p: float, gain: float, detectable: dict[str, float],
+    p: float, gain: float,
 ) -> Score:  # fmt: skip
     a, size = evidence.evidence.A.shape[2], form.columns.shape[1]
     fit = tried[2]
     if len(fit.mean) < a + size:
         nothing = np.zeros(size)
-        return Score(
-            candidate, seen, form, 1.0, gain, nothing, np.full(size, np.nan), np.zeros((size, size)), fit, detectable
-        )
+        return Score(candidate, seen, form, 1.0, gain, nothing, np.full(size, np.nan), np.zeros((size, size)), fit)
     covariance = fit.covariance[a:, a:]
     return Score(
         candidate, seen, form, p if seen else 1.0, gain if seen else 0.0, fit.mean[a:],
-        np.sqrt(np.maximum(np.diag(covariance), 0)), covariance, fit, detectable,
+        np.sqrt(np.maximum(np.diag(covariance), 0)), covariance, fit,
     )  # fmt: skip

@@ -40,7 +40,7 @@ def start_values(state: State, effects: Sequence[Effect]) -> list[Term]:
         if candidate is None:
             out.append(empty_term(state.chain, effect))
             continue
-        best = score(evidence, candidate, 1)
+        best = score(evidence, candidate)
         values = best.values if np.isfinite(best.sigmas).all() else np.zeros(len(best.values))
         out.append(with_values(best.form, values))
     return out
