@@ -18,6 +18,7 @@ from stitch.diagnosis.detectable import least_noncentrality
 from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.score import form_weights
 from stitch.effects import EFFECTS
+from stitch.effects.chain import Chain
 from stitch.effects.user_file import load
 from stitch.frames import Array
 from stitch.result import Run
@@ -81,9 +82,14 @@ def measure(
     )
 
 
-def drawn(plan: Plan, laws: Sequence[str], chance: int) -> dict[str, dict[str, float]]:
-    """What nature draws for these laws, in this order, at amplitude 1 in this very cell."""
-    return nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
+def drawn(name: str, plan: Plan, chain: Chain, laws: Sequence[str], chance: int) -> dict[str, dict[str, float]]:
+    """What nature draws for these laws, in this order, at amplitude 1 in this very cell, as a model counts it."""
+    out = nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
+    if "part_growth" in out:
+        # About another origin than the part's own, growth is a motion too.
+        off = chain.scan_views[0].origin - load_scene(name).T_reference_part[:3, 3]
+        out["part_growth"] |= dict(zip(("cx", "cy", "cz"), out["part_growth"]["g"] * off, strict=True))
+    return out
 
 
 def user_effect(law: str) -> str:

@@ -90,7 +90,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     # What follows a covariate shows as well as that one's course of the day, which is drawn too.
     own = any(law in OUTSIDE or law in CLIMATE for law in laws)
     cell = cell_without(job["scene"], job["seed"], _chance(job) if own else None)
-    true = drawn(cell.plan, laws, _chance(job))
+    true = drawn(job["scene"], cell.plan, cell.evidence.chain, laws, _chance(job))
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law

@@ -61,7 +61,7 @@ def main() -> None:
     for scene in options.scenes.split(","):
         cell = cell_without(scene, 0)
         candidates, rng = candidates_of(cell.evidence)[0], np.random.default_rng(1)
-        true = drawn(cell.plan, LIBRARY, 0)
+        true = drawn(scene, cell.plan, cell.evidence.chain, LIBRARY, 0)
         for candidate in candidates:
             size = smallest(cell.evidence, candidate.name, true[candidate.name]) if candidate.name in true else None
             if size is None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from stitch.diagnosis.start import start_values
-from stitch.effects.chain import Chain, Term, chain_of
+from stitch.effects.chain import Chain, Term, about_part, chain_of
 from stitch.effects.scanner_field import field_scatters
 from stitch.effects.terms import empty_term, known, require, terms_of
 from stitch.effects.undo import corrected
@@ -66,6 +66,7 @@ def run_rig(
             found = run_labelled(sessions[0], chains[0], own, effects, recorders[0])
             return [_in_ledger(found, (), model.effects_file if model else None, recorders[0])]
         start = _start(sessions, chains, model)
+        chains = [about_part(chain, start.T_mount) for chain in chains]
         seconds = clock.lap()
         before = [_begin(c, start, seconds, r) for c, r in zip(chains, recorders, strict=True)]
         clock.lap()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.effects.chain import Chain, Term, chain_of
+from stitch.effects.chain import Chain, Term, about_part, chain_of
 from stitch.effects.terms import terms_of
 from stitch.effects.undo import corrected
 from stitch.effects.user_file import load
@@ -67,7 +67,7 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
     session = load_session(path)
     with library_threads_off():
         session, scans = thinned(session) if thin and session.has_clouds else (session, capture(session))
-        chain = chain_of(session, scans)
+        chain = about_part(chain_of(session, scans), model.T_mount_coarse)
         terms = tuple(terms_of(model, chain))
         chain = as_counted(chain, session, document)
         own = corrected(chain, terms, model.T_mount)

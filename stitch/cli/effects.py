@@ -47,7 +47,13 @@ def _one(console: Console, name: str) -> None:
         f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", soft_wrap=True, highlight=False
     )
     console.print(f"  {effect.formula}", highlight=False)
-    kinds = {"number": "", "joint": ", one a joint", "torque": ", one a gravity torque", "twist": ", a twist: rx … tz"}
+    kinds = {
+        "number": "",
+        "offset": "x, y, z, or zero",
+        "joint": ", one a joint",
+        "torque": ", one a gravity torque",
+        "twist": ", a twist: rx … tz",
+    }
     for key, spec in effect.specs.items():
         shift = f" and {spec.typical_shift:g} {spec.unit_shift}" if spec.kind == "twist" else ""
         sizes = f"plausible {spec.typical:g}{shift}, not believed beyond {spec.limit:g}"

@@ -11,13 +11,13 @@ from stitch.effects.chain import Term
 from stitch.effects.columns import PointGram
 from stitch.effects.contract import EFFECTS, Effect, Parameter
 from stitch.effects.empirical import empirical_effects
-from stitch.effects.groups import by_joint, one_by_one
+from stitch.effects.groups import by_joint, one_by_one, without_offset
 from stitch.frames import Array
 
 
 @dataclass(frozen=True)
 class Form:
-    """One form of an effect: all its parameters, or those of one joint; one value of each gridded parameter."""
+    """One form of an effect: all its parameters, those of one joint, or all but an offset; one value of each grid."""
 
     term: Term  # at zero, gridded parameters at their value
     keep: Array  # (P,) bool: parameters that are free in this form
@@ -91,20 +91,18 @@ def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
 
 
 def _forms(evidence: ViewEvidence, term: Term, parameters: Sequence[Parameter], twists: Array) -> list[Form]:
-    """All parameters together, then joint by joint where there are several."""
+    """All parameters together, then those that can be true alone."""
     free = np.array([not p.grid for p in parameters])
     sizes = np.array([p.typical for p in parameters])
     channel = evidence.in_channel(twists)
-    keeps = [free]
-    groups = _groups(term.effect, parameters)
-    if len(groups) > 1:
-        keeps += [free & np.isin(np.arange(len(parameters)), g) for g in groups]
+    alone = [free & np.isin(np.arange(len(parameters)), g) for g in _groups(term.effect, parameters)]
+    keeps = [free, *(keep for keep in alone if (keep != free).any())]
     return [Form(term, keep, twists[:, keep], channel[:, keep], sizes[keep]) for keep in keeps]
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Parameters of one joint; links in single numbers too."""
-    joints = by_joint(effect, parameters)
+    """Parameters of one joint, or all but an offset; links in single numbers too."""
+    joints = by_joint(effect, parameters) or without_offset(effect, parameters)
     single = effect.place == "links" and len(effect.specs) > 1
     return joints + one_by_one(effect, parameters) if joints and single else joints
 

@@ -4,9 +4,20 @@ Importing the package registers the library; `user_file.load` adds a user's own.
 """
 
 from stitch.effects import empirical, mount, part, robot, sensor
-from stitch.effects.contract import EFFECTS, Effect, Parameter, effect, event, number, per_joint, per_torque, twist
+from stitch.effects.contract import (
+    EFFECTS,
+    Effect,
+    Parameter,
+    effect,
+    event,
+    number,
+    offset,
+    per_joint,
+    per_torque,
+    twist,
+)
 
 __all__ = [
-    "EFFECTS", "Effect", "Parameter", "effect", "empirical", "event", "mount", "number", "part", "per_joint",
+    "EFFECTS", "Effect", "Parameter", "effect", "empirical", "event", "mount", "number", "offset", "part", "per_joint",
     "per_torque", "robot", "sensor", "twist",
 ]  # fmt: skip

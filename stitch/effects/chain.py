@@ -104,6 +104,23 @@ def chain_of(session: Session, capture: Capture) -> Chain:
     )
 
 
+def about_part(chain: Chain, T_mount: Array) -> Chain:
+    """The chain with the origin about which a part grows; a coarse hand-eye is enough.
+
+    On the flange that is the flange, which holds it; in the cell it is the middle of what the views show.
+    """
+    if chain.eye_to_hand:
+        return chain
+    placed = [
+        frames.transform(T, p) for T, p in zip(chain.capture.poses(T_mount), chain.capture.point_sets, strict=True)
+    ]
+    origin = np.mean([points.mean(axis=0) for points in placed if len(points)], axis=0)
+    scan_views, target_views = (
+        tuple(replace(v, origin=origin) for v in w) for w in (chain.scan_views, chain.target_views)
+    )
+    return replace(chain, scan_views=scan_views, target_views=target_views)
+
+
 def _intensities(session: Session) -> list[Array | None]:
     """Standardised over the session: (I − Ī)/σ_I."""
     raw = [None if v.cloud is None else v.cloud.scalars.get("intensity") for v in session.views]

@@ -56,7 +56,7 @@ class Parameter:
 class Spec:
     """How an argument of the function becomes parameters."""
 
-    kind: str  # number | joint | torque | twist
+    kind: str  # number | offset | joint | torque | twist
     unit: str
     typical: float
     limit: float
@@ -69,6 +69,11 @@ class Spec:
 def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
     """One number."""
     return Spec("number", unit, typical, limit, tuple(grid))
+
+
+def offset(unit: str, typical: float, limit: float) -> Spec:
+    """A vector (3,) in the reference frame that may be zero beside the effect's other parameters: c is cx, cy, cz."""
+    return Spec("offset", unit, typical, limit)
 
 
 def event() -> Spec:
@@ -121,7 +126,8 @@ class Effect:
                     sizes = (spec.typical, spec.limit) if r else (spec.typical_shift, spec.limit_shift)
                     out.append(_in_unit(name, spec.unit if r else spec.unit_shift, *sizes, (), length_unit))
             else:
-                names = {"number": [key], "joint": [f"{key}{i + 1}" for i in range(joints)],
+                names = {"number": [key], "offset": [key + axis for axis in "xyz"],
+                         "joint": [f"{key}{i + 1}" for i in range(joints)],
                          "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
                 # A torque between two joints is that of 1 kg there; the link's mass is in the coefficient.
                 for name in names:
@@ -133,7 +139,7 @@ class Effect:
 
     def arguments(self, values: Array, joints: int, torques: int) -> dict[str, Any]:
         """Keyword arguments of the function from the flat parameter vector."""
-        sizes = {"number": 1, "joint": joints, "torque": torques, "twist": 6}
+        sizes = {"number": 1, "offset": 3, "joint": joints, "torque": torques, "twist": 6}
         out, at = {}, 0
         for key, spec in self.specs.items():
             size = sizes[spec.kind]

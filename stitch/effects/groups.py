@@ -17,9 +17,15 @@ def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]
     return list(joints.values())
 
 
+def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Indices of all parameters but an offset; empty for an effect without one."""
+    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in "xyz"]
+    return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
+
+
 def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """A partition into the smallest parts that can be true without the others."""
+    """The smallest parts that can be true without the others."""
     if effect.place == "links":
         # One row of a table seldom is wrong altogether.
         return [[i] for i in range(len(parameters))]
-    return by_joint(effect, parameters) or [list(range(len(parameters)))]
+    return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.effects.contract import effect, event, number, twist
+from stitch.effects.contract import effect, event, number, offset, twist
 from stitch.effects.robot import warmer
 from stitch.effects.views import ScanView, Views
 from stitch.frames import Array
@@ -20,10 +20,17 @@ def part_slip(views: Views, xi: Array, v: float) -> Array:
     return np.outer(np.arange(views.count) >= v, xi)
 
 
-@effect("shape", prefers=("part_temperature_c",), g=number("1/°C", typical=3e-5, limit=5e-4))
-def part_growth(points: Array, view: ScanView, g: float) -> Array:
-    """part scaled about its frame's origin, 1+g·ΔT, ΔT from part_temperature_c; without it g per hour"""
-    return points * (1 + g * float(warmer(view.views, "part_temperature_c")[view.index]))
+@effect(
+    "shape", prefers=("part_temperature_c",), g=number("1/°C", typical=3e-5, limit=5e-4),
+    c=offset("mm/°C", typical=3e-3, limit=0.2),
+)  # fmt: skip
+def part_growth(points: Array, view: ScanView, g: float, c: Array) -> Array:
+    """part scaled about its frame's origin, 1+g·ΔT, ΔT from part_temperature_c; without it g per hour
+
+    Where that frame lies, no session says: the part grows about `view.origin`, and moves by c·ΔT as a whole,
+    so that −c/g from there it stands still.
+    """
+    return points + ((points - view.origin) * g + c) * float(warmer(view.views, "part_temperature_c")[view.index])
 
 
 @effect("shape", kappa=number("1/mm", typical=5e-6, limit=1e-3))

@@ -25,14 +25,14 @@ def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequen
         further: (N, P) whitened columns per unit of the parameters.
         z: (N,) whitened observation without the effects.
         sizes: (P,) plausible sizes.
-        groups: indices of parameters that stand or fall together.
+        groups: indices of parameters that stand or fall together; one may hold another.
         effects: number of the effect that each group belongs to.
     """
     G, y = project_out(own, further * sizes), project_out(own, z[:, None])[:, 0]
     M, v = G.T @ G, G.T @ y
 
     def gain(chosen: Sequence[int]) -> float:
-        index = [i for k in chosen for i in groups[k]]
+        index = sorted({i for k in chosen for i in groups[k]})
         information = np.eye(len(index)) + M[np.ix_(index, index)]
         b = v[index]
         return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])

@@ -71,6 +71,7 @@ class ScanView:
     intensity: Array | None  # (N,) standardised over the session
     gravity: Array  # (3,) unit vector in the reference frame
     size: float  # of the part: lengths of shape effects may be counted in it
+    origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
     cache: dict[str, Array] = field(default_factory=dict, repr=False)
 
     def along(self, points: Array) -> Array:

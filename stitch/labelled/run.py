@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch import frames
-from stitch.effects.chain import Chain, Term
+from stitch.effects.chain import Chain, Term, about_part
 from stitch.effects.terms import empty_term, known, terms_of
 from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of
@@ -38,6 +38,7 @@ def run_labelled(
     clock = Clock()
     stated = model.T_mount if model else session.scanner.T_mount
     T_mount = closed_form(chain.capture) if stated is None else stated
+    chain = about_part(chain, T_mount)
     before = _begin(chain, T_mount, "found in closed form" if stated is None else "given", clock.lap(), recorder)
     if model:
         terms: list[Term] = terms_of(model, chain)
