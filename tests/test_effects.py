@@ -1,5 +1,7 @@
 """Effects of the model against nature's laws, which share no code with them, and against finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import measured_blade
@@ -125,18 +127,16 @@ def test_point_slopes_are_minus_what_nature_does(cells, name):
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
     slopes = shifts(chain, [], Term(effect, np.zeros(len(chain.parameters(effect)))), 2, pose, index)
-    parameter = chain.parameters(effect)[0]
-    from dataclasses import replace
-
     view = chain.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
     points = chain.capture.scans[2].points[index]
     at = frames.transform(pose, points) if effect.place == "shape" else points
-    h = 1e-3 * parameter.typical
-    key = next(iter(effect.specs))
-    moved = (effect.function(at, view, **{key: h}) - at) / h
-    expected = -frames.rotate(frames.inverse(pose), moved) if effect.place == "shape" else -moved
-    assert np.allclose(slopes[0], expected, rtol=1e-2, atol=1e-6 * np.abs(expected).max())
+    for i, parameter in enumerate(chain.parameters(effect)):
+        h = 1e-3 * parameter.typical
+        values = h * np.eye(len(slopes))[i]
+        moved = (effect.function(at, view, **chain.arguments(effect, values)) - at) / h
+        expected = -frames.rotate(frames.inverse(pose), moved) if effect.place == "shape" else -moved
+        assert np.allclose(slopes[i], expected, rtol=1e-2, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])

@@ -15,6 +15,7 @@ from stitch.cli.main import main
 from stitch.diagnosis import candidates
 from stitch.diagnosis.beyond import beyond
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.hold import idle_effect
 from stitch.diagnosis.ranking import certain, rank
 from stitch.diagnosis.score import score
@@ -74,14 +75,18 @@ def cell(
     targets=TARGETS,
     sag=0.0,
     gears=None,
+    grown=None,
 ):
-    """A session, the true T_mount and the true targets in the reference frame; `gears` maps joints to their errors."""
+    """A session, the true T_mount and the true targets in the reference frame.
+
+    `gears` maps joints to their errors; `grown` is the growth per degree of the part and the point that stands still.
+    """
     rng = np.random.default_rng(seed)
     joints = rng.uniform(-1.2, 1.2, (views, 6))
     T_mount = pose(rng, 2000 if mount == "eye_to_hand" else 60)
     places = targets if mount == "eye_to_hand" else targets + np.array([450.0, 100.0, 200.0])
     turn = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
-    rows = []
+    rows, warmth = [], 22 + 6 * np.sin(np.arange(views) / 5)
     for v, q in enumerate(joints):
         jitter = np.eye(4)
         jitter[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * scatter[0]).as_matrix()
@@ -90,13 +95,16 @@ def cell(
         bent = np.array([0, sag * reach, 0, 0, 0, 0])
         T = flange(q + bent + (0 if gears is None else gears(q)), offset) @ jitter
         T_sensor_reference = np.linalg.inv(T_mount) @ (T if mount == "eye_to_hand" else np.linalg.inv(T))
-        seen = places @ T_sensor_reference[:3, :3].T + T_sensor_reference[:3, 3] + noise * rng.normal(size=places.shape)
+        rate, still = grown or (0.0, 0.0)
+        own = places + rate * (warmth[v] - warmth[0]) * (places - still)
+        seen = own @ T_sensor_reference[:3, :3].T + T_sensor_reference[:3, 3] + noise * rng.normal(size=places.shape)
         names = tuple(f"t{i}" for i in range(len(places)))
         sighting = Sighting(names, seen, np.full(len(seen), noise))
         if probe:
             R = T_sensor_reference[:3, :3] @ turn @ Rotation.from_rotvec(rng.normal(size=3) * 3e-5).as_matrix()
             sighting = Sighting(("probe",), seen[:1], np.full(1, noise), R, 3e-5)
-        rows.append(View(f"v{v}", None, flange(q), q, np.zeros(6), None, {}, sighting))
+        course = {} if grown is None else {"part_temperature_c": warmth[v]}
+        rows.append(View(f"v{v}", None, flange(q), q, np.zeros(6), None, course, sighting))
     robot = robot_from_dh("arm", "standard", ROWS, None, np.array([0, 0, -9.81]), "mm")
     session = Session(Path("cell"), "cell", "mm", mount, Scanner(None, noise, None, np.array([0, 0, 1.0])), robot, None,
                       None, None, tuple(rows))  # fmt: skip
@@ -429,6 +437,20 @@ def test_nominal_targets_pull_by_their_sigma(tmp_path):
 
     assert np.abs(shape(found) - shape(places)).max() < 1e-3
     assert np.abs(shape(alone) - shape(places)).max() > 1e-2
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_growth_is_found_wherever_the_part_is_held(mount):
+    """No session says which point of a part stands still; the flange and the robot's base need not be near it."""
+    still = TARGETS[0] + [80.0, -40.0, -90.0] + (0 if mount == "eye_to_hand" else np.array([450.0, 100.0, 200.0]))
+    session, *_ = cell(4, mount=mount, grown=(2e-4, still))
+    found = run(session)
+    assert diagnose(state_of(found)).effects == ("part_growth",)
+    found = run(session, effects=["part_growth"])
+    values, sigmas = found.terms[0].values, found.sigmas[0]
+    true = 2e-4 * np.append(1.0, found.chain.target_views[0].origin - still)
+    assert (sigmas < [1e-5, 2e-3, 2e-3, 2e-3]).all()  # mm: a quarter of the motion of the middle
+    assert (np.abs(values - true) < 4 * sigmas).all()
 
 
 def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):
