@@ -109,6 +109,9 @@ def _empty(rows: list[Row]) -> str:
     for noise in dict.fromkeys(r["noise"] for r in rows):
         lines.append(_alarms(noise or "usual noise", [r for r in rows if r["noise"] == noise]))
     lines.append(_alarms("all of the harder ones", [r for r in rows if r["noise"]]))
+    usual = [r for r in rows if not r["noise"]]
+    for scene in dict.fromkeys(r["scene"] for r in usual):
+        lines.append(_alarms(f"usual noise, {scene}", [r for r in usual if r["scene"] == scene]))
     return "\n".join(lines)
 
 

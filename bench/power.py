@@ -28,7 +28,7 @@ def verdict(evidence: PoseEvidence, candidates: list[Candidate]) -> str:
     """As `diagnose` judges, less what it says about it."""
     selection = select(evidence, candidates, "mm")
     asked = {r.name: r for r in (*selection.named, selection.second) if r is not None}
-    suspects = [Suspect(r, (), left_by(evidence, r.score, None), {}) for r in asked.values()]
+    suspects = [Suspect(r, (), left_by(evidence, r.score, None), {}, None) for r in asked.values()]
     return checked(selection, suspects, implausible(evidence, "mm"))[0].verdict
 
 

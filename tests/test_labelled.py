@@ -453,6 +453,21 @@ def test_growth_is_found_wherever_the_part_is_held(mount):
     assert (np.abs(values - true) < 4 * sigmas).all()
 
 
+def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
+    """Offsets of the smallest detectable size, put into the same measurements joint by joint."""
+    session, *_ = cell(5)
+    found = run(session)
+    suspect = next(s for s in diagnose(state_of(found)).suspects if s.name == "joint_offset")
+    sizes = [min(suspect.detectable.get(f"d{i + 1}", np.inf), 1e-3) for i in range(6)]
+    middle = np.mean([v.sighting.points.mean(axis=0) for v in session.views], axis=0)
+    pushed = []
+    for size, own in zip(sizes, np.eye(6), strict=True):
+        T = np.linalg.inv(found.T_mount) @ run(cell(5, offset=size * own)[0]).T_mount
+        pushed.append(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
+    seen = [np.isfinite(suspect.detectable.get(f"d{i + 1}", np.inf)) for i in range(6)]
+    assert suspect.hand_eye == pytest.approx(np.max(np.array(pushed)[seen]), rel=0.2)
+
+
 def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):
     session = load_session(shared_data / "irb120-tracker")
     even, odd = (replace(session, views=session.views[k::2]) for k in (0, 1))

@@ -89,10 +89,21 @@ def show(found: Diagnosis, length_unit: str) -> None:
     for need in lacking:
         names = ", ".join(name for name, needs in found.missing.items() if need in needs)
         console.print(f"Not tested without {need}: {names}.", soft_wrap=True, highlight=False)
+    if found.verdict == "adequate":
+        _show_missed(console, found, to_um)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
         console.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True, highlight=False)
     for p in found.next[:3]:
         console.print(f"Next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True, highlight=False)
+
+
+def _show_missed(console: Console, found: Diagnosis, to_um: float) -> None:
+    """What effects too small to be seen could still do to the hand-eye."""
+    known = sorted(((s.hand_eye, s.name) for s in found.suspects if s.hand_eye is not None), reverse=True)
+    told = ", ".join(f"{name} {size * to_um:.2g} µm" for size, name in known[:3])
+    if told:
+        console.print(f"Effects too small to be seen could still displace the hand-eye, at the part by up to: {told}. "
+                      "Its sigma does not hold that.", soft_wrap=True, highlight=False)  # fmt: skip
 
 
 def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:

@@ -19,6 +19,7 @@ class Suspect:
     aliases: tuple[Alias, ...]
     left: Left | None
     detectable: dict[str, float]  # smallest detectable size per parameter, alone
+    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`missed.py`)
 
     @property
     def name(self) -> str:

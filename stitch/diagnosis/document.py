@@ -65,6 +65,7 @@ def _candidate(d: Diagnosis, suspect: Suspect) -> dict[str, Any]:
         "minimum_detectable": detectable.get(_clearest(suspect) or ""),
         "minimum_detectable_of": _clearest(suspect),
         "minimum_detectable_each": detectable,
+        "hand_eye_if_missed": suspect.hand_eye,
         "aliases": [{"effect": a.name, "correlation": a.correlation} for a in suspect.aliases],
         "tier": s.candidate.effect.tier,
     }
