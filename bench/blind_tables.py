@@ -46,7 +46,7 @@ def _effects(rows: list[Row]) -> str:
         own = [r for r in rows if r["multiple"] == m]
         wrong = share(own, lambda r: r["verdict"] == "missing_effect" and not _right(r))
         lines.append(f"| {m:g}× | {share(own, _detected)} | {share(filter(_detected, own), _right)} | {wrong} |")
-    lines += ["\n| effect | at 0.5× | at 1× | at 2× and 4× | right when detected | otherwise called |",
+    lines += ["\n| effect | at 0.5× | at 1× | at 2× and 4× | right when detected there | otherwise called |",
               "|---|---|---|---|---|---|"]  # fmt: skip
     for name in sorted({r["effect"] for r in rows}):
         own = [r for r in rows if r["effect"] == name]

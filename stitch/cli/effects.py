@@ -49,7 +49,7 @@ def _one(console: Console, name: str) -> None:
     console.print(f"  {effect.formula}", highlight=False)
     kinds = {
         "number": "",
-        "offset": "x, y, z, or zero",
+        "offset": ", x, y, z, or zero",
         "joint": ", one a joint",
         "torque": ", one a gravity torque",
         "twist": ", a twist: rx … tz",

@@ -25,10 +25,9 @@ def part_slip(views: Views, xi: Array, v: float) -> Array:
     c=offset("mm/°C", typical=3e-3, limit=0.2),
 )  # fmt: skip
 def part_growth(points: Array, view: ScanView, g: float, c: Array) -> Array:
-    """part scaled about its frame's origin, 1+g·ΔT, ΔT from part_temperature_c; without it g per hour
+    """x = x* + ((x*−o)·g + c)·ΔT, o the flange or the middle of the scans; ΔT of part_temperature_c, else hours
 
-    Where that frame lies, no session says: the part grows about `view.origin`, and moves by c·ΔT as a whole,
-    so that −c/g from there it stands still.
+    Scaled about its frame's origin, where no session says: the point at −c/g from o stands still.
     """
     return points + ((points - view.origin) * g + c) * float(warmer(view.views, "part_temperature_c")[view.index])
 
