@@ -39,8 +39,8 @@ class Sightings:
         return replace(self, used=self.target >= 0)
 
     def sets(self) -> list[Array]:
-        """Per view the points in use, (k, 3); views that show nothing are left out."""
-        return [points[used] for points, used in zip(self.points, self.used, strict=True) if used.any()]
+        """Per view the points in use, (k, 3); none where it shows nothing."""
+        return [points[used] for points, used in zip(self.points, self.used, strict=True)]
 
     def without(self, left_out: Indices) -> "Sightings":
         """The sightings less some views."""

@@ -17,6 +17,7 @@ from stitch.diagnosis.beyond import beyond
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.hold import idle_effect
+from stitch.diagnosis.imagined import imagined_chain
 from stitch.diagnosis.ranking import certain, rank
 from stitch.diagnosis.score import score
 from stitch.diagnosis.start import evidence_of_state
@@ -466,6 +467,28 @@ def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
         pushed.append(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
     seen = [np.isfinite(suspect.detectable.get(f"d{i + 1}", np.inf)) for i in range(6)]
     assert suspect.hand_eye == pytest.approx(np.max(np.array(pushed)[seen]), rel=0.2)
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_a_view_that_shows_nothing_only_says_where_the_arm_was(mount):
+    session, T_mount, *_ = cell(6, mount=mount, grown=(0.0, 0.0))
+    blank = replace(session, views=tuple(replace(v, sighting=None) if k in (0, 7) else v
+                                         for k, v in enumerate(session.views)))  # fmt: skip
+    angle, distance = off(run(blank).T_mount, T_mount)
+    assert angle < 1e-3 and distance < 1.0
+
+
+def test_views_not_taken_yet_come_after_those_that_were():
+    """Temperatures count from the session's first view, an event before them has happened, a scan at rest has no delay."""
+    session, *_ = cell(2, views=9, grown=(0.0, 0.0))
+    speeds = {f"j{i + 1}_velocity_deg_s": 5.0 for i in range(6)}
+    session = replace(session, views=tuple(replace(v, covariates=v.covariates | speeds) for v in session.views))
+    chain = chain_of(session, capture(session))
+    later = imagined_chain(chain, chain.views.joints[:3] + 0.1).views
+    warmth = [v.covariates["part_temperature_c"] for v in session.views]
+    np.testing.assert_allclose(later.since_first("part_temperature_c"), warmth[-1] - warmth[0])
+    assert EFFECTS["part_slip"].function(later, xi=np.ones(6), v=8.0).all()
+    assert not (EFFECTS["latency"].function(later.joints, later, dt=1.0) - later.joints).any()
 
 
 def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):

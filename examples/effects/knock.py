@@ -6,4 +6,4 @@ from stitch.effects import effect, event, twist
 @effect("mount", v=event(), xi=twist("", 6e-4, 0.2))
 def knock(views, v, xi):
     """M·exp(ξ) from view v on"""
-    return np.outer(np.arange(views.count) >= v, xi)
+    return np.outer(views.number >= v, xi)

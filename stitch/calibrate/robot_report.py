@@ -34,7 +34,7 @@ def write_robot(run: Run, found: CalibratedRobot, folder: Path) -> None:
 def beyond_sentence(found: CalibratedRobot) -> str:
     """What the table cannot hold."""
     if not found.beyond:
-        return "Nothing else was found."
+        return "No other error of the arm was found."
     return f"Not in it, because no table of links can hold it: {', '.join(found.beyond)}; model.toml has it."
 
 

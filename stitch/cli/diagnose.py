@@ -48,9 +48,17 @@ def next_measurement(
         return
     console = Console(stderr=True)
     if not found.next:
-        console.print("Nothing has to be told apart: no two suspects look alike in these views.")
+        console.print(_nothing_next(found), soft_wrap=True, highlight=False)
     for p in found.next:
         console.print(f"To separate {' from '.join(p.separates)}: {p.do}.", soft_wrap=True, highlight=False)
+
+
+def _nothing_next(found: Diagnosis) -> str:
+    if found.verdict == "adequate":
+        return "Nothing is missing: there is nothing to tell apart."
+    if len(found.effects) > 1:
+        return f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}."
+    return "Nothing has to be told apart: no two suspects look alike in these views."
 
 
 def _diagnosed(run: Path, effects_file: Path | None) -> tuple[Diagnosis, dict[str, object], str]:
@@ -102,8 +110,8 @@ def _show_missed(console: Console, found: Diagnosis, to_um: float) -> None:
     known = sorted(((s.hand_eye, s.name) for s in found.suspects if s.hand_eye is not None), reverse=True)
     told = ", ".join(f"{name} {size * to_um:.2g} µm" for size, name in known[:3])
     if told:
-        console.print(f"Effects too small to be seen could still displace the hand-eye, at the part by up to: {told}. "
-                      "Its sigma does not hold that.", soft_wrap=True, highlight=False)  # fmt: skip
+        console.print(f"An effect too small to be seen could still displace the hand-eye, at the part by as much as: "
+                      f"{told}. Its sigma does not hold that.", soft_wrap=True, highlight=False)  # fmt: skip
 
 
 def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:

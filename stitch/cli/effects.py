@@ -29,10 +29,7 @@ def effects(
     for heading in ("effect", "place", "what nature does", "parameters"):
         table.add_column(heading, overflow="fold")
     for effect in EFFECTS.values():
-        told = ", ".join(
-            f"{key}{'' if spec.kind == 'number' else '₁…'} ({spec.unit})" for key, spec in effect.specs.items()
-        )
-        table.add_row(effect.name, effect.place, effect.formula, told)
+        table.add_row(effect.name, effect.place, effect.formula, signature(effect))
     console.print(table)
 
 

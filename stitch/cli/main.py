@@ -63,9 +63,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except StitchError as error:
         print(f"stitch: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("stitch: interrupted; nothing was written", file=sys.stderr)
-        sys.exit(1)
     except OSError as error:
         print(f"stitch: {error.filename or 'file system'}: {error.strerror or error}", file=sys.stderr)
         sys.exit(2)

@@ -1,5 +1,6 @@
 """Progress on a terminal, as one of the recorders."""
 
+import atexit
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -24,6 +25,8 @@ class Progress:
         """Name what is being done."""
         self.to_um = MICROMETRES[session.length_unit]
         if self.status:
+            # An error on the way must not leave the terminal without a cursor.
+            atexit.register(self.status.stop)
             self.status.start()
             self.status.update(f"{session.name}: {len(session.views)} views, finding the hand-eye")
 

@@ -47,7 +47,7 @@ def _candidate(d: Diagnosis, suspect: Suspect) -> dict[str, Any]:
     kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
     units = {p.name: p.unit for p in s.candidate.parameters}
     parameters = {name: {"value": float(v), "sigma": None, "unit": units[name]} for name, v in values.items()}
-    if s.observable:
+    if s.observable and np.isfinite(s.sigmas).all():
         parameters |= {
             p.name: {"value": float(v), "sigma": float(x), "unit": p.unit}
             for p, v, x in zip(kept, s.values, s.sigmas, strict=True)

@@ -114,9 +114,11 @@ def imagined_chain(chain: Chain, joints: Array) -> Chain:
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
     imagined = replace(
         views, count=count, joints=joints, previous=last, approach=np.sign(joints - last),
-        time=np.full(count, views.time[-1] + pause), velocity=None,
+        # They would be taken at rest.
+        time=np.full(count, views.time[-1] + pause), velocity=None if views.velocity is None else np.zeros_like(joints),
         torques=replace(torques, values=torques.values[:count]),
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
+        number=np.full(count, views.number[-1] + 1),
     )  # fmt: skip
     return replace(chain, views=imagined, T_base_flange=kinematics.forward(chain.robot, joints), scan_views=())
 

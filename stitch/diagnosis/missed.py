@@ -36,5 +36,5 @@ def _shifts(evidence: ViewEvidence, columns: Array) -> Array:
 
 def _lever(evidence: ViewEvidence) -> Array:
     """(3, 6) how a right perturbation of the hand-eye displaces the middle of the scanner's field."""
-    middle = np.mean([points.mean(axis=0) for points in evidence.chain.capture.point_sets if len(points)], axis=0)
+    middle = np.mean([points.mean(axis=0) for points in evidence.chain.capture.point_sets], axis=0)
     return np.hstack([-frames.skew(middle), np.eye(3)])

@@ -60,8 +60,7 @@ def score(evidence: ViewEvidence, candidate: Candidate) -> Score:
         _try(evidence, form) if i in worth and quick[i] >= _HOPELESS else (float(quick[i]), 1.0, evidence.null)
         for i, form in enumerate(candidate.forms)
     ]
-    singles = len(candidate.forms)
-    best = max(range(singles), key=lambda i: tried[i][0])
+    best = max(range(len(tried)), key=lambda i: tried[i][0])
     gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
     gain = float(logsumexp(gains + np.log(weights)))
     p_values = np.array([p for _, p, _ in tried])

@@ -13,7 +13,7 @@ from stitch.diagnosis.together import together
 
 # Hundreds of views show several missing effects at once; among few, one is all that can be told.
 MANY = 100
-# No arm that is fit for use scatters more than this; larger is something systematic (mm, rad).
+# No arm that is fit for use scatters more than this; larger is something systematic (rad, mm).
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
 # Errors of one and two periods a turn have a name; those of three and four have not.

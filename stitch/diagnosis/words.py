@@ -70,10 +70,12 @@ def _lack(d: Diagnosis) -> str:
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
     """The clearest parameters: c2 = 4.4e-07 ± 4e-08 rad/(N m)."""
     s = ranked.score
+    if not np.isfinite(s.sigmas).all():
+        return "too small to be worth a fit"
     kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
     order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
     told = [
-        f"{kept[i].name} = {rounded(s.values[i], s.sigmas[i])} ± {s.sigmas[i]:.1g} {kept[i].unit}"
+        f"{kept[i].name} = {rounded(s.values[i], s.sigmas[i])} ± {s.sigmas[i]:.1g} {kept[i].unit}".removesuffix(" 1")
         for i in sorted(order)
     ]
     grid = [

@@ -80,15 +80,11 @@ def chain_of(session: Session, capture: Capture) -> Chain:
     views = views_of(session)
     eye_to_hand = session.mount == "eye_to_hand"
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    gravity = np.array([0.0, 0.0, -1.0])
-    if session.robot is not None and np.linalg.norm(session.robot.gravity) > 0:
-        gravity = session.robot.gravity / np.linalg.norm(session.robot.gravity)
-    down = frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0] if eye_to_hand else None
+    down = downwards(session.robot, T_base_flange, eye_to_hand)
     intensity = _intensities(session)
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     scan_views = tuple(
-        ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v],
-                 gravity if down is None else down[v], size)
+        ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v], down[v], size)
         for v, scan in enumerate(capture.scans)
     )  # fmt: skip
     target_views: tuple[ScanView, ...] = ()
@@ -96,12 +92,20 @@ def chain_of(session: Session, capture: Capture) -> Chain:
         # Nobody knows at what slant a target was seen, or how bright: effects of these have nothing to say about it.
         straight = np.ones(capture.sightings.used.shape[1])
         usual = None if intensity[0] is None else np.zeros(len(straight))
-        target_views = tuple(
-            ScanView(v, views, straight, usual, gravity if down is None else down[v], size) for v in range(views.count)
-        )
+        target_views = tuple(ScanView(v, views, straight, usual, down[v], size) for v in range(views.count))
     return Chain(
         capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit, target_views
     )
+
+
+def downwards(robot: Robot | None, T_base_flange: Array, eye_to_hand: bool) -> Array:
+    """(V, 3) unit vector of gravity in the reference frame."""
+    gravity = np.array([0.0, 0.0, -1.0])
+    if robot is not None and np.linalg.norm(robot.gravity) > 0:
+        gravity = robot.gravity / np.linalg.norm(robot.gravity)
+    if not eye_to_hand:
+        return np.tile(gravity, (len(T_base_flange), 1))
+    return np.asarray(frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0])
 
 
 def about_part(chain: Chain, T_mount: Array) -> Chain:
@@ -111,10 +115,8 @@ def about_part(chain: Chain, T_mount: Array) -> Chain:
     """
     if chain.eye_to_hand:
         return chain
-    placed = [
-        frames.transform(T, p) for T, p in zip(chain.capture.poses(T_mount), chain.capture.point_sets, strict=True)
-    ]
-    origin = np.mean([points.mean(axis=0) for points in placed if len(points)], axis=0)
+    views = zip(chain.capture.poses(T_mount), chain.capture.shown, strict=True)
+    origin = np.mean([frames.transform(T, points).mean(axis=0) for T, points in views if len(points)], axis=0)
     scan_views, target_views = (
         tuple(replace(v, origin=origin) for v in w) for w in (chain.scan_views, chain.target_views)
     )

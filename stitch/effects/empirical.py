@@ -75,4 +75,4 @@ def _mount(name: str, course: Array, order: int) -> Effect:
 
 def _step(views: Views, xi: Array, v: float) -> Array:
     """M·exp(ξ) from view v on"""
-    return np.outer(np.arange(views.count) >= v, xi)
+    return np.outer(views.number >= v, xi)

@@ -17,7 +17,7 @@ def fixture_drift(views: Views, xi: Array) -> Array:
 @effect("part", xi=twist("", 6e-4, 0.2), v=event())
 def part_slip(views: Views, xi: Array, v: float) -> Array:
     """from view v on (counted from 0), the part sits displaced by ξ"""
-    return np.outer(np.arange(views.count) >= v, xi)
+    return np.outer(views.number >= v, xi)
 
 
 @effect(

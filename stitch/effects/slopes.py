@@ -48,6 +48,9 @@ def _slopes(chain: Chain, terms: Sequence[Term], term: Term, moved: Callable[[Se
     others = [t for t in terms if t.effect.name != term.effect.name]
     out = []
     for i, parameter in enumerate(chain.parameters(term.effect)):
+        if parameter.discrete:
+            out.append(np.zeros_like(moved([*others, term])))
+            continue
         step = 0.1 * parameter.typical * np.eye(len(term.values))[i]
         both = [moved([*others, replace(term, values=term.values + s * step)]) for s in (1, -1)]
         out.append((both[0] - both[1]) / (0.2 * parameter.typical))

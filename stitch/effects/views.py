@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stitch import robot as kinematics
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.robot import Robot
 from stitch.session import Session
 
@@ -33,6 +33,8 @@ class Views:
     torques: Torques
     covariates: dict[str, Array]  # (V,) each, without gaps
     standoff: float
+    first: dict[str, float]  # the covariates at the session's first view
+    number: Indices  # (V,) of the view in its session, from 0
 
     def sag(self, c: Array) -> Array:
         """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
@@ -43,7 +45,7 @@ class Views:
 
     def since_first(self, covariate: str) -> Array:
         """(V,) a covariate less its value at the first view."""
-        return np.asarray(self.covariates[covariate] - self.covariates[covariate][0])
+        return np.asarray(self.covariates[covariate] - self.first[covariate])
 
     @property
     def hours(self) -> Array:
@@ -72,7 +74,6 @@ class ScanView:
     gravity: Array  # (3,) unit vector in the reference frame
     size: float  # of the part: lengths of shape effects may be counted in it
     origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
-    cache: dict[str, Array] = field(default_factory=dict, repr=False)
 
     def along(self, points: Array) -> Array:
         """(N, 3) unit rays."""
@@ -112,7 +113,20 @@ def views_of(session: Session) -> Views:
     velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds])) if moving else None
     standoff = session.scanner.standoff or _median_range(session)
     torques = torques_of(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
-    return Views(count, time - time[0], joints, previous, approach, velocity, torques, covariates, standoff)
+    first = {name: float(course[0]) for name, course in covariates.items()}
+    return Views(
+        count,
+        time - time[0],
+        joints,
+        previous,
+        approach,
+        velocity,
+        torques,
+        covariates,
+        standoff,
+        first,
+        np.arange(count),
+    )
 
 
 def _median_range(session: Session) -> float:

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from stitch import frames
-from stitch.effects.chain import Chain, Term
-from stitch.effects.views import ScanView
+from stitch.effects.chain import Chain, Term, downwards
 from stitch.frames import Array
 from stitch.labelled.landmarks import Landmarks
 from stitch.labelled.rows import Rows, effect_rows, evidence_of_rows, rows_of
@@ -42,11 +41,13 @@ def imagined_rows(
     if before.sigma_rotation is not None and landmarks.orientation is not None:
         sightings = replace(sightings, rotation=back[:, :3, :3] @ landmarks.orientation,
                             sigma_rotation=np.full(K, np.median(before.sigma_rotation)))  # fmt: skip
-    straight, down = np.ones(len(known)), np.array([0.0, 0.0, -1.0])
-    size = chain.target_views[0].size
+    down = downwards(chain.robot, chain.T_base_flange, chain.eye_to_hand)
+    first = chain.target_views[0]
+    usual = None if first.intensity is None else np.zeros(len(known))
+    like = replace(first, views=chain.views, cosine=np.ones(len(known)), intensity=usual)
     chain = replace(
         chain, capture=replace(bare, sightings=sightings),
-        target_views=tuple(ScanView(v, chain.views, straight, None, down, size) for v in range(K)),
+        target_views=tuple(replace(like, index=v, gravity=down[v]) for v in range(K)),
     )  # fmt: skip
     rows = rows_of(chain.capture, seen.T_mount, replace(landmarks, drawing=None, T_reference_part=None))
     unknown = np.zeros((*rows.left.shape, landmarks.size - rows.landmarks.shape[2]))

@@ -31,11 +31,16 @@ class Capture:
     noise_factor: float = 1.0
 
     @property
-    def point_sets(self) -> list[Array]:
-        """Per view the points (N, 3) that it shows, scanner frame: of its scan, or its labelled ones."""
+    def shown(self) -> list[Array]:
+        """Per view the points (N, 3) that it shows, scanner frame: of its scan, or its labelled ones; maybe none."""
         if self.scans or self.sightings is None:
             return [scan.points for scan in self.scans]
         return self.sightings.sets()
+
+    @property
+    def point_sets(self) -> list[Array]:
+        """The same of the views that show any."""
+        return [points for points in self.shown if len(points)]
 
     @property
     def spacing(self) -> float:
