@@ -9,7 +9,8 @@ import tomli_w
 
 from stitch.errors import InputError
 from stitch.frames import Array, is_rigid
-from stitch.reading.toml_file import read_toml
+from stitch.reading.toml_file import choice, read_toml, text
+from stitch.robot import METRES
 
 FORMAT = "stitch-model/1"
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
@@ -77,7 +78,7 @@ def read_model(path: Path) -> Model:
     """Read `model.toml`, or that of a run folder.
 
     Raises:
-        InputError: the file is missing, not a model, or its hand-eye is not a rigid motion.
+        InputError: the file is missing, not a model, or a value cannot be: a hand-eye that is not a rigid motion.
     """
     path = path / "model.toml" if path.is_dir() else path
     document = read_toml(path, "name a run folder that `stitch run` wrote")
@@ -91,8 +92,8 @@ def read_model(path: Path) -> Model:
             raise InputError(f"{path}: hand_eye.{name} is not a rigid motion; its 3x3 part must be a rotation")
     covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
     return Model(
-        str(document.get("length_unit")), str(document.get("mount")), corrected, coarse, covariance,
-        _effects(path, document.get("effects", {})), document.get("effects_file"),
+        choice(path, document, "length_unit", tuple(METRES)), str(document.get("mount")), corrected, coarse, covariance,
+        _effects(path, document.get("effects", {})), text(path, document, "", "effects_file"),
         _targets(path, document.get("targets", {})),
     )  # fmt: skip
 
@@ -152,7 +153,7 @@ def in_unit(model: Model, length_unit: str) -> Model:
     """The model with lengths in another unit."""
     if model.length_unit == length_unit:
         return model
-    factor = {"mm": 1e-3, "m": 1.0}[model.length_unit] / {"mm": 1e-3, "m": 1.0}[length_unit]
+    factor = METRES[model.length_unit] / METRES[length_unit]
     scale = np.array([1.0] * 3 + [factor] * 3)
     moved = []
     for T in (model.T_mount, model.T_mount_coarse):

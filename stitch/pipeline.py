@@ -7,9 +7,8 @@ from functools import partial
 from stitch.diagnosis.start import start_values
 from stitch.effects.chain import Chain, Term, about_part, chain_of
 from stitch.effects.scanner_field import field_scatters
-from stitch.effects.terms import empty_term, known, require, terms_of
+from stitch.effects.terms import empty_term, known, sigmas_of, terms_of
 from stitch.effects.undo import corrected
-from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.labelled.beside import Beside, fitted_beside, weighed
 from stitch.labelled.run import change_labelled, run_labelled
@@ -20,8 +19,9 @@ from stitch.overlap.match import sample
 from stitch.overlap.overlaps import collect
 from stitch.recorder import Recorder, Silent
 from stitch.result import Run, StageResult, Step
+from stitch.rig import require_effects, require_same_rig
 from stitch.session import Session
-from stitch.stages.coarse import COARSE_GATE, Coarse, coarse, given, part_size
+from stitch.stages.coarse import COARSE_GATE, REUSED, STATED, Coarse, coarse, given, part_size
 from stitch.stages.correct import COARSE_SAMPLES, Correction, correct
 from stitch.stages.finish import finish, show
 from stitch.stages.refine import refine
@@ -40,7 +40,7 @@ def run(
         effects: names of effects to fit together with the hand-eye.
 
     Raises:
-        InputError: the model belongs to another mount, or the session cannot have an effect.
+        InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
     return run_rig([session], model, [recorder or Silent()], effects)[0]
@@ -51,19 +51,18 @@ def run_rig(
     effects: Sequence[str] = (),
 ) -> list[Run]:  # fmt: skip
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
-    _same_rig(sessions, model)
+    require_same_rig(sessions, model)
     recorders = recorders or [Silent() for _ in sessions]
     with library_threads_off():
         clock = Clock()
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
         chains = [chain_of(session, capture(session)) for session in sessions]
-        for chain in chains:
-            for name in effects:
-                require(chain, known(name))
+        effects = list(dict.fromkeys(effects))
+        model = in_unit(model, sessions[0].length_unit) if model else None
+        require_effects(chains, [*effects, *(model.effects if model else ())])
         if not sessions[0].has_clouds:
-            own = in_unit(model, sessions[0].length_unit) if model else None
-            found = run_labelled(sessions[0], chains[0], own, effects, recorders[0])
+            found = run_labelled(sessions[0], chains[0], model, effects, recorders[0])
             return [_in_ledger(found, (), model.effects_file if model else None, recorders[0])]
         start = _start(sessions, chains, model)
         chains = [about_part(chain, start.T_mount) for chain in chains]
@@ -91,8 +90,8 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         clock = Clock()
         chain = state.chain
         recorder.start(state.session)
-        for name in effects:
-            require(chain, known(name))
+        effects = list(dict.fromkeys(effects))
+        require_effects([chain], effects)
         kept = [t for t in state.terms if t.effect.name in effects]
         used = [t.effect.name for t in kept]
         terms = [*kept, *start_values(state, [known(name) for name in effects if name not in used])]
@@ -123,9 +122,10 @@ class _Place:
 
 def _start(sessions: Sequence[Session], chains: Sequence[Chain], model: Model | None) -> Coarse:
     captures = [chain.capture for chain in chains]
+    if model:
+        return given(captures, model.T_mount, REUSED)
     stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
-    T_mount = in_unit(model, sessions[0].length_unit).T_mount if model else stated
-    return coarse(captures) if T_mount is None else given(captures, T_mount)
+    return coarse(captures) if stated is None else given(captures, stated, STATED)
 
 
 def _correct(
@@ -134,10 +134,9 @@ def _correct(
     """The hand-eye from the scans; with effects, both; with a model, neither is changed."""
     captures: list[Capture] = [chain.capture for chain in chains]
     if model:
-        model = in_unit(model, chains[0].length_unit)
         terms: list[Term] = terms_of(model, chains[0])
         captures = [corrected(chain, terms, model.T_mount) for chain in chains]
-        return reuse(captures, model, terms)
+        return reuse(captures, model, terms, sigmas_of(model, chains[0]))
     repeating = partial(field_scatters, chains)
     first = correct(captures, start.T_mount, start.gate, recorder, repeating)
     if not effects:
@@ -174,24 +173,3 @@ def _in_ledger(result: Run, ledger: Sequence[Step], effects_file: str | None, re
     result = replace(result, ledger=(*ledger, step), effects_file=effects_file)
     recorder.finish(result)
     return result
-
-
-def _same_rig(sessions: Sequence[Session], model: Model | None) -> None:
-    first = sessions[0]
-    for other in sessions[1:]:
-        if (other.mount, other.length_unit) != (first.mount, first.length_unit):
-            raise InputError(
-                f"{other.path}: mount {other.mount} in {other.length_unit}, but {first.path} has {first.mount} "
-                f"in {first.length_unit}; only sessions of one rig share a hand-eye"
-            )
-    if model and model.mount != first.mount:
-        raise InputError(
-            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
-        )
-    for session in sessions:
-        if not session.has_clouds and not session.has_sightings:
-            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
-        if not session.has_clouds and len(sessions) > 1:
-            raise InputError(f"{session.path}: sessions without clouds run one by one; use --hand-eye for the next")
-        if len(session.views) < 2:
-            raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")

@@ -1,6 +1,8 @@
-"""Numbers with the digits that are known."""
+"""Numbers as people read them: in micrometres, with the digits that are known."""
 
 import numpy as np
+
+MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
 
 
 def rounded(value: float, sigma: float) -> str:

@@ -3,16 +3,16 @@
 import numpy as np
 
 from stitch.repeatability import Repeatability
+from stitch.rounding import MICROMETRES
 from stitch.stages.coarse import Coarse
 
-_MICROMETRES = {"mm": 1e3, "m": 1e6}
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
 _NEAR_FLOOR = 1.1
 
 
 def sentence(residual: float, registered: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
     """What one hand-eye leaves, what the noise would leave, and where the difference sits."""
-    to_um = _MICROMETRES[length_unit]
+    to_um = MICROMETRES[length_unit]
     left, after, noise = (f"{x * to_um:.3g} µm" for x in (residual, registered, floor))
     if residual < _NEAR_FLOOR * floor:
         return f"One hand-eye closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."

@@ -82,6 +82,16 @@ def test_text(tmp_path, suffix, text):
     assert np.array_equal(next(iter(cloud.scalars.values())), [9, 8])
 
 
+def test_points_at_the_scanner_itself_are_no_measurement(tmp_path):
+    """Structured exports keep a place for every pixel; scalars and normals stay with their points."""
+    path = tmp_path / "c.csv"
+    path.write_text("x,y,z,nx,ny,nz,intensity\n0,0,0,0,0,0,0\n1,0,3,0,0,1,9\n-0.0,0,0,0,0,0,0\n0,0,6,0,1,0,8\n")
+    cloud = read_cloud(path)
+    assert np.array_equal(cloud.points, [[1, 0, 3], [0, 0, 6]])
+    assert np.array_equal(cloud.normals, [[0, 0, 1], [0, 1, 0]])
+    assert np.array_equal(cloud.scalars["intensity"], [9, 8])
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [("c.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n", "cannot be read"),

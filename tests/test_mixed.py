@@ -280,3 +280,7 @@ def test_every_command_works(tmp_path, capsys, monkeypatch):
         stitch("run", str(tmp_path / "s"), "--hand-eye", out, "-o", str(tmp_path / "q"), "--no-recording", "--json")
     )
     assert len(judged["targets"]) == len(first["targets"])
+    page = tmp_path / "q" / "report.html"
+    targets = [line for line in page.read_text().splitlines() if "reference frame</td>" in line]
+    stitch("report", str(tmp_path / "q"), "--no-diagnosis")
+    assert len(targets) == len(first["targets"]) and all(line in page.read_text() for line in targets)

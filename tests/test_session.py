@@ -4,15 +4,21 @@ import csv
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import measured_blade
+from pyarrow.parquet import read_table
 
 from data_synth.write import write_session
+from stitch import frames
 from stitch.cli.main import main
+from stitch.effects import EFFECTS
 from stitch.errors import InputError
+from stitch.model import Model, read_model, write_model
+from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.robot import forward, robot_from_dh
 
@@ -70,6 +76,17 @@ def toml(old, new):
     return lambda folder: edit(folder / "session.toml", old, new)
 
 
+def table(text):
+    """A table more in session.toml."""
+    return toml(r"\[scanner\]", f"{text}\n[scanner]")
+
+
+def open_quote(folder):
+    """A quote on line 3 that nobody closes, in a file larger than what csv takes for one cell."""
+    rows = (folder / "views.csv").read_text().splitlines()
+    (folder / "views.csv").write_text("\n".join([*rows[:2], '"' + rows[2], *rows[3:] * 2000]) + "\n")
+
+
 BAD = {
     "no session.toml": (remove("session.toml"), ["session.toml", "not found"]),
     "no views.csv": (remove("views.csv"), ["views.csv", "not found"]),
@@ -92,6 +109,16 @@ BAD = {
     "format": (toml("stitch-session/1", "stitch-session/9"), ["format", "stitch-session/1"]),
     "broken TOML": (toml("mount = ", "mount "), ["not valid TOML"]),
     "axis": (toml(r"\+z", "up"), ["optical_axis"]),
+    "axis as a vector": (toml(r'"\+z"', "[0, 0, 1]"), ["scanner.optical_axis is [0, 0, 1]", '"+z"']),
+    "axis that no effect knows": (toml(r"\+z", "-x"), ["scanner.optical_axis is '-x'", "turn the clouds"]),
+    "gravity in words": (table('[robot]\njoints = [{ a = 1 }]\ngravity = "down"'), ["session.toml", "gravity is 'down'"]),
+    "URDF that is no name": (table("[robot]\nurdf = 5"), ["session.toml", "robot.urdf is 5"]),
+    "link that is no name": (table('[robot]\nurdf = "r.urdf"\nflange_link = ["a"]'), ["robot.flange_link is ['a']"]),
+    "CAD that is no name": (table("[part]\ncad = 5"), ["part.cad is 5"]),
+    "unit of the CAD": (table('[part]\ncad_unit = "inch"'), ["cad_unit is 'inch'", "'mm' or 'm'"]),
+    "open quote": (open_quote, ["views.csv line 3", "quote"]),
+    "one point": (write_cloud("1 2 400\n"), ["v001", "line 3", "1 of at least 3 points"]),
+    "nothing but invalid points": (write_cloud("0 0 0\n0 0 0\n"), ["v001", "line 3", "all 2 points are 0 0 0"]),
     "noise": (toml("noise = 0.02", "noise = -1"), ["scanner.noise"]),
 }  # fmt: skip
 
@@ -140,6 +167,103 @@ def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
     assert [path.name for path in keep.iterdir()] == ["thesis.txt"]
 
 
+def test_a_run_cannot_take_the_place_of_the_folder_one_stands_in(session, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("stitch.cli.run.run_rig", lambda *_: pytest.fail("computed first"))
+    (tmp_path / "here" / "inner").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here" / "inner")
+    for target in (".", "..", tmp_path / "here" / "inner"):
+        with pytest.raises(SystemExit) as ended:
+            main(["run", str(session), "-o", str(target)])
+        assert ended.value.code == 2
+        assert f"stitch: {target}: " in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.rglob("here/**/*")) == ["inner"]
+
+
+def test_a_batch_goes_on_after_whatever_befalls_one_session(session, tmp_path, monkeypatch, capsys):
+    """Also after an error that nobody foresaw."""
+    shutil.copytree(session, tmp_path / "t")
+
+    def fails_once(loaded):
+        if loaded.path.name == "s":
+            raise ZeroDivisionError("by\nzero")
+        return run(loaded)
+
+    monkeypatch.setattr("stitch.cli.batch.run", fails_once)
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", str(session), str(tmp_path / "t"), "-o", str(tmp_path / "runs"), "--json"])
+    assert ended.value.code == 1
+    bad, good = json.loads(capsys.readouterr().out)
+    assert bad["error"] == "ZeroDivisionError: by zero" and good["error"] is None
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["t"]
+
+
+def sees_points(folder):
+    """Six labelled points on the flange, seen with 20 µm of noise."""
+    loaded, rng = load_session(folder), np.random.default_rng(0)
+    balls, rows = rng.normal(size=(6, 3)) * 50, ["view,target,x,y,z"]
+    for view in loaded.views:
+        T_scanner_flange = frames.inverse(loaded.scanner.T_mount) @ view.T_base_flange
+        seen = frames.transform(T_scanner_flange, balls) + rng.normal(size=(6, 3)) * 0.02
+        rows += [f"{view.name},ball{i},{x},{y},{z}" for i, (x, y, z) in enumerate(seen)]
+    (folder / "points.csv").write_text("\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("kind", ["clouds", "points", "both"])
+def test_residuals_with_gaps_in_the_times_and_covariates_named_like_columns(session, tmp_path, kind):
+    if kind != "clouds":
+        sees_points(session)
+    if kind == "points":
+        for row in (1, 2, 3):
+            spoil_cell(row, "cloud", "")(session)
+    rows = (session / "views.csv").read_text().splitlines()
+    more = ("time_s,residual,nx", "0,5,7", ",6,", "9,5,8")
+    (session / "views.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(rows, more, strict=True)) + "\n")
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(tmp_path / "run"), "--no-recording"])
+    assert not ended.value.code
+    table = read_table(tmp_path / "run" / "residuals.parquet")
+    assert sorted(set(table.column_names)) == sorted(table.column_names)
+    columns = {name: np.array(values) for name, values in table.to_pydict().items()}
+    assert np.abs(columns["residual"]).max() < 4 and np.abs(columns["nx"]).max() <= 1
+    assert ("ball0" in columns["partner"], "v001" in columns["partner"]) == (kind != "clouds", kind != "points")
+    for view, *known in (("v000", 0, 5, 7), ("v001", np.nan, 6, np.nan)):
+        own = columns["view"] == view
+        for name, value in zip(("time_s", "covariate_residual", "covariate_nx"), known, strict=True):
+            assert np.array_equal(np.unique(columns[name][own]), [value], equal_nan=True)
+
+
+USER = """
+from stitch.effects import effect, number
+
+@effect("sensor", k=number("mm", typical=0.02, limit=1.0))
+def of_my_own(points, view, k):
+    return points
+"""
+
+
+@pytest.mark.parametrize(("name", "expected"), [("mine.txt", "mine.py"), ("mine.py", "'of_my_own' has no docstring")])
+def test_effects_that_cannot_be_loaded_are_refused(tmp_path, capsys, name, expected):
+    (tmp_path / name).write_text(USER)
+    with pytest.raises(SystemExit) as ended:
+        main(["effects", "--effects-file", str(tmp_path / name)])
+    assert ended.value.code == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"stitch: {tmp_path / name}: ") and expected in printed and printed.count("\n") == 1
+    assert "of_my_own" not in EFFECTS
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ('length_unit = "mm"', 'length_unit = "cm"', "length_unit is 'cm'"), ('length_unit = "mm"\n', "", "length_unit is None"),
+    ("^", "effects_file = 5\n", "effects_file is 5"),
+])  # fmt: skip
+def test_a_model_that_was_edited_wrongly_is_refused(tmp_path, old, new, expected):
+    file = tmp_path / "model.toml"
+    write_model(Model("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6)), file)
+    edit(file, old, new)
+    with pytest.raises(InputError, match=f"model.toml: {expected}; "):
+        read_model(file)
+
+
 JOINTS = [
     {"a": 100, "alpha_deg": 90, "d": 400},
     {"a": 500, "d": 0, "alpha_deg": 0},
@@ -170,7 +294,7 @@ def test_joints_and_pose_that_contradict_are_refused(session):
     rows = (session / "views.csv").read_text().splitlines()
     header = rows[0] + ",j1_deg,j2_deg,j3_deg"
     joints_session(session, [row + ",10,20,30" for row in rows[1:]], header)
-    with pytest.raises(InputError, match="line 2.*differ by.*check robot.dh"):
+    with pytest.raises(InputError, match="line 2.* mm and .*check robot.dh"):
         load_session(session)
 
 

@@ -102,10 +102,11 @@ class RerunRecorder:
 
     def _sticks(self, run: Run) -> None:
         """Offsets of the targets under the model, magnified, beside the targets."""
+        assert run.labelled is not None
         target, left = residual_vectors(run)
-        start = run.fused.points[target]
+        start = run.labelled.landmarks.positions[target]
         longest = max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
-        factor = 0.25 * (float(np.ptp(run.fused.points, axis=0).max()) or 1.0) / longest
+        factor = 0.25 * (float(np.ptp(start, axis=0).max()) or 1.0) / longest
         strips = np.stack([start, start + factor * left], axis=1).astype(np.float32)
         self.recording.log("fused/sticks", rr.LineStrips3D(strips, colors=[(72, 120, 168)]), static=True)
         self.recording.log("log", rr.TextLog(f"sticks at the targets are {factor:.0f} times longer than they are"))

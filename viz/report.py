@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch.result import Run
 from stitch.rounding import rounded
+from stitch.writing.whole import whole
 from viz import captions, figures, maps, target_figures
 from viz.diagnosis_figures import waterfall
 from viz.recording import shown_points, view_shifts
@@ -25,7 +26,9 @@ def write_report(run: Run, path: Path) -> None:
     """Write the page: verdict, stages, hand-eye, views and pictures; needs nothing beside it."""
     environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
     template = environment.get_template("report.html.j2")
-    path.write_text(template.render(**_content(run)), encoding="utf-8")
+    page = template.render(**_content(run))
+    with whole(path) as file:
+        file.write_text(page, encoding="utf-8")
 
 
 def _content(run: Run) -> dict[str, object]:

@@ -11,6 +11,7 @@ from stitch.diagnosis.answer import Diagnosis
 from stitch.diagnosis.comparison import Comparison
 from stitch.diagnosis.words import amounts_of
 from stitch.state import State
+from stitch.writing.whole import whole
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.blueprint import diagnosis_blueprint
@@ -71,9 +72,8 @@ def _insert(page: Path, name: str, html: str) -> None:
     begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
     text = page.read_text(encoding="utf-8")
     new = re.sub(f"{begin}.*?{end}", lambda _: begin + html + end, text, flags=re.S)
-    scratch = page.with_name(f".{page.name}.new")
-    scratch.write_text(new, encoding="utf-8")
-    scratch.replace(page)
+    with whole(page) as file:
+        file.write_text(new, encoding="utf-8")
 
 
 def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
@@ -82,8 +82,10 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
     addresses = {}
     for name, figure in figures.items():
         text = svg_text(figure)
-        figure.savefig(folder / f"{name}.png", dpi=120)
-        (folder / f"{name}.svg").write_text(text, encoding="utf-8")
+        with whole(folder / f"{name}.png") as file:
+            figure.savefig(file, format="png", dpi=120)
+        with whole(folder / f"{name}.svg") as file:
+            file.write_text(text, encoding="utf-8")
         addresses[name] = uri("svg+xml", text.encode())
     return addresses
 
@@ -91,9 +93,10 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
 def _record(found: Diagnosis, folder: Path) -> None:
     """The verdict and its pictures; `stitch view` opens it beside the recording of the run."""
     recording = rr.RecordingStream("stitch_diagnosis")
-    recording.save(str(folder / "diagnosis.rrd"), default_blueprint=diagnosis_blueprint())
     text = f"# {found.verdict}\n\n{found.sentence}"
-    recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
-    for picture in sorted((folder / "pictures").glob("*.png")):
-        recording.log(f"diagnosis/{picture.stem}", rr.EncodedImage(path=picture), static=True)
-    recording.disconnect()
+    with whole(folder / "diagnosis.rrd") as file:
+        recording.save(str(file), default_blueprint=diagnosis_blueprint())
+        recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
+        for picture in sorted((folder / "pictures").glob("*.png")):
+            recording.log(f"diagnosis/{picture.stem}", rr.EncodedImage(path=picture), static=True)
+        recording.disconnect()

@@ -15,9 +15,10 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 def sticks(run: Run) -> Figure:
     """Where every view puts each target, as magnified sticks from the target's place, in three planes."""
+    assert run.labelled is not None
     target, left = residual_vectors(run)
-    place = run.fused.points
-    size = float(np.ptp(place, axis=0).max()) or 1.0
+    place = run.labelled.landmarks.positions
+    size = float(np.nanmax(np.ptp(place[target], axis=0))) or 1.0
     magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):

@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.progress import MICROMETRES
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
+from stitch.rounding import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 
@@ -42,12 +42,14 @@ def batch(
 def stitch_one(session: Path, folder: Path) -> dict[str, Any]:
     """Run one session into its folder; what goes wrong becomes part of the answer."""
     try:
-        result = run(load_session(session))
+        loaded = load_session(session)
         with run_folder.new_folder(folder) as scratch:
+            result = run(loaded)
             run_folder.write_run(result, scratch)
             run_folder.extend("stitch.reports", result, scratch / "report.html")
-    except StitchError as error:
-        return {"session": str(session), "run": None, "error": str(error)}
+    except Exception as error:  # whatever befalls one session, the others go on
+        kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
+        return {"session": str(session), "run": None, "error": f"{kind}{' '.join(str(error).split())}"}
     um = MICROMETRES[result.session.length_unit]
     return {
         "session": str(session), "run": str(folder), "error": None, "residual_um": result.residual_rms * um,

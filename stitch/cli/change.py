@@ -1,6 +1,5 @@
 """`stitch add RUN EFFECT…`, `stitch drop RUN EFFECT…`: change the model, refit, print the ledger."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -11,21 +10,18 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.cli.diagnose import write_diagnosis
-from stitch.cli.progress import MICROMETRES
 from stitch.cli.run import recorder_for
 from stitch.diagnosis.suggest import suggest
 from stitch.effects.terms import known, require
 from stitch.errors import InputError
 from stitch.pipeline import change
-from stitch.recorder import Recorder
 from stitch.result import Run
-from stitch.rounding import rounded
+from stitch.rounding import MICROMETRES, rounded
 from stitch.state import State, load_state, state_of
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.result_document import result_document
 
-_SCRATCH = ".new"
 # A held-out residual falls if it does by more than new matches alone change it.
 _FALLS = 0.995
 _CLEAR = 4.0
@@ -55,7 +51,7 @@ def add(
         require(state.chain, known(name))
         if name in used:
             raise InputError(f"{name} is in the model of {run} already")
-    _finish(run, change(state, [*used, *(effects or [])], _recorder(run, recording)), as_json)
+    _change(run, state, [*used, *(effects or [])], recording, as_json)
 
 
 def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: bool) -> None:
@@ -64,10 +60,14 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
     for line in lines:
         Console(stderr=True).print(line, soft_wrap=True, highlight=False)
     if result is not None:
-        if recording:
-            again = change(state_of(result), list(result.effects), _recorder(run, recording))
-            result = replace(again, ledger=result.ledger, poses_before=result.poses_before)
-        _finish(run, result, as_json)
+        with run_folder.changed(run) as scratch:
+            if recording:
+                again = change(state_of(result), list(result.effects), recorder_for(scratch, recording))
+                result = replace(again, ledger=result.ledger, poses_before=result.poses_before)
+            _write(result, scratch)
+        _show(result, as_json)
+    elif as_json:
+        print((run / "result.json").read_text(encoding="utf-8").rstrip())
     write_diagnosis(found, state if result is None else state_of(result), run)
 
 
@@ -83,23 +83,23 @@ def drop(
         if name not in used:
             raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
     kept = [name for name in used if name not in effects]
-    _finish(run, change(state, kept, _recorder(run, recording)), as_json)
+    _change(run, state, kept, recording, as_json)
 
 
-def _recorder(run: Path, recording: bool) -> Recorder:
-    """Records into a folder of its own, whose files take their place in the run at the end."""
-    scratch = run / _SCRATCH
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    return recorder_for(scratch, recording)
+def _change(run: Path, state: State, effects: list[str], recording: bool, as_json: bool) -> None:
+    """Give the run folder the model with these effects, and show it."""
+    with run_folder.changed(run) as scratch:
+        result = change(state, effects, recorder_for(scratch, recording))
+        _write(result, scratch)
+    _show(result, as_json)
 
 
-def _finish(run: Path, result: Run, as_json: bool) -> None:
-    scratch = run / _SCRATCH
-    scratch.mkdir(exist_ok=True)
-    run_folder.write_run(result, scratch)
-    run_folder.extend("stitch.reports", result, scratch / "report.html")
-    run_folder.take_over(scratch, run)
+def _write(result: Run, folder: Path) -> None:
+    run_folder.write_run(result, folder)
+    run_folder.extend("stitch.reports", result, folder / "report.html")
+
+
+def _show(result: Run, as_json: bool) -> None:
     if as_json:
         print(to_json(result_document(result)))
     else:

@@ -8,10 +8,10 @@ import typer
 from rich.console import Console
 from rich.table import Table as Printed
 
-from stitch.cli.progress import MICROMETRES
 from stitch.diagnosis.compare import compare
 from stitch.diagnosis.compare_targets import compare_targets
 from stitch.diagnosis.comparison import Table, comparison_document
+from stitch.rounding import MICROMETRES
 from stitch.state import load_state
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend

@@ -7,11 +7,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.progress import MICROMETRES
 from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.words import amounts_of
+from stitch.rounding import MICROMETRES
 from stitch.state import State, load_state
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend

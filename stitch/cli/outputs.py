@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from stitch.errors import InputError
+from stitch.writing.whole import whole
 
 RecordingOption = Annotated[
     Path | None, typer.Option("--recording", metavar="FILE", help="Write a Rerun recording, .rrd.")
@@ -36,10 +37,6 @@ def show(command: str, recording: Path | None, report: Path | None, *found: Any)
             raise InputError(f"{path}: no writer for `stitch {command}` is installed; install stitch anew")
         if not path.parent.is_dir():
             raise InputError(f"{path}: its folder does not exist; make it first")
-        scratch = path.with_name(f".{path.name}.new")
-        try:
+        with whole(path) as scratch:
             for writer in offered:
                 writer.load()(*found, scratch)
-            scratch.replace(path)
-        finally:
-            scratch.unlink(missing_ok=True)

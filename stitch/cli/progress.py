@@ -8,9 +8,8 @@ from rich.console import Console
 from stitch.frames import Array
 from stitch.recorder import Recorder
 from stitch.result import Run, StageResult
+from stitch.rounding import MICROMETRES
 from stitch.session import Session
-
-MICROMETRES = {"mm": 1e3, "m": 1e6}
 
 
 class Progress:

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.progress import MICROMETRES, Progress, Tee
+from stitch.cli.progress import Progress, Tee
 from stitch.effects.terms import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
@@ -18,6 +18,7 @@ from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.recorder import Recorder
 from stitch.result import Run
+from stitch.rounding import MICROMETRES
 from stitch.session import Session
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
@@ -42,7 +43,7 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")] = False,
 ) -> None:  # fmt: skip
     """Find and correct the hand-eye, register the views, fuse them."""
-    names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
+    names_of_effects = list(dict.fromkeys(name.strip() for name in effects.split(",") if name.strip()))
     if effects_file:
         load_effects(effects_file)
     for name in names_of_effects:

@@ -1,5 +1,6 @@
 """On what the unexplained part of the poses depends: every covariate, with the shape as binned means."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -46,8 +47,8 @@ def course_of(views: Views, name: str) -> Array | None:
         return views.time
     if name == "an event":
         return np.arange(views.count, dtype=float)
-    if name.startswith("j") and name.endswith("_deg"):
-        return np.asarray(np.degrees(views.joints[:, int(name[1:-4]) - 1]))
+    if joint := re.fullmatch(r"j(\d+)_deg", name):
+        return np.asarray(np.degrees(views.joints[:, int(joint[1]) - 1]))
     return views.covariates.get(name)
 
 

@@ -5,14 +5,12 @@ import numpy as np
 from stitch.diagnosis.answer import Diagnosis
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.select import IMPLAUSIBLE
-from stitch.rounding import rounded
-
-_MICROMETRES = {"mm": 1e3, "m": 1e6}
+from stitch.rounding import MICROMETRES, rounded
 
 
 def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     """One sentence for each verdict."""
-    to_um = _MICROMETRES[length_unit]
+    to_um = MICROMETRES[length_unit]
     now, floor = (f"{x * to_um:.3g} µm" for x in (d.residual_rms, d.noise_floor))
     scatter = f"{d.translation * to_um:.3g} µm and {d.rotation * 1e6:.3g} µrad"
     if d.verdict == "adequate":

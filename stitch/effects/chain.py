@@ -37,9 +37,10 @@ class Chain:
     target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
 
     def parameters(self, effect: Effect) -> tuple[Parameter, ...]:
-        """The parameters of an effect in this session."""
+        """The parameters of an effect in this session; where time stands in for a temperature, rates are per hour."""
         found = effect.parameters(self.views.joints.shape[1], self.views.torques.names, self.length_unit)
-        return tuple(replace(p, grid=self._grid(p)) for p in found)
+        timed = bool(effect.prefers) and not any(self.views.has(name) for name in effect.prefers)
+        return tuple(replace(p, grid=self._grid(p), unit=p.unit.replace("°C", "h") if timed else p.unit) for p in found)
 
     def _grid(self, parameter: Parameter) -> tuple[float, ...]:
         if parameter.grid != EVERY_VIEW:
@@ -129,7 +130,8 @@ def _intensities(session: Session) -> list[Array | None]:
     if any(values is None for values in raw):
         return [None] * len(raw)
     everything = np.concatenate([values for values in raw if values is not None])
-    spread = float(everything.std())
-    if spread <= 0:
+    # One value that is not finite would spoil the mean of all: intensity then counts as absent, in every view.
+    if not np.isfinite(everything).all() or everything.std() <= 0:
         return [None] * len(raw)
+    spread = float(everything.std())
     return [None if values is None else (values - everything.mean()) / spread for values in raw]

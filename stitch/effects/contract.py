@@ -166,7 +166,7 @@ def effect(
     """Register the decorated function under its own name.
 
     Raises:
-        InputError: unknown place, or a name that is taken.
+        InputError: unknown place, a name that is taken, or no docstring.
     """
     if place not in PLACES:
         raise InputError(f"effect at {place!r}: places are {', '.join(PLACES)}")
@@ -175,6 +175,8 @@ def effect(
         name = function.__name__
         if name in EFFECTS and EFFECTS[name].tier != "user":
             raise InputError(f"effect {name!r} is in the library already; give yours another name")
+        if not (function.__doc__ or "").strip():
+            raise InputError(f"effect {name!r} has no docstring; its first line says what nature does")
         EFFECTS[name] = Effect(name, place, specs, function, tuple(needs), tuple(prefers), tier)
         return function
 

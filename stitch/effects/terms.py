@@ -31,7 +31,9 @@ def require(chain: Chain, effect: Effect) -> None:
     missing = chain.lacks(effect)
     if missing:
         words = [_MENDS.get(need, f"a column {need} in views.csv") for need in missing]
-        raise InputError(f"effect {effect.name} needs {' and '.join(words)}, which this session does not have")
+        raise InputError(
+            f"effect {effect.name} needs {' and '.join(words)}, which session {chain.capture.name} does not have"
+        )
 
 
 _MENDS = {
@@ -50,18 +52,46 @@ def empty_term(chain: Chain, effect: Effect) -> Term:
 
 
 def terms_of(model: Model, chain: Chain) -> list[Term]:
-    """The terms of a model in a session.
+    """The terms of a model in a session, a parameter that the model does not name at zero.
 
     Raises:
-        InputError: an effect that is not known, or that the session cannot have.
+        InputError: an effect that is not known or that the session cannot have, or a parameter that it does not have
+            or counts in another unit.
     """
     out = []
     for name, fitted in model.effects.items():
         effect = known(name)
         require(chain, effect)
-        values = [fitted[p.name].value if p.name in fitted else 0.0 for p in chain.parameters(effect)]
-        out.append(Term(effect, np.array(values)))
+        parameters = chain.parameters(effect)
+        _require_same(chain, effect, fitted, {p.name: p.unit for p in parameters})
+        out.append(Term(effect, np.array([fitted[p.name].value if p.name in fitted else 0.0 for p in parameters])))
     return out
+
+
+def sigmas_of(model: Model, chain: Chain) -> tuple[Array, ...]:
+    """Per term of `terms_of` the sigmas (P,) of its parameters, NaN where the model states none."""
+    return tuple(
+        np.array([fitted[p.name].sigma if p.name in fitted else np.nan for p in chain.parameters(known(name))])
+        for name, fitted in model.effects.items()
+    )
+
+
+def _require_same(chain: Chain, effect: Effect, fitted: dict[str, Fitted], units: dict[str, str]) -> None:
+    """Refuse what a model knows of an effect where this session would have to drop it or read it otherwise."""
+    where = f"session {chain.capture.name}"
+    lost = [name for name in fitted if name not in units]
+    if lost:
+        raise InputError(
+            f"the model's {effect.name} has {', '.join(lost)}, but in {where} it has {', '.join(units)}; state the arm "
+            "and its link masses under [robot] as the session that was fitted does, or fit the effect anew"
+        )
+    for name, f in fitted.items():
+        if f.unit != units[name]:
+            mend = f"a column {' or '.join(effect.prefers)} there as here" if effect.prefers else "that unit"
+            raise InputError(
+                f"the model's {effect.name}.{name} is in {f.unit!r}, but {where} counts it in {units[name]!r}; "
+                f"it needs {mend}"
+            )
 
 
 def fitted_of(chain: Chain, terms: Sequence[Term], sigmas: Sequence[Array]) -> dict[str, dict[str, Fitted]]:

@@ -13,15 +13,16 @@ def load(path: Path) -> list[str]:
     The file is Python and is executed: load only files that you would run.
 
     Raises:
-        InputError: no such file, an error in it (with its line), or no effect in it.
+        InputError: no such file, no Python file, an error in it (with its line), or no effect in it.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; --effects-file names a Python file with @effect functions")
+    spec = importlib.util.spec_from_file_location(f"stitch_user_effects_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: not called a Python file; rename it {path.with_suffix('.py').name}")
     before = dict(EFFECTS)
     for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
         del EFFECTS[name]
-    spec = importlib.util.spec_from_file_location(f"stitch_user_effects_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
     try:
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
     except InputError as error:

@@ -10,6 +10,9 @@ from stitch.frames import Array, Indices
 from stitch.robot import Robot
 from stitch.session import Session
 
+# Joint angles that show which torques of an arm differ.
+_ANYWHERE = 100
+
 
 @dataclass(frozen=True)
 class Torques:
@@ -136,14 +139,17 @@ def _median_range(session: Session) -> float:
 
 
 def torques_of(robot: Robot, joints: Array) -> Torques:
-    """Gravity torques at joint angles (V, n)."""
+    """Gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles."""
     n = robot.n_joints
     if robot.has_masses:
         values = kinematics.gravity_torques(robot, joints)
         return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
-    # Without masses the shape of every torque follows from the geometry: 1 kg at each link's frame.
+    # Without masses the shape of every torque follows from the geometry: 1 kg at each link's frame. Angles from
+    # everywhere choose among them: a coefficient must mean the same in every session of an arm.
+    everywhere = np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, n))
+    shapes = kinematics.unit_torques(robot, everywhere)
+    keep = [(i, k) for i in range(n) for k in _different(shapes[:, i], range(i, n))]
     unit = kinematics.unit_torques(robot, joints)
-    keep = [(i, k) for i in range(n) for k in _different(unit[:, i], range(i, n))]
     return Torques(
         tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep),
         np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep)),

@@ -83,9 +83,8 @@ def residual_columns(found: LabelledFit, session: Session) -> dict[str, Array]:
     out |= {"residual": distance, "heldout": found.heldout[v, slot]}
     covariates = sorted({key for view in session.views for key in view.covariates})
     out |= {key: np.array([view.covariates.get(key, np.nan) for view in session.views])[v] for key in covariates}
-    if all(view.time_s is not None for view in session.views):
-        out["time_s"] = np.array([view.time_s for view in session.views], float)[v]
-    return out
+    # As floats, NaN where nobody states it.
+    return out | {"time_s": np.array([view.time_s for view in session.views], float)[v]}
 
 
 def as_counted(chain: Chain, session: Session, document: dict[str, Any]) -> Chain:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.effects.chain import Chain, Term
+from stitch.effects.terms import sigmas_of
 from stitch.effects.undo import corrected
 from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.landmarks import Landmarks, settled
@@ -20,10 +21,9 @@ def judged(chain: Chain, model: Model, terms: Sequence[Term]) -> LabelledFit:
     rows = rows_of(own, model.T_mount, landmarks)
     variances = fit_variances(evidence_of_rows(rows, rows.hand_eye[..., :0]), both_starts=True).variances
     distances, size = rows.distances(rows.left), landmarks.size
-    sigmas = tuple(np.full(len(t.values), np.nan) for t in terms)
     return LabelledFit(
-        model.T_mount, model.covariance, 1.0, landmarks, np.zeros((size, size)), tuple(terms), sigmas, variances, rows,
-        distances, (rms_of(distances),),
+        model.T_mount, model.covariance, 1.0, landmarks, np.zeros((size, size)), tuple(terms), sigmas_of(model, chain),
+        variances, rows, distances, (rms_of(distances),),
     )  # fmt: skip
 
 

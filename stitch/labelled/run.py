@@ -23,6 +23,7 @@ from stitch.recorder import Recorder
 from stitch.repeatability import scatter_from
 from stitch.result import FusedCloud, Run, StageResult
 from stitch.session import Session
+from stitch.stages.coarse import REUSED, STATED
 from stitch.threads import Clock
 
 
@@ -39,7 +40,8 @@ def run_labelled(
     stated = model.T_mount if model else session.scanner.T_mount
     T_mount = closed_form(chain.capture) if stated is None else stated
     chain = about_part(chain, T_mount)
-    before = _begin(chain, T_mount, "found in closed form" if stated is None else "given", clock.lap(), recorder)
+    source = REUSED if model else STATED if stated is not None else "found in closed form"
+    before = _begin(chain, T_mount, source, clock.lap(), recorder)
     if model:
         terms: list[Term] = terms_of(model, chain)
         found, chain, outliers = without_gross(chain, lambda c: judged(c, model, terms))

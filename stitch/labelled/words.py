@@ -7,9 +7,9 @@ import numpy as np
 from stitch.labelled.fit import LabelledFit
 from stitch.labelled.gross import Outlier
 from stitch.repeatability import Repeatability
+from stitch.rounding import MICROMETRES
 from stitch.session import Session
 
-_MICROMETRES = {"mm": 1e3, "m": 1e6}
 # Within a quarter of the noise floor's square it is noise; above, something else is there.
 _NEAR_FLOOR = 1.1
 _LISTED = 12
@@ -17,7 +17,7 @@ _LISTED = 12
 
 def sentence(found: LabelledFit, after: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
     """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
-    to_um = _MICROMETRES[length_unit]
+    to_um = MICROMETRES[length_unit]
     left, out, noise = (f"{x * to_um:.4g} µm" for x in (found.rms, found.heldout_rms, floor))
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
@@ -53,7 +53,7 @@ def beside_notes(found: LabelledFit, outliers: Sequence[Outlier], session: Sessi
 
 
 def _left_out(found: LabelledFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
-    to_um = _MICROMETRES[session.length_unit]
+    to_um = MICROMETRES[session.length_unit]
     notes = []
     if outliers:
         told = [f"{named(o, session)} ({o.distance * to_um:.3g} µm, {o.times:.0f} times the usual)" for o in outliers]

@@ -17,7 +17,7 @@ _TEXT = (".xyz", ".csv", ".txt", ".asc")
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
-    """Read one scan; `scale` turns the file's unit into the session's.
+    """Read one scan; `scale` turns the file's unit into the session's. Points at 0 0 0 are left out.
 
     Raises:
         InputError: missing or broken file, no x, y, z, no points, or points that are not finite.
@@ -48,12 +48,19 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise InputError(f"{path}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
+    # Structured exports write 0 0 0 for a pixel that measured nothing; the scanner's own place has no ray.
+    seen = points.any(axis=1)
+    if not seen.any():
+        raise InputError(
+            f"{path}: all {len(points)} points are 0 0 0, nothing was measured; leave this view out of views.csv or "
+            "scan it again"
+        )
     normals = None
     for names in _NORMALS:
         if all(name in columns for name in names):
-            normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)
-    scalars = {name: np.asarray(column, np.float64) for name, column in columns.items() if column.ndim == 1}
-    return Cloud(points * scale, normals, scalars)
+            normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)[seen]
+    scalars = {name: np.asarray(column, np.float64)[seen] for name, column in columns.items() if column.ndim == 1}
+    return Cloud(points[seen] * scale, normals, scalars)
 
 
 def _read_ply(path: Path) -> dict[str, Array]:

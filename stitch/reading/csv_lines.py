@@ -10,12 +10,22 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Names of the columns, and line number and cells of every line that is not empty.
 
     Raises:
-        InputError: the file is not text.
+        InputError: the file is not text, or a quote stays open.
     """
+    rows: list[tuple[int, list[str]]] = []
+    first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream, skipinitialspace=True)
             header = [name.strip() for name in next(reader, [])]
-            return header, [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+            first = reader.line_num + 1
+            for row in reader:
+                if any(cell.strip() for cell in row):
+                    rows.append((reader.line_num, row))
+                first = reader.line_num + 1
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: not UTF-8 text ({error.reason}); save it as CSV") from None
+    except csv.Error as error:
+        # A quote that stays open swallows lines until a cell is larger than the csv module allows.
+        raise InputError(f"{file} line {first}: {error}; close the quote that opens there") from None
+    return header, rows

@@ -11,7 +11,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.csv_lines import read_lines
-from stitch.reading.csv_number import is_number
+from stitch.reading.csv_number import is_number, number
 from stitch.robot import Robot, forward
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -65,8 +65,8 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
             mend = f"is used on line {seen[name]} already" if name else "is empty"
             raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
         seen[name] = line
-        time_s = _number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
-        values = {c: _number(file, line, c, row[c]) for c in covariates if row[c]}
+        time_s = number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+        values = {c: number(file, line, c, row[c]) for c in covariates if row[c]}
         T_base_flange = _flange(file, line, name, row, joints[i], robot)
         approach = _approach(file, line, row, joints, i)
         rows.append(Row(line, name, row.get("cloud", ""), T_base_flange, joints[i], approach, time_s, values))
@@ -108,17 +108,11 @@ def _covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str,
     return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
 
 
-def _number(file: Path, line: int, column: str, cell: str) -> float:
-    if not is_number(cell) or not np.isfinite(float(cell)):
-        raise InputError(f"{file} line {line}: {column} is {cell!r}; write a number")
-    return float(cell)
-
-
 def _joints(file: Path, line: int, row: dict[str, str], header: Sequence[str]) -> Array | None:
     names = [f"j{i}_deg" for i in range(1, sum(bool(_JOINT.match(n)) for n in header) + 1)]
     if not names or not any(row[name] for name in names):
         return None
-    return np.radians([_number(file, line, name, row[name]) for name in names])
+    return np.radians([number(file, line, name, row[name]) for name in names])
 
 
 def _approach(file: Path, line: int, row: dict[str, str], joints: Sequence[Array | None], i: int) -> Array | None:
@@ -130,7 +124,7 @@ def _approach(file: Path, line: int, row: dict[str, str], joints: Sequence[Array
     for k in range(len(q)):
         cell = row.get(f"j{k + 1}_approach", "")
         if cell:
-            out[k] = _number(file, line, f"j{k + 1}_approach", cell)
+            out[k] = number(file, line, f"j{k + 1}_approach", cell)
             if out[k] not in (-1, 0, 1):
                 raise InputError(f"{file} line {line}: j{k + 1}_approach is {cell}; use -1, 0 or 1")
     return out
@@ -145,7 +139,7 @@ def _flange(file: Path, line: int, name: str, row: dict[str, str], joints: Array
                 f"{file} line {line}: view {name} has no pose; fill {','.join(_POSE)} or the joints, or remove the row"
             )
         return from_joints
-    values = np.array([_number(file, line, c, cell) for c, cell in zip(_POSE, given, strict=True)])
+    values = np.array([number(file, line, c, cell) for c, cell in zip(_POSE, given, strict=True)])
     norm = float(np.linalg.norm(values[3:]))
     if abs(norm - 1) > _UNIT_TOLERANCE:
         raise InputError(
@@ -153,17 +147,17 @@ def _flange(file: Path, line: int, name: str, row: dict[str, str], joints: Array
             "write a unit quaternion, w last"
         )
     reported = frames.from_quaternion(values[:3], values[3:] / norm)
-    if from_joints is not None:
-        _agree(file, line, name, reported, from_joints)
+    if robot is not None and from_joints is not None:
+        _agree(file, line, name, reported, from_joints, robot.metres_per_unit)
     return reported
 
 
-def _agree(file: Path, line: int, name: str, reported: Array, from_joints: Array) -> None:
+def _agree(file: Path, line: int, name: str, reported: Array, from_joints: Array, metres: float) -> None:
     angle = float(frames.angle_between(reported, from_joints))
     distance = float(np.linalg.norm(reported[:3, 3] - from_joints[:3, 3]))
     reach = float(np.linalg.norm(from_joints[:3, 3]))
     if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
         raise InputError(
-            f"{file} line {line}: view {name}: joints and reported pose differ by {distance:.4g} and "
+            f"{file} line {line}: view {name}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
             f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
         )

@@ -29,6 +29,8 @@ _SEARCH_SAMPLES = 120
 _SEARCH_ITERATIONS = 7
 # First gate of the search and truncation of the score, as shares of the part's size.
 COARSE_GATE = 0.35
+# Where a hand-eye came from that was not searched.
+STATED, REUSED = "given in session.toml", "of another run, used as it is"
 _SCORE_SHARE = 0.05
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
@@ -61,9 +63,13 @@ class Coarse:
         return self.candidates[1].score / self.candidates[0].score if len(self.candidates) > 1 else np.inf
 
 
-def given(captures: Sequence[Capture], T_mount: Array) -> Coarse:
-    """Take a hand-eye that somebody measured: the gate is wide enough for 5° and 30 mm."""
-    return Coarse(T_mount, COARSE_GATE * part_size(captures), "given in session.toml", ())
+def given(captures: Sequence[Capture], T_mount: Array, source: str) -> Coarse:
+    """Take a hand-eye that is known from elsewhere: the gate is wide enough for 5° and 30 mm.
+
+    Args:
+        source: where from, in words.
+    """
+    return Coarse(T_mount, COARSE_GATE * part_size(captures), source, ())
 
 
 def part_size(captures: Sequence[Capture]) -> float:

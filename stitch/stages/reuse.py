@@ -20,11 +20,14 @@ REUSE_GATE = 0.05
 _TIGHTENINGS = 4
 
 
-def reuse(captures: Sequence[Capture], model: Model, terms: Sequence[Term] = ()) -> Correction:
+def reuse(
+    captures: Sequence[Capture], model: Model, terms: Sequence[Term] = (), sigmas: Sequence[Array] = ()
+) -> Correction:
     """Overlaps and pose scatter of `captures` under the model's hand-eye, as `correct` returns them.
 
     Args:
         captures: without the model's effects, `terms`.
+        sigmas: per term (P,), as the model states them.
 
     Raises:
         NoResultError: no two views overlap under the hand-eye.
@@ -35,7 +38,6 @@ def reuse(captures: Sequence[Capture], model: Model, terms: Sequence[Term] = ())
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(scatter_of(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
     hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
-    sigmas = tuple(np.full(len(t.values), np.nan) for t in terms)
     return Correction(
         hand_eye,
         overlaps,
@@ -43,7 +45,7 @@ def reuse(captures: Sequence[Capture], model: Model, terms: Sequence[Term] = ())
         (pooled_rms(overlaps),),
         tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
         tuple(terms),
-        sigmas,
+        tuple(sigmas),
     )
 
 

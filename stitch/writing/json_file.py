@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from stitch.writing.whole import whole
+
 
 def write_json(document: Any, path: Path) -> None:
     """Write JSON whole or not at all; what is not known is null."""
-    scratch = path.with_name(f".{path.name}.new")
-    scratch.write_text(to_json(document) + "\n", encoding="utf-8")
-    scratch.replace(path)
+    with whole(path) as file:
+        file.write_text(to_json(document) + "\n", encoding="utf-8")
 
 
 def to_json(document: Any) -> str:

@@ -39,7 +39,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "unobservable": list(run.unobservable),
         "stages": [
             {"name": s.name, "rms": s.rms, "correspondences": s.correspondences, "iterations": s.iterations,
-             "seconds": round(s.seconds, 3)}
+             "seconds": round(s.seconds, 3), "note": s.note}
             for s in run.stages
         ],
         "residual_rms": run.residual_rms,

@@ -16,14 +16,23 @@ from stitch.writing.json_file import write_json
 from stitch.writing.result_document import ledger, model_of, result_document
 from stitch.writing.tables import write_cloud, write_residuals
 
+_SCRATCH = ".new"
+# What commands make of a model and no change of it makes anew, or not always.
+_OF_THE_MODEL = (
+    "diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recording.rrd", "robot.toml", "robot.urdf",
+)  # fmt: skip
+
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
 
     Raises:
-        InputError: `path` holds something that is not a run.
+        InputError: `path` holds something that is not a run, or holds the present folder.
     """
+    here = Path.cwd()
+    if path.resolve() in (here, *here.parents):
+        raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
     if path.exists() and not _is_run(path):
         raise InputError(f"{path}: exists and is not a run folder; name another with -o")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,14 +64,24 @@ def _umask() -> int:
     return mask
 
 
-def take_over(scratch: Path, path: Path) -> None:
-    """Move every file of `scratch` into the run folder; a diagnosis of the old model goes."""
-    for stale in ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply"):
-        (path / stale).unlink(missing_ok=True)
-    shutil.rmtree(path / "pictures", ignore_errors=True)
-    for file in sorted(scratch.iterdir()):
-        file.replace(path / file.name)
-    scratch.rmdir()
+@contextmanager
+def changed(path: Path) -> Iterator[Path]:
+    """A scratch folder whose files take their place in a run folder if the block succeeds; it goes if it fails.
+
+    What else was made of the old model goes then too.
+    """
+    scratch = path / _SCRATCH
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch
+        for stale in _OF_THE_MODEL:
+            (path / stale).unlink(missing_ok=True)
+        shutil.rmtree(path / "pictures", ignore_errors=True)
+        for file in sorted(scratch.iterdir()):
+            file.replace(path / file.name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def extend(group: str, *arguments: Any) -> None:

@@ -1,8 +1,7 @@
 """stitched.ply and residuals.parquet."""
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +10,12 @@ from plyfile import PlyData, PlyElement
 
 from stitch.frames import Array
 from stitch.labelled.document import residual_columns
+from stitch.overlap.match import Match
 from stitch.result import FusedCloud, Run
+from stitch.session import Session
+
+_PLACE = ("x", "y", "z", "nx", "ny", "nz")
+_OWN = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
@@ -26,33 +30,37 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
 
 
 def write_residuals(run: Run, path: Path) -> None:
-    """One row per residual of the model, before the register stage moves single views."""
-    names = np.array([view.name for view in run.session.views])
-    covariates = sorted({key for view in run.session.views for key in view.covariates})
-    table: dict[str, list[Any]] = {}
+    """One row per residual of the model, before the register stage moves single views.
 
-    def add(key: str, values: Array | Sequence[str]) -> None:
-        table.setdefault(key, []).append(values)
-
-    for m in () if run.overlaps is None else run.overlaps.matches:
-        size = len(m.residual)
-        add("view", np.repeat(names[m.v], size))
-        add("partner", np.repeat(names[m.w], size))
-        for axis, column in zip("xyz", m.middle.T, strict=True):
-            add(axis, column)
-        for axis, column in zip("xyz", m.normal.T, strict=True):
-            add(f"n{axis}", column)
-        add("residual", m.residual)
-        for key in covariates:
-            add(key, np.full(size, run.session.views[m.v].covariates.get(key, np.nan)))
-        if run.session.views[m.v].time_s is not None:
-            add("time_s", np.full(size, run.session.views[m.v].time_s))
+    `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
+    """
+    session = _renamed(run.session)
+    parts = [] if run.overlaps is None else [_columns(session, m) for m in run.overlaps.matches]
     if run.labelled is not None:
-        for key, values in residual_columns(run.labelled, run.session).items():
-            if run.overlaps is None or key in table:
-                add(key, values)
-    columns = {key: np.concatenate(parts) for key, parts in table.items()}
+        parts.append(residual_columns(run.labelled, session))
+    # Beside clouds, labelled points have the columns of these.
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if all(key in p for p in parts)}
     arrays = {
         key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()
     }
     pq.write_table(pa.table(arrays), path, compression="zstd")
+
+
+def _renamed(session: Session) -> Session:
+    """The session without covariates that would take the place of a column."""
+    views = [
+        replace(view, covariates={f"covariate_{k}" if k in _OWN else k: x for k, x in view.covariates.items()})
+        for view in session.views
+    ]
+    return replace(session, views=tuple(views))
+
+
+def _columns(session: Session, m: Match) -> dict[str, Array]:
+    """Columns of one pair of views, a row per correspondence."""
+    size = len(m.residual)
+    covariates = sorted({key for view in session.views for key in view.covariates})
+    own, time = session.views[m.v].covariates, session.views[m.v].time_s
+    out = {name: np.repeat(session.views[v].name, size) for name, v in (("view", m.v), ("partner", m.w))}
+    out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
+    out |= {"residual": m.residual, "time_s": np.full(size, np.nan if time is None else time)}
+    return out | {key: np.full(size, own.get(key, np.nan)) for key in covariates}

@@ -1,0 +1,136 @@
+"""session.toml: every key checked, tables turned to what they describe."""
+
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch import frames
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.reading.robot_table import numbers
+from stitch.reading.toml_file import choice, read_toml, text
+from stitch.reading.urdf import robot_from_urdf
+from stitch.robot import METRES, Robot, robot_from_dh
+from stitch.session import Scanner
+
+FORMAT = "stitch-session/1"
+
+_KEYS = {
+    "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis"},
+    "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity"},
+    "sphere": {"radius"},
+    "part": {"cad", "cad_unit"},
+}
+# Effects of the scanner count its field as x/z and y/z: they know no scanner that looks along x or y.
+_AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
+
+
+def document(file: Path) -> dict[str, Any]:
+    """The document with known tables and keys only.
+
+    Raises:
+        InputError: missing, not TOML, of another format, or with a key that nobody knows.
+    """
+    document = read_toml(file, "a session is a folder with session.toml and views.csv")
+    if document.get("format") != FORMAT:
+        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
+    for table, known in _KEYS.items():
+        entries = document if not table else document.get(table, {})
+        if not isinstance(entries, dict):
+            raise InputError(f"{file}: [{table}] must be a table")
+        for key in entries:
+            if key not in known:
+                close = get_close_matches(key, known, 1)
+                raise InputError(
+                    f"{file}: unknown key {f'{table}.{key}' if table else key!r}"
+                    + (f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}")
+                )
+    return document
+
+
+def positive(file: Path, table: dict[str, Any], name: str, key: str) -> float | None:
+    """A positive number, or None where it is absent.
+
+    Raises:
+        InputError: anything else.
+    """
+    value = table.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
+        raise InputError(f"{file}: {name}.{key} is {value!r}; use a positive number")
+    return float(value)
+
+
+def scanner(file: Path, table: dict[str, Any]) -> Scanner:
+    """[scanner]; lengths in length_unit.
+
+    Raises:
+        InputError: a value that cannot be, with the mend.
+    """
+    axis = table.get("optical_axis", "+z")
+    if axis not in tuple(_AXES):
+        raise InputError(
+            f"{file}: scanner.optical_axis is {axis!r}; turn the clouds until their scanner looks along z, and write "
+            'the side: "+z" or "-z"'
+        )
+    T_mount = None
+    if "pose" in table:
+        T_mount = _pose(file, table["pose"])
+    noise, standoff = (positive(file, table, "scanner", key) for key in ("noise", "standoff"))
+    return Scanner(T_mount, noise, standoff, _AXES[axis])
+
+
+def _pose(file: Path, value: Any) -> Array:
+    try:
+        T = np.array(value, float)
+    except (TypeError, ValueError):
+        T = np.empty(0)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{file}: scanner.pose must be four rows of four numbers")
+    off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
+    if off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputError(
+            f"{file}: scanner.pose is not a rigid motion (R·Rᵀ differs from 1 by {off:.2g}, "
+            f"det {np.linalg.det(T[:3, :3]):+.3f}); write a rotation, and 0 0 0 1 in the last row"
+        )
+    return frames.make(frames.nearest_rotation(T[:3, :3]), T[:3, 3])
+
+
+def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
+    """[robot] by its DH rows or URDF; None without one.
+
+    Raises:
+        InputError: a value that cannot be, with the mend.
+    """
+    if not table:
+        return None
+    gravity = numbers(f"{file}: robot", {"gravity": [0.0, 0.0, -9.81]} | table, "gravity", (3,))
+    name, payload = str(table.get("name", "robot")), table.get("payload")
+    urdf, base, flange = (text(file, table, "robot", key) for key in ("urdf", "base_link", "flange_link"))
+    if urdf is not None:
+        return robot_from_urdf(file.parent / urdf, base, flange, unit, gravity, payload)
+    if "joints" not in table:
+        raise InputError(f"{file}: [robot] needs joints (DH rows) or urdf")
+    try:
+        return robot_from_dh(name, str(table.get("dh", "standard")), table["joints"], payload, gravity, unit)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
+
+
+def cad(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
+    """Path and unit of the CAD file of [part]; None where they are absent.
+
+    Raises:
+        InputError: no such file, or another unit.
+    """
+    name = text(file, table, "part", "cad")
+    path = None if name is None else file.parent / name
+    if path is not None and not path.is_file():
+        raise InputError(f"{file}: part.cad names {path}, which does not exist")
+    return path, choice(file, table, "cad_unit", tuple(METRES)) if "cad_unit" in table else None
