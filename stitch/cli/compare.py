@@ -10,9 +10,9 @@ from rich.table import Table as Printed
 
 from stitch.diagnosis.compare import compare
 from stitch.diagnosis.compare_targets import compare_targets
-from stitch.diagnosis.comparison import Table, comparison_document
+from stitch.diagnosis.comparison import Comparison, Table, comparison_document
 from stitch.rounding import MICROMETRES
-from stitch.state import load_state
+from stitch.state import State, load_state
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend
 
@@ -26,9 +26,7 @@ def compare_run(
 ) -> None:
     """Show the residual by view, pair, target, joint, range, incidence, field, time, covariate and place."""
     state = load_state(run, thin=True)
-    found = compare(state) if state.chain.capture.scans else compare_targets(state)
-    write_json(comparison_document(found), run / "compare.json")
-    extend("stitch.comparison_reports", found, state, run)
+    found = write_comparison(state, run)
     if as_json:
         print(to_json(comparison_document(found)))
         return
@@ -45,6 +43,14 @@ def compare_run(
     for file in ("compare.json", "pictures/compare.png"):
         if (run / file).exists():
             console.print(f"  {run / file}", highlight=False)
+
+
+def write_comparison(state: State, run: Path) -> Comparison:
+    """compare.json and what other packages make of it."""
+    found = compare(state) if state.chain.capture.scans else compare_targets(state)
+    write_json(comparison_document(found), run / "compare.json")
+    extend("stitch.comparison_reports", found, state, run)
+    return found
 
 
 def _worst(console: Console, table: Table, to_um: float) -> None:

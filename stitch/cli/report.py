@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from stitch.cli.compare import write_comparison
 from stitch.cli.diagnose import write_diagnosis
 from stitch.diagnosis.diagnose import diagnose
 from stitch.state import load_state
@@ -15,11 +16,15 @@ from stitch.writing import run_folder
 
 def report(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
-    with_diagnosis: Annotated[bool, typer.Option("--diagnosis/--no-diagnosis", help="Diagnose too.")] = True,
+    with_diagnosis: Annotated[
+        bool, typer.Option("--diagnosis/--no-diagnosis", help="Compare and diagnose too.")
+    ] = True,
 ) -> None:
-    """Write report.html of a run anew, with its diagnosis; nothing is fitted, the model stays as it is."""
+    """Write report.html of a run anew, with comparison and diagnosis; nothing is fitted, the model stays as it is."""
     state = load_state(run)
     run_folder.extend("stitch.reports", stored_run(run, state), run / "report.html")
     if with_diagnosis:
-        write_diagnosis(diagnose(state), state, run)
+        thin = load_state(run, thin=True)
+        write_comparison(thin, run)
+        write_diagnosis(diagnose(thin), thin, run)
     Console(stderr=True).print(f"  {run / 'report.html'}", highlight=False)
