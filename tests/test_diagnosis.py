@@ -21,7 +21,7 @@ from stitch.diagnosis.compare import compare
 from stitch.diagnosis.document import diagnosis_document
 from stitch.diagnosis.heldout import null_left
 from stitch.diagnosis.start import evidence_of_state
-from stitch.effects.supported import supported
+from stitch.effects.supported import left_at_zero, supported
 from stitch.effects.visible import independent
 from stitch.errors import InputError
 from stitch.folds import grouped_folds, joint_ends
@@ -183,6 +183,22 @@ def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
         [[0], [1], [2]], [0, 0, 1],
     )  # fmt: skip
     assert chosen[2] and chosen[:2].sum() == 1
+
+
+def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
+    """Amplitudes that are there in half the cases, drawn from their prior: mean squares told and true agree."""
+    rng, told, true = np.random.default_rng(3), [], []
+    for _ in range(4000):
+        own, further, size = rng.standard_normal((12, 2)), 0.4 * rng.standard_normal((12, 1)), rng.uniform(0.2, 3)
+        amplitude = size * rng.standard_normal() * rng.integers(0, 2)
+        z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
+        told.append(left_at_zero(own, further, z, np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
+        true.append(amplitude**2 / size**2)
+    apart = np.array(told) - true
+    assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
+    # Beside a column that is fitted and says the same nothing is known of it but its size.
+    same = left_at_zero(own, np.tile(further, 2), z, np.full(2, 0.3), np.array([True, False]))
+    np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)
 
 
 def test_ends_of_joints_are_fifths_of_what_was_driven():

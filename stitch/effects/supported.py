@@ -1,4 +1,4 @@
-"""Which parameters of the effects in use the views support.
+"""Which parameters of the effects in use the views support, and how large the others may be.
 
 An effect with a number for every joint would lend each of them to the noise, and what the views hardly know
 they borrow from the hand-eye. A group of parameters is fitted where the evidence for it, the likelihood
@@ -8,6 +8,7 @@ integrated over amplitudes of plausible size, exceeds that of leaving it at zero
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.special import expit
 
 from stitch.effects.visible import project_out
 from stitch.frames import Array
@@ -45,6 +46,25 @@ def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequen
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
     return out
+
+
+def left_at_zero(own: Array, further: Array, z: Array, sizes: Array, fitted: Array) -> Array:
+    """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
+
+    Each may be there or not, even odds before the views were asked: with probability π it has the mean μ and the
+    sigma σ that they give it, so that its mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999).
+
+    Args:
+        own, further, z, sizes: as in `supported`.
+        fitted: (P,) bool.
+    """
+    base = np.hstack([own, further[:, fitted]])
+    G, y = project_out(base, further * sizes), project_out(base, z[:, None])[:, 0]
+    told, pull = np.einsum("np,np->p", G, G), G.T @ y
+    mean, variance = pull / (1 + told), 1 / (1 + told)
+    gain = 0.5 * pull * mean - 0.5 * np.log1p(told)
+    rms = sizes * np.sqrt(expit(gain) * (mean**2 + variance))
+    return np.where(fitted, 0.0, rms)
 
 
 def _forward_and_back(gain: Callable[[Sequence[int]], float], count: int) -> list[int]:

@@ -10,7 +10,7 @@ from stitch.effects.chain import Chain, Term
 from stitch.effects.columns import all_columns
 from stitch.effects.groups import one_by_one
 from stitch.effects.scanner_field import field_scatters
-from stitch.effects.supported import supported
+from stitch.effects.supported import left_at_zero, supported
 from stitch.effects.undo import corrected
 from stitch.effects.visible import independent, whitened
 from stitch.frames import Array
@@ -76,12 +76,14 @@ def refine(chains: Sequence[Chain], terms: Sequence[Term], T_mount: Array, gate:
             repeating = field_scatters(chains, freed)
             whiten = partial(whitened, captures, freed, T_mount, columns, values)
             seen = fitted_parameters(chains[0], terms, seen, sizes, whiten)
+            unfitted = np.where(held, 0.0, left_at_zero(*whiten(seen), sizes, seen))
         fitted = fit_hand_eye(
             captures,
             freed,
             T_mount,
             Columns(tuple(c[:, seen] for c in columns), values[seen], WEAK * sizes[seen]),
-            repeating,
+            # A parameter at zero that is not zero errs alike in every view, as the scanner does.
+            [np.hstack([r, c * unfitted]) for r, c in zip(repeating, columns, strict=True)],
         )
         T_mount, before = fitted.T_mount, values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
