@@ -45,8 +45,7 @@ def stitch_one(session: Path, folder: Path) -> dict[str, Any]:
         loaded = load_session(session)
         with run_folder.new_folder(folder) as scratch:
             result = run(loaded)
-            run_folder.write_run(result, scratch)
-            run_folder.extend("stitch.reports", result, scratch / "report.html")
+            run_folder.write_with_page(result, scratch)
     except Exception as error:  # whatever befalls one session, the others go on
         kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
         return {"session": str(session), "run": None, "error": f"{kind}{' '.join(str(error).split())}"}

@@ -98,8 +98,7 @@ def robot(
     result = found or first
     target = output or Path("runs") / f"{loaded.name}-robot"
     with run_folder.new_folder(target) as scratch:
-        run_folder.write_run(result, scratch)
-        run_folder.extend("stitch.reports", result, scratch / "report.html")
+        run_folder.write_with_page(result, scratch)
         write_robot(result, calibrated(result), scratch)
         write_diagnosis(diagnosis, state_of(result), scratch)
     document = robot_document(result, lines, diagnosis.sentence)

@@ -64,7 +64,7 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
             if recording:
                 again = change(state_of(result), list(result.effects), recorder_for(scratch, recording))
                 result = replace(again, ledger=result.ledger, poses_before=result.poses_before)
-            _write(result, scratch)
+            run_folder.write_with_page(result, scratch)
         _show(result, as_json)
     elif as_json:
         print((run / "result.json").read_text(encoding="utf-8").rstrip())
@@ -90,13 +90,8 @@ def _change(run: Path, state: State, effects: list[str], recording: bool, as_jso
     """Give the run folder the model with these effects, and show it."""
     with run_folder.changed(run) as scratch:
         result = change(state, effects, recorder_for(scratch, recording))
-        _write(result, scratch)
+        run_folder.write_with_page(result, scratch)
     _show(result, as_json)
-
-
-def _write(result: Run, folder: Path) -> None:
-    run_folder.write_run(result, folder)
-    run_folder.extend("stitch.reports", result, folder / "report.html")
 
 
 def _show(result: Run, as_json: bool) -> None:

@@ -43,7 +43,7 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")] = False,
 ) -> None:  # fmt: skip
     """Find and correct the hand-eye, register the views, fuse them."""
-    names_of_effects = list(dict.fromkeys(name.strip() for name in effects.split(",") if name.strip()))
+    names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
     if effects_file:
         load_effects(effects_file)
     for name in names_of_effects:
@@ -89,11 +89,9 @@ def recorder_for(folder: Path, recording: bool) -> Recorder:
 
 
 def _write(result: Run, folder: Path, mesh: bool) -> None:
-    run_folder.write_run(result, folder)
+    run_folder.write_with_page(result, folder)
     if mesh:
         write_mesh(result.fused, folder / "mesh.ply")
-    for entry in entry_points(group="stitch.reports"):
-        entry.load()(result, folder / "report.html")
 
 
 def show(runs: list[Run], target: Path) -> None:

@@ -9,7 +9,7 @@ from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.detectable import smallest_detectable
 from stitch.diagnosis.heldout import Left, left_by
-from stitch.diagnosis.missed import hand_eye_if_missed
+from stitch.diagnosis.missed import hand_eye_if_missed, hand_eye_push
 from stitch.diagnosis.next_view import propose
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.select import Selection, implausible, select
@@ -39,11 +39,12 @@ def diagnose(state: State) -> Diagnosis:
         scores = [r.score for r in selection.ranked]
         matrix = alias_matrix(evidence, scores)
         tests, suspects = sum(c.effect.tier != "empirical" for c in candidates), []
+        push = hand_eye_push(evidence)
         for k, ranked in enumerate(selection.ranked):
             clear = ranked.score.observable and k < _PREDICTED and np.isfinite(ranked.score.sigmas).all()
             left = left_by(evidence, ranked.score, points) if clear else None
             detectable = smallest_detectable(evidence, ranked.score.candidate, tests)
-            missed = hand_eye_if_missed(evidence, ranked.score.candidate, detectable)
+            missed = hand_eye_if_missed(evidence, push, ranked.score.candidate, detectable)
             suspects.append(Suspect(ranked, tuple(aliases_of(k, matrix, scores)), left, detectable, missed))
         selection, notes = checked(selection, suspects, implausible(evidence, state.session.length_unit))
         depends = dependences(evidence, selection.empirical)

@@ -18,7 +18,7 @@ from stitch.overlap.capture import Capture
 from stitch.overlap.capture_evidence import jacobian
 from stitch.overlap.free_poses import FreePoses
 from stitch.repeatability import PoseChannel, evidence_of, pose_channel
-from stitch.solve import column_space
+from stitch.solve import column_space, fit_columns
 from stitch.variance import Evidence, VarianceFit, fit_variances
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
@@ -136,11 +136,8 @@ class PoseEvidence:
 
         Directions that the overlaps cannot see are at zero, the common motion of all views is taken out.
         """
-        columns = self.channel.left @ self.model
-        white = np.linalg.solve(self.half, np.column_stack([columns, self.channel.z]))
-        scale = np.maximum(np.linalg.norm(white[:, :-1], axis=0), 1e-300)
-        x = np.linalg.lstsq(white[:, :-1] / scale, white[:, -1], rcond=1e-10)[0] / scale
-        return self.at_part(self.channel.z - columns @ x)
+        explained = self.model @ fit_columns(self.white_model, self.raw_white_z)
+        return self.at_part(self.channel.z - self.channel.left @ explained)
 
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.effects.columns import PointGram
 from stitch.frames import Array, Indices
-from stitch.solve import column_space, pair_squares
+from stitch.solve import column_space, fit_columns, pair_squares
 
 if TYPE_CHECKING:
     from stitch.diagnosis.pose_evidence import PoseEvidence
@@ -34,8 +34,7 @@ class PoseTrial:
             # A view is left out by letting it move freely: six more columns each.
             free = e.white_left[:, _columns_of(left_out)]
             white = np.hstack([white, np.vstack([free, np.zeros((len(z) - len(free), free.shape[1]))])])
-        scale = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
-        return np.asarray((np.linalg.lstsq(white / scale, z, rcond=1e-10)[0] / scale)[: self.X.shape[1]])
+        return fit_columns(white, z)[: self.X.shape[1]]
 
     def squares(self, coefficients: Array) -> Array:
         """Σ w e² per pair after the model moved; point effects change e itself and do not move the views."""

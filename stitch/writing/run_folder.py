@@ -97,3 +97,9 @@ def write_run(run: Run, folder: Path) -> None:
     write_json(ledger(run), folder / "ledger.json")
     write_cloud(run.fused, folder / "stitched.ply")
     write_residuals(run, folder / "residuals.parquet")
+
+
+def write_with_page(run: Run, folder: Path) -> None:
+    """The same and report.html."""
+    write_run(run, folder)
+    extend("stitch.reports", run, folder / "report.html")

@@ -1,5 +1,6 @@
 """stitched.ply and residuals.parquet."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def write_residuals(run: Run, path: Path) -> None:
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
     """
     session = _renamed(run.session)
-    parts = [] if run.overlaps is None else [_columns(session, m) for m in run.overlaps.matches]
+    covariates = sorted({key for view in session.views for key in view.covariates})
+    parts = [] if run.overlaps is None else [_columns(session, m, covariates) for m in run.overlaps.matches]
     if run.labelled is not None:
         parts.append(residual_columns(run.labelled, session))
     # Beside clouds, labelled points have the columns of these.
@@ -55,10 +57,9 @@ def _renamed(session: Session) -> Session:
     return replace(session, views=tuple(views))
 
 
-def _columns(session: Session, m: Match) -> dict[str, Array]:
+def _columns(session: Session, m: Match, covariates: Sequence[str]) -> dict[str, Array]:
     """Columns of one pair of views, a row per correspondence."""
     size = len(m.residual)
-    covariates = sorted({key for view in session.views for key in view.covariates})
     own, time = session.views[m.v].covariates, session.views[m.v].time_s
     out = {name: np.repeat(session.views[v].name, size) for name, v in (("view", m.v), ("partner", m.w))}
     out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
