@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 
 from stitch.effects.chain import Chain
 from stitch.effects.columns import PointGram, seen_twists, streamed
@@ -63,25 +63,31 @@ def field_scatters(chains: Sequence[Chain], freed: Sequence[FreePoses]) -> list[
     return [field_scatter(chain, f, None) for chain, f in zip(chains, freed, strict=True)]
 
 
-def _shown(sums: PointGram, twists: Array, freed: FreePoses, noise: float) -> float:
-    """Share by the likelihood of what smooth errors leave within the overlaps, beside free poses, and a prior.
+def _shown(sums: PointGram, twists: Array, freed: FreePoses, noise: float) -> Array:
+    """(K,) shares by the likelihood of what errors leave within the overlaps, beside free poses, and a prior.
 
-    Within overlaps errors f of variance s² change the normal equations by M f: Mf + noise is N(0, s²M² + cσ²M).
+    Errors f of variances S change the normal equations there by M f: Mf + noise is N(0, M S M + cσ²M). The field
+    and the incidence are two causes, and need not be equally large.
     """
     g = freed.overlaps.gram
     own = twists.reshape(g.views, 6, -1)
     # What the poses do not follow: Σ g² less what moving the views takes away.
     followed = np.einsum("pik,pil->kl", sums.vector, own[g.pairs[:, 0]] - own[g.pairs[:, 1]])
-    M = sums.square.sum(axis=0) - (followed + followed.T) / 2
-    values, vectors = np.linalg.eigh(M)
+    values, vectors = np.linalg.eigh(sums.square.sum(axis=0) - (followed + followed.T) / 2)
     keep = values > _TOLD * values[-1]
-    squares, values = (vectors.T @ sums.residual.sum(axis=0))[keep] ** 2, values[keep]
+    values, told = values[keep], noise * values[keep, None] * vectors[:, keep].T
+    seen = vectors[:, keep].T @ sums.residual.sum(axis=0)
+    cause = np.arange(len(vectors)) == len(vectors) - 1  # incidence is the last
 
-    def deviance(log_share: float) -> float:
-        spread = _CORRELATION * g.variance * values + (np.exp(log_share) * noise * values) ** 2
-        return float(np.sum(np.log(spread) + squares / spread) + ((log_share - np.log(_USUAL_SHARE)) / _SPREAD) ** 2)
+    def deviance(log_shares: Array) -> float:
+        squares = np.exp(2 * log_shares)[cause.astype(np.int64)]
+        spread = (told * squares) @ told.T + np.diag(_CORRELATION * g.variance * values)
+        prior = (log_shares - np.log(_USUAL_SHARE)) / _SPREAD
+        return float(np.linalg.slogdet(spread)[1] + seen @ np.linalg.solve(spread, seen) + prior @ prior)
 
-    return float(np.exp(minimize_scalar(deviance, bounds=np.log(_SHARES), method="bounded").x))
+    bounds = [tuple(np.log(_SHARES))] * 2
+    found = minimize(deviance, np.full(2, np.log(_USUAL_SHARE)), method="L-BFGS-B", bounds=bounds)
+    return np.asarray(np.exp(found.x)[cause.astype(np.int64)])
 
 
 def _half_field(chain: Chain) -> Array:
