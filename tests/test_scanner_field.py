@@ -9,6 +9,9 @@ from scipy.stats import chi2
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames, pipeline
+from stitch.diagnosis.start import evidence_of_state
+from stitch.effects.scanner_field import field_scatter
+from stitch.state import state_of
 
 SEEDS = 2
 
@@ -33,3 +36,14 @@ def test_sigmas_hold_whatever_the_scanner_repeats():
     for squares, _ in (large, small):
         assert sum(squares) < chi2.ppf(0.999, 6 * SEEDS)
     assert np.mean(large[1]) > 1.5 * np.mean(small[1])
+
+
+def test_what_incidence_shows_is_not_laid_on_the_field():
+    """A carried scanner on a coarse surface: grazing points pretend a bias, while its field has no error at all."""
+    scene = load_scene("blade-table")
+    scanner = replace(scene.scanner, columns=90, rows=90, field_error=0.0)
+    measured = simulate(replace(scene, scanner=scanner), {}, 3, views=12)
+    evidence = evidence_of_state(state_of(pipeline.run(session_of(measured))))
+    shown, unit = (field_scatter(evidence.chain, evidence.freed, share) for share in (None, 1.0))
+    shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
+    assert np.max(shares[:-1]) < 0.2
