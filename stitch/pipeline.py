@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from stitch.diagnosis.start import start_values
-from stitch.effects.chain import Chain, Term, about_part, chain_of
+from stitch.diagnosis.start import evidence_at, evidence_of_state, start_values
+from stitch.effects.chain import Chain, about_part, chain_of
 from stitch.effects.scanner_field import field_scatters
-from stitch.effects.terms import empty_term, known, sigmas_of, terms_of
+from stitch.effects.terms import known, sigmas_of, terms_of
 from stitch.effects.undo import corrected
 from stitch.frames import Array
 from stitch.labelled.beside import Beside, fitted_beside, weighed
@@ -94,7 +94,8 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         require_effects([chain], effects)
         kept = [t for t in state.terms if t.effect.name in effects]
         used = [t.effect.name for t in kept]
-        terms = [*kept, *start_values(state, [known(name) for name in effects if name not in used])]
+        new = [known(name) for name in effects if name not in used]
+        terms = [*kept, *start_values(chain, new, partial(evidence_of_state, state))]
         if not state.session.has_clouds:
             found = change_labelled(state.session, chain, terms, state.T_mount, state.T_mount_coarse, recorder)
             found = replace(found, poses_before=corrected(chain, state.terms, state.T_mount).poses(state.T_mount))
@@ -134,17 +135,19 @@ def _correct(
     """The hand-eye from the scans; with effects, both; with a model, neither is changed."""
     captures: list[Capture] = [chain.capture for chain in chains]
     if model:
-        terms: list[Term] = terms_of(model, chains[0])
+        terms = terms_of(model, chains[0])
         captures = [corrected(chain, terms, model.T_mount) for chain in chains]
         return reuse(captures, model, terms, sigmas_of(model, chains[0]))
     repeating = partial(field_scatters, chains)
     first = correct(captures, start.T_mount, start.gate, recorder, repeating)
     if not effects:
         return first
-    terms = [empty_term(chains[0], known(name)) for name in effects]
+    T_mount, gates = first.hand_eye.T_mount, [overlaps.gate for overlaps in first.overlaps]
     chains = [weighed(chain, own.noise_factor) for chain, own in zip(chains, first.captures, strict=True)]
-    gates = [overlaps.gate for overlaps in first.overlaps]
-    return refine(chains, terms, first.hand_eye.T_mount, gates).as_correction()
+    # An event or a time constant is one for the whole rig: the first session says where it begins.
+    evidence = partial(evidence_at, chains[0], (), T_mount, gates[0])
+    terms = start_values(chains[0], [known(name) for name in effects], evidence)
+    return refine(chains, terms, T_mount, gates).as_correction()
 
 
 def _begin(chain: Chain, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:

@@ -1,6 +1,6 @@
 """Values to begin a fit with: those that the views suggest at first sight."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -9,36 +9,53 @@ from stitch.diagnosis.evidence import ViewEvidence
 from stitch.diagnosis.pose_evidence import pose_evidence
 from stitch.diagnosis.score import score
 from stitch.diagnosis.target_evidence import target_evidence
-from stitch.effects.chain import Term
+from stitch.effects.chain import Chain, Term
 from stitch.effects.contract import Effect
 from stitch.effects.terms import empty_term
 from stitch.effects.undo import corrected
+from stitch.frames import Array
 from stitch.labelled.landmarks import drawing_of
 from stitch.overlap.free_poses import free_poses
+from stitch.reading.points_csv import Nominal
 from stitch.state import State
 
 
 def evidence_of_state(state: State) -> ViewEvidence:
-    """Free the views under the model and reduce them to evidence; labelled points are evidence as they are."""
-    sightings = state.chain.capture.sightings
-    if not state.chain.capture.scans and sightings is not None:
-        return target_evidence(state.chain, state.terms, state.T_mount, drawing_of(state.session.nominal, sightings))
-    own = corrected(state.chain, state.terms, state.T_mount)
-    freed = free_poses(own, own.poses(state.T_mount), state.gate)
-    return pose_evidence(state.chain, state.terms, own, state.T_mount, freed)
+    """The evidence about what the model of a run lacks."""
+    return evidence_at(state.chain, state.terms, state.T_mount, state.gate, state.session.nominal)
 
 
-def start_values(state: State, effects: Sequence[Effect]) -> list[Term]:
-    """A term for each effect; events and time constants at the value that explains most."""
-    gridded = [e for e in effects if any(p.grid for p in state.chain.parameters(e))]
+def evidence_at(
+    chain: Chain, terms: Sequence[Term], T_mount: Array, gate: float, nominal: Nominal | None = None
+) -> ViewEvidence:
+    """Free the views under the model and reduce them to evidence; labelled points are evidence as they are.
+
+    Args:
+        gate: largest distance between partners, length_unit.
+        nominal: positions of the targets in the part frame.
+    """
+    sightings = chain.capture.sightings
+    if not chain.capture.scans and sightings is not None:
+        return target_evidence(chain, terms, T_mount, drawing_of(nominal, sightings))
+    own = corrected(chain, terms, T_mount)
+    return pose_evidence(chain, terms, own, T_mount, free_poses(own, own.poses(T_mount), gate))
+
+
+def start_values(chain: Chain, effects: Sequence[Effect], evidence_now: Callable[[], ViewEvidence]) -> list[Term]:
+    """A term for each effect; events and time constants at the value that explains most.
+
+    Args:
+        evidence_now: the evidence before these effects, asked only where one has an event or a time constant.
+    """
+    gridded = [e for e in effects if any(p.grid for p in chain.parameters(e))]
     if not gridded:
-        return [empty_term(state.chain, effect) for effect in effects]
-    evidence = evidence_of_state(state)
+        return [empty_term(chain, effect) for effect in effects]
+    evidence = evidence_now()
     out = []
     for effect in effects:
         candidate = candidate_of(evidence, effect) if effect in gridded else None
         if candidate is None:
-            out.append(empty_term(state.chain, effect))
+            out.append(empty_term(chain, effect))
             continue
         best = score(evidence, candidate)
         values = best.values if np.isfinite(best.sigmas).all() else np.zeros(len(best.values))

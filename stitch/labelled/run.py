@@ -1,12 +1,14 @@
 """The run of a session with labelled points: coarse → correct → register; there is no cloud to fuse."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from stitch import frames
+from stitch.diagnosis.start import evidence_at, start_values
 from stitch.effects.chain import Chain, Term, about_part
-from stitch.effects.terms import empty_term, known, terms_of
+from stitch.effects.terms import known, terms_of
 from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.gross import Outlier
@@ -48,7 +50,8 @@ def run_labelled(
     else:
         found, chain, outliers = robust_fit(chain, (), T_mount, _drawing(session, chain))
         if effects:
-            terms = [empty_term(chain, known(name)) for name in effects]
+            evidence = partial(evidence_at, chain, (), found.T_mount, float("nan"), session.nominal)
+            terms = start_values(chain, [known(name) for name in effects], evidence)
             found, chain, outliers = robust_fit(chain, terms, found.T_mount, _drawing(session, chain))
     return finish_labelled(session, chain, T_mount, found, outliers, before, recorder, clock.lap())
 
