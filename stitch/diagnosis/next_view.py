@@ -2,10 +2,11 @@
 
 Two effects a and b are told apart by what of a's pattern b cannot imitate: λ = |y_a − best of b|² in units
 of the scatter. A further view adds six rows to both patterns; among poses that the arm can take and in which
-the scanner would see the part as it has before, the one that adds most is proposed.
+the scanner would see the part as it has before, the one that adds most to the two that stay most alike is proposed.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -55,42 +56,63 @@ class Proposal:
 
 def propose(evidence: ViewEvidence, selection: Selection) -> list[Proposal]:
     """What would tell the named group apart; without a group, the clearest suspect from what resembles it."""
-    pair = _pair(evidence, selection)
-    if pair is None:
-        return []
-    out = []
-    pose = _best_pose(evidence, *pair) if _can_move(evidence.chain) else None
-    names = (pair[0].name, pair[1].name)
-    if pose is not None:
-        joints, count = pose
-        told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
-        times = "a view" if count == 1 else f"{count} views"
-        out.append(Proposal(f"take {times} near {told}", names, [round(float(x), 2) for x in joints], count))
-    out += [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
-    return out
+    group = _group(evidence, selection)
+    names = tuple(score.name for score in group)
+    artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
+    found = _best_pose(evidence, group) if _can_move(evidence.chain) else None
+    if found is None:
+        return artefacts
+    joints, count, separated = found
+    told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
+    times = "a view" if count == 1 else f"{count} views"
+    pose = Proposal(f"take {times} near {told}", separated, [round(float(x), 2) for x in joints], count)
+    return [pose, *artefacts]
 
 
-def _pair(evidence: ViewEvidence, selection: Selection) -> tuple[Score, Score] | None:
-    """The two to separate: the first of the group, or the best suspect and its nearest alias."""
+def _group(evidence: ViewEvidence, selection: Selection) -> list[Score]:
+    """What to separate: the group that was named, or the best suspect and its nearest alias; else nothing."""
     if len(selection.named) > 1:
-        return selection.named[0].score, selection.named[1].score
+        return [r.score for r in selection.named]
     seen = [r for r in selection.ranked if r.score.observable and np.isfinite(r.score.sigmas).all()][:6]
     if selection.verdict == "adequate" or len(seen) < 2:
-        return None
+        return []
     first: Ranked = selection.named[0] if selection.named else seen[0]
     others = [r.score for r in seen if r.name != first.name]
     row = alias_matrix(evidence, [first.score, *others])[0, 1:]
-    return (first.score, others[int(row.argmax())]) if row.max() > SIMILAR else None
+    return [first.score, others[int(row.argmax())]] if row.max() > SIMILAR else []
 
 
 def _can_move(chain: Chain) -> bool:
     return chain.robot is not None and chain.views.joints.shape[1] > 0
 
 
-def _best_pose(evidence: ViewEvidence, a: Score, b: Score) -> tuple[Array, int] | None:
-    """Joint angles (n,) in degrees and the number of such views; None if poses cannot separate them."""
+def _best_pose(evidence: ViewEvidence, group: list[Score]) -> tuple[Array, int, tuple[str, ...]] | None:
+    """Joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and whom
+    they separate; None if poses cannot separate anything.
+    """
+    pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(evidence, a, b))]
+    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * _ENOUGH]
+    if not pairs:
+        return None
+    k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())
+    counts = [np.ceil(max(_ENOUGH - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
+    separated = dict.fromkeys(score.name for score in group if any(score.name in names for _, names in pairs))
+    return np.degrees(pairs[0][0].joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
+
+
+@dataclass(frozen=True)
+class _Gains:
+    """How much apart two suspects are, and how much each of K views would add to it."""
+
+    known: float
+    joints: Array  # (K, n) rad, the same for every two suspects
+    of_views: Array  # (K,)
+
+
+def _gains(evidence: ViewEvidence, a: Score, b: Score) -> _Gains | None:
+    """None if poses cannot show the suspects."""
     imagined = IMAGINE[type(evidence)](evidence, a, b)
-    if imagined is None:
+    if imagined is None or not len(imagined.joints):
         return None
     # What is known already, as normal equations of [hand-eye and model | b] against a's pattern.
     X = np.hstack([evidence.white_model, evidence.whiten_raw(b.form.columns) * b.form.sizes])
@@ -98,15 +120,10 @@ def _best_pose(evidence: ViewEvidence, a: Score, b: Score) -> tuple[Array, int] 
     ridge = np.diag(np.concatenate([np.zeros(evidence.white_model.shape[1]), np.full(len(b.form.sizes), 0.01)]))
     M, c, square = X.T @ X + ridge, X.T @ y, float(y @ y)
     known = square - float(c @ np.linalg.lstsq(M, c, rcond=1e-12)[0])
-    best, chosen = 0.0, None
+    gains = []
     for k in range(len(imagined.joints)):
         base = np.hstack([imagined.model[k], imagined.b[k] * b.form.sizes])
         Xn, yn = (np.linalg.solve(imagined.half[k], v) for v in (base, imagined.a[k] @ a.values))
         cn = c + Xn.T @ yn
-        gain = square + float(yn @ yn) - float(cn @ np.linalg.lstsq(M + Xn.T @ Xn, cn, rcond=1e-12)[0]) - known
-        if gain > best:
-            best, chosen = gain, k
-    if chosen is None or best < 1e-3 * _ENOUGH:
-        return None
-    count = int(np.ceil(max(_ENOUGH - known, best) / best))
-    return np.degrees(imagined.joints[chosen]), min(count, 99)
+        gains.append(square + float(yn @ yn) - float(cn @ np.linalg.lstsq(M + Xn.T @ Xn, cn, rcond=1e-12)[0]) - known)
+    return _Gains(known, imagined.joints, np.array(gains))
