@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from stitch.calibrate.robot import calibrated, dh_rows
 from stitch.cli.main import main
@@ -147,6 +148,21 @@ def test_hand_eye_and_targets_with_their_sigmas(mount):
         assert found.heldout_rms > found.residual_rms
     # Six χ² of six degrees of freedom; wider sigmas are allowed, too narrow ones are not.
     assert np.sum(z) < 67.99  # 99.9 % point of χ² with 36
+
+
+def test_targets_that_a_model_does_not_know_have_sigmas_of_their_own():
+    """The model's hand-eye is used as it is: its error, the scatter and the noise are what moves a new target."""
+    spread, squares = np.diag([1e-5] * 3 + [0.02] * 3), []
+    for seed in range(8):
+        session, T_mount, places, _ = cell(seed, views=25)
+        xi = spread @ np.random.default_rng([seed, 1]).normal(size=6)
+        wrong = T_mount @ np.block([[Rotation.from_rotvec(xi[:3]).as_matrix(), xi[3:, None]], [np.eye(4)[3:]]])
+        model = replace(model_of(run(session)), T_mount=wrong, covariance=spread**2, targets={})
+        found = run(session, model)
+        error = (found.fused.points - places).ravel()
+        covariance = found.labelled.landmarks_covariance[: error.size, : error.size]
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert chi2.ppf(0.001, error.size * len(squares)) < np.sum(squares) < chi2.ppf(0.999, error.size * len(squares))
 
 
 def test_fit_equals_scipy_least_squares_where_all_rows_weigh_alike():
@@ -359,6 +375,7 @@ def test_every_command_works(kind, tmp_path, capsys, monkeypatch, few_effects):
         judged["hand_eye"] == second["hand_eye"]
         and judged["targets"][0]["position"] == second["targets"][0]["position"]
     )
+    assert judged["targets"][0]["sigma"] == second["targets"][0]["sigma"]
     assert judged["residual_rms"] == pytest.approx(second["residual_rms"], rel=0.05)
     stitch("drop", out, "joint_offset")
     stitch("add", out, "--suggested", "--no-recording")

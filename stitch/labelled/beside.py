@@ -7,13 +7,12 @@ import numpy as np
 
 from stitch.effects.chain import Chain
 from stitch.effects.undo import corrected
-from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of
 from stitch.labelled.gross import Outlier, gross
+from stitch.labelled.landmark_blocks import landmark_blocks, landmarks_covariance
 from stitch.labelled.landmarks import settled
 from stitch.labelled.robust import taken_out
-from stitch.labelled.rows import Rows, evidence_of_rows, rows_of
-from stitch.labelled.solve import Blocks
+from stitch.labelled.rows import evidence_of_rows, rows_of
 from stitch.stages.correct import Correction
 from stitch.variance import fit_variances
 
@@ -59,27 +58,16 @@ def placed_targets(chain: Chain, correction: Correction) -> LabelledFit | None:
     own = corrected(chain, correction.terms, hand_eye.T_mount)
     landmarks = settled(own, hand_eye.T_mount)
     rows = rows_of(own, hand_eye.T_mount, landmarks)
-    evidence = evidence_of_rows(rows, rows.landmarks)
-    variances = fit_variances(evidence, both_starts=True).variances
-    # One working distance for what nobody sees.
-    distance = float(np.median(np.linalg.norm(np.concatenate(chain.capture.sightings.sets()), axis=1)))
-    precision = np.full(landmarks.size, distance**-2.0)
-    blocks = Blocks(evidence.z, rows.landmarks, evidence.covariance(variances), precision, np.zeros(landmarks.size))
+    variances = fit_variances(evidence_of_rows(rows, rows.landmarks), both_starts=True).variances
+    blocks = landmark_blocks(rows, variances)
     landmarks = landmarks.moved(blocks.solve())
     rows = rows_of(own, hand_eye.T_mount, landmarks)
-    covariance = blocks.estimates_covariance() + _through_hand_eye(blocks, rows, hand_eye.covariance)
+    covariance = landmarks_covariance(blocks, rows, hand_eye.covariance)
     distances = rows.distances(rows.left)
     return LabelledFit(
         hand_eye.T_mount, hand_eye.covariance, hand_eye.inflation, landmarks, covariance, correction.terms,
         correction.sigmas, variances, rows, np.full(distances.shape, np.nan), (rms_of(distances),),
     )  # fmt: skip
-
-
-def _through_hand_eye(blocks: Blocks, rows: Rows, covariance: Array) -> Array:
-    """(U, U) what the uncertainty (6, 6) of the hand-eye does to the landmarks."""
-    pull = np.einsum("bmk,bmi->ki", blocks.weighted, rows.hand_eye)
-    moved = np.linalg.solve(blocks.information.sum(axis=0) + np.diag(blocks.precision), pull)
-    return np.asarray(moved @ covariance @ moved.T)
 
 
 def _with_everything(chain: Chain) -> Chain:

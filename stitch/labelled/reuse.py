@@ -7,7 +7,9 @@ import numpy as np
 from stitch.effects.chain import Chain, Term
 from stitch.effects.terms import sigmas_of
 from stitch.effects.undo import corrected
+from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of
+from stitch.labelled.landmark_blocks import landmark_blocks, landmarks_covariance
 from stitch.labelled.landmarks import Landmarks, settled
 from stitch.labelled.rows import evidence_of_rows, rows_of
 from stitch.model import Model
@@ -15,16 +17,33 @@ from stitch.variance import fit_variances
 
 
 def judged(chain: Chain, model: Model, terms: Sequence[Term]) -> LabelledFit:
-    """Rows and scatter under the model; a target that it does not know sits where the views have it (median)."""
+    """Rows and scatter under the model; a target that it does not know sits where the views have it."""
     own = corrected(chain, terms, model.T_mount)
-    landmarks = _known(settled(own, model.T_mount), chain, model)
+    landmarks = settled(own, model.T_mount)
+    rows = rows_of(own, model.T_mount, landmarks)
+    variances = fit_variances(evidence_of_rows(rows, rows.landmarks), both_starts=True).variances
+    blocks = landmark_blocks(rows, variances)
+    landmarks = _known(landmarks.moved(blocks.solve()), chain, model)
     rows = rows_of(own, model.T_mount, landmarks)
     variances = fit_variances(evidence_of_rows(rows, rows.hand_eye[..., :0]), both_starts=True).variances
-    distances, size = rows.distances(rows.left), landmarks.size
+    covariance = landmarks_covariance(blocks, rows, model.covariance)
+    distances = rows.distances(rows.left)
     return LabelledFit(
-        model.T_mount, model.covariance, 1.0, landmarks, np.zeros((size, size)), tuple(terms), sigmas_of(model, chain),
-        variances, rows, distances, (rms_of(distances),),
+        model.T_mount, model.covariance, 1.0, landmarks, _as_known(covariance, chain, model), tuple(terms),
+        sigmas_of(model, chain), variances, rows, distances, (rms_of(distances),),
     )  # fmt: skip
+
+
+def _as_known(covariance: Array, chain: Chain, model: Model) -> Array:
+    """The covariance (U, U) of the landmarks with the model's own sigmas for the targets that it knows."""
+    assert chain.capture.sightings is not None
+    out = covariance.copy()
+    for k, name in enumerate(chain.capture.sightings.targets):
+        if name in model.targets:
+            at = slice(3 * k, 3 * k + 3)
+            out[at] = out[:, at] = 0.0
+            out[at, at] = np.diag(model.targets[name].sigma ** 2)
+    return out
 
 
 def _known(landmarks: Landmarks, chain: Chain, model: Model) -> Landmarks:
