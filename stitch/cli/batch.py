@@ -10,9 +10,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.progress import Tee
+from stitch.cli.run import recordings
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
+from stitch.reading.session_toml import document
 from stitch.rounding import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
@@ -26,9 +29,10 @@ def batch(
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of results on standard output.")] = False,
 ) -> None:
     """Run many sessions; one that fails does not stop the others."""
-    folders = [output / path.resolve().name for path in sessions]
+    folders = [output / _name(path) for path in sessions]
     if len(set(folders)) < len(folders):
-        raise InputError("two of the sessions have folders of the same name; run them with -o of their own")
+        twice = max(folders, key=folders.count).name
+        raise InputError(f"two of the sessions are named {twice!r}; run them with -o of their own")
     rows = list(_map(sessions, folders, workers, scheduler))
     if as_json:
         print(to_json(rows))
@@ -36,7 +40,17 @@ def batch(
         _show(rows)
     failed = [row for row in rows if row["error"]]
     if failed:
-        raise NoResultError(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")
+        refused = all(row["bad_input"] for row in failed)
+        kind = InputError if refused else NoResultError
+        raise kind(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")
+
+
+def _name(session: Path) -> str:
+    """What the session is called; a session that cannot be read is refused when it is its turn."""
+    try:
+        return str(document(session / "session.toml").get("name", session.resolve().name))
+    except InputError:
+        return session.resolve().name
 
 
 def stitch_one(session: Path, folder: Path) -> dict[str, Any]:
@@ -44,14 +58,16 @@ def stitch_one(session: Path, folder: Path) -> dict[str, Any]:
     try:
         loaded = load_session(session)
         with run_folder.new_folder(folder) as scratch:
-            result = run(loaded)
+            result = run(loaded, recorder=Tee(recordings(scratch)))
             run_folder.write_with_page(result, scratch)
     except Exception as error:  # whatever befalls one session, the others go on
         kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
-        return {"session": str(session), "run": None, "error": f"{kind}{' '.join(str(error).split())}"}
+        told = f"{kind}{' '.join(str(error).split())}"
+        return {"session": str(session), "run": None, "error": told, "bad_input": isinstance(error, InputError)}
     um = MICROMETRES[result.session.length_unit]
     return {
-        "session": str(session), "run": str(folder), "error": None, "residual_um": result.residual_rms * um,
+        "session": str(session), "run": str(folder), "error": None, "bad_input": False,
+        "residual_um": result.residual_rms * um,
         "registered_um": result.stages[2].rms * um, "noise_floor_um": result.noise_floor * um,
         "seconds": sum(s.seconds for s in result.stages),
     }  # fmt: skip

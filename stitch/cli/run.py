@@ -82,10 +82,12 @@ def run(
 
 def recorder_for(folder: Path, recording: bool) -> Recorder:
     """Progress on a terminal, and the recording."""
-    recorders: list[Recorder] = [Progress()]
-    if recording:
-        recorders += [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
-    return Tee(recorders)
+    return Tee([Progress(), *(recordings(folder) if recording else [])])
+
+
+def recordings(folder: Path) -> list[Recorder]:
+    """What other packages record of a run."""
+    return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
 
 
 def _write(result: Run, folder: Path, mesh: bool) -> None:
