@@ -17,6 +17,7 @@ from stitch.model import read_model
 from stitch.pipeline import run as stitched
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
+from stitch.result import Step
 from stitch.state import load_state, state_of
 from stitch.stored import stored_run
 from stitch.writing.result_document import model_of
@@ -167,6 +168,20 @@ def test_a_change_that_fails_leaves_the_run_as_it_was(changing, monkeypatch, err
         main(["drop", str(run), EFFECT, "--no-recording"])
     assert stop.value.code
     assert files(run) == before and not (run / ".new").exists()
+
+
+def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch):
+    """The fit is made once more for the recording; history and result speak of the same one."""
+    run, result = changing
+    step, last = Step((), 0.1, 0.1, 0.1, np.eye(4)), Step((), 0.1, result.heldout_rms, 0.1, result.T_mount)
+    fitted = replace(result, ledger=(step, step))
+    monkeypatch.setattr(change_command, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
+    monkeypatch.setattr(change_command, "suggest", lambda state, at_most: (fitted, [], None))
+    monkeypatch.setattr(change_command, "write_diagnosis", lambda found, state, run: {})
+    stitch("add", run, "--suggested")
+    steps = json.loads((run / "ledger.json").read_text())
+    assert len(steps) == len(fitted.ledger)
+    assert steps[-1]["hand_eye"] == told(run)["hand_eye"] and steps[-1]["heldout_rms"] == told(run)["heldout_rms"]
 
 
 def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, capsys):

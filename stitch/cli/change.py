@@ -62,8 +62,10 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
     if result is not None:
         with run_folder.changed(run) as scratch:
             if recording:
-                again = change(state_of(result), list(result.effects), recorder_for(scratch, recording))
-                result = replace(again, ledger=result.ledger, poses_before=result.poses_before)
+                # The same fit once more from where it ended, for the recording; it takes the last step's place.
+                before = replace(state_of(result), ledger=result.ledger[:-1])
+                again = change(before, list(result.effects), recorder_for(scratch, recording))
+                result = replace(again, poses_before=result.poses_before)
             run_folder.write_with_page(result, scratch)
         _show(result, as_json)
     elif as_json:
