@@ -72,6 +72,7 @@ def test_real_pcd_equals_open3d(reghec):
         (".xyz", "1 2 3 9\n4 5 6 8\n"),
         (".csv", "x,y,z,intensity\n1,2,3,9\n4,5,6,8\n"),
         (".txt", "# c\n1;2;3;9\n4;5;6;8\n"),
+        (".xyz", "# taken at noon\n# X Y Z intensity\n1 2 3 9\n4 5 6 8\n"),
     ],
 )
 def test_text(tmp_path, suffix, text):
@@ -79,7 +80,9 @@ def test_text(tmp_path, suffix, text):
     path.write_text(text)
     cloud = read_cloud(path)
     assert np.array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
-    assert np.array_equal(next(iter(cloud.scalars.values())), [9, 8])
+    (name,) = cloud.scalars
+    assert np.array_equal(cloud.scalars[name], [9, 8])
+    assert name == ("intensity" if "intensity" in text else "scalar_0")
 
 
 def test_points_at_the_scanner_itself_are_no_measurement(tmp_path):

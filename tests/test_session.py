@@ -183,10 +183,12 @@ def test_a_batch_goes_on_after_whatever_befalls_one_session(session, tmp_path, m
     """Also after an error that nobody foresaw."""
     shutil.copytree(session, tmp_path / "t")
 
-    def fails_once(loaded):
+    edit(tmp_path / "t" / "session.toml", "(?m)^name = .*$", 'name = "second"')
+
+    def fails_once(loaded, recorder):
         if loaded.path.name == "s":
             raise ZeroDivisionError("by\nzero")
-        return run(loaded)
+        return run(loaded, recorder=recorder)
 
     monkeypatch.setattr("stitch.cli.batch.run", fails_once)
     with pytest.raises(SystemExit) as ended:
@@ -194,7 +196,15 @@ def test_a_batch_goes_on_after_whatever_befalls_one_session(session, tmp_path, m
     assert ended.value.code == 1
     bad, good = json.loads(capsys.readouterr().out)
     assert bad["error"] == "ZeroDivisionError: by zero" and good["error"] is None
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["t"]
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["second"]
+    assert {"result.json", "recording.rrd"} <= {path.name for path in (tmp_path / "runs" / "second").iterdir()}
+
+
+def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", str(tmp_path / "nowhere"), "-o", str(tmp_path / "runs")])
+    assert ended.value.code == 2
+    assert "nowhere" in capsys.readouterr().err
 
 
 def sees_points(folder):
@@ -295,6 +305,20 @@ def test_joints_and_pose_that_contradict_are_refused(session):
     header = rows[0] + ",j1_deg,j2_deg,j3_deg"
     joints_session(session, [row + ",10,20,30" for row in rows[1:]], header)
     with pytest.raises(InputError, match="line 2.* mm and .*check robot.dh"):
+        load_session(session)
+
+
+def test_rows_out_of_the_order_of_time_are_refused(session):
+    rows = (session / "views.csv").read_text().splitlines()
+    more = ("time_s", "100", "", "50")
+    (session / "views.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(rows, more, strict=True)) + "\n")
+    with pytest.raises(InputError, match="line 4: time_s 50 stands below 100; sort the rows"):
+        load_session(session)
+
+
+def test_joint_columns_are_called_as_the_format_calls_them(session):
+    joints_session(session, ["a,clouds/v000.ply,10,20,30"], "view,cloud,j01_deg,j02_deg,j03_deg")
+    with pytest.raises(InputError, match="neither joints \\(j1_deg"):
         load_session(session)
 
 

@@ -72,15 +72,29 @@ def _read_ply(path: Path) -> dict[str, Array]:
 
 
 def _read_text(path: Path) -> dict[str, Array]:
-    """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …"""
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …
+
+    The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
+    """
+    told = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = [line for line in told if not _is_comment(line)]
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}
     separator = next((s for s in ",;" if s in lines[0]), None)
-    first = [cell.strip() for cell in lines[0].split(separator)]
+    first = _names(lines[0], separator)
     header = any(not is_number(cell) for cell in first)
-    names = [name.lower() if name.lower() in "xyz" else name for name in first]
-    if not header:
+    above = told[: told.index(lines[0])]
+    names = first if header or not above else _names(above[-1].lstrip(" #"), separator)
+    if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
         names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
     table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
     return dict(zip(names, table.T, strict=True))
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip()[0] == "#"
+
+
+def _names(line: str, separator: str | None) -> list[str]:
+    cells = [cell.strip() for cell in line.split(separator)]
+    return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]

@@ -15,8 +15,8 @@ from stitch.reading.csv_number import is_number, number
 from stitch.robot import Robot, forward
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_JOINT = re.compile(r"j(\d+)_deg$")
-_APPROACH = re.compile(r"j(\d+)_approach$")
+_JOINT = re.compile(r"j([1-9]\d*)_deg$")
+_APPROACH = re.compile(r"j([1-9]\d*)_approach$")
 # A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
 _UNIT_TOLERANCE = 1e-3
 # Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
@@ -59,6 +59,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     joints = [_joints(file, line, row, header) for line, row in cells]
     rows: list[Row] = []
     seen: dict[str, int] = {}
+    latest = -np.inf
     for i, (line, row) in enumerate(cells):
         name = row.get("view", "")
         if not name or name in seen:
@@ -66,11 +67,23 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
             raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
         seen[name] = line
         time_s = number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+        if time_s is not None:
+            _require_later(file, line, time_s, latest)
+            latest = time_s
         values = {c: number(file, line, c, row[c]) for c in covariates if row[c]}
         T_base_flange = _flange(file, line, name, row, joints[i], robot)
         approach = _approach(file, line, row, joints, i)
         rows.append(Row(line, name, row.get("cloud", ""), T_base_flange, joints[i], approach, time_s, values))
     return rows
+
+
+def _require_later(file: Path, line: int, time_s: float, latest: float) -> None:
+    """Refuse rows out of order: direction of approach, settling and drifts count on it."""
+    if time_s < latest:
+        raise InputError(
+            f"{file} line {line}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go on "
+            "counting"
+        )
 
 
 def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> None:

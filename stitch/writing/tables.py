@@ -1,8 +1,9 @@
 """stitched.ply and residuals.parquet."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +15,8 @@ from stitch.labelled.document import residual_columns
 from stitch.overlap.match import Match
 from stitch.result import FusedCloud, Run
 from stitch.session import Session
+
+_Value = TypeVar("_Value")
 
 _PLACE = ("x", "y", "z", "nx", "ny", "nz")
 _OWN = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
@@ -34,10 +37,12 @@ def write_residuals(run: Run, path: Path) -> None:
     """One row per residual of the model, before the register stage moves single views.
 
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
+    What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
     """
     session = _renamed(run.session)
-    covariates = sorted({key for view in session.views for key in view.covariates})
-    parts = [] if run.overlaps is None else [_columns(session, m, covariates) for m in run.overlaps.matches]
+    of_views = {key for view in session.views for key in view.covariates}
+    of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}
+    parts = [] if run.overlaps is None else [_columns(session, m, of_views, of_points) for m in run.overlaps.matches]
     if run.labelled is not None:
         parts.append(residual_columns(run.labelled, session))
     # Beside clouds, labelled points have the columns of these.
@@ -50,18 +55,33 @@ def write_residuals(run: Run, path: Path) -> None:
 
 def _renamed(session: Session) -> Session:
     """The session without covariates that would take the place of a column."""
+
+    def free(values: dict[str, _Value]) -> dict[str, _Value]:
+        return {f"covariate_{key}" if key in _OWN else key: value for key, value in values.items()}
+
     views = [
-        replace(view, covariates={f"covariate_{k}" if k in _OWN else k: x for k, x in view.covariates.items()})
+        replace(
+            view, covariates=free(view.covariates),
+            cloud=None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars)),
+        )
         for view in session.views
-    ]
+    ]  # fmt: skip
     return replace(session, views=tuple(views))
 
 
-def _columns(session: Session, m: Match, covariates: Sequence[str]) -> dict[str, Array]:
+def _columns(session: Session, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
     """Columns of one pair of views, a row per correspondence."""
     size = len(m.residual)
     own, time = session.views[m.v].covariates, session.views[m.v].time_s
     out = {name: np.repeat(session.views[v].name, size) for name, v in (("view", m.v), ("partner", m.w))}
     out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
     out |= {"residual": m.residual, "time_s": np.full(size, np.nan if time is None else time)}
-    return out | {key: np.full(size, own.get(key, np.nan)) for key in covariates}
+    out |= {key: np.full(size, own.get(key, np.nan)) for key in sorted(of_views)}
+    for key in sorted(of_points):
+        for name, v, index in ((key, m.v, m.index_v), (f"partner_{key}", m.w, m.index_w)):
+            cloud = session.views[v].cloud
+            if cloud is not None and key in cloud.scalars:
+                out[name] = cloud.scalars[key][index]
+            else:
+                out.setdefault(name, np.full(size, np.nan))
+    return out
