@@ -1,5 +1,6 @@
 """Effects of the model against nature's laws, which share no code with them, and against finite differences."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from conftest import measured_blade
 from in_memory import session_of
 
 from stitch import frames
+from stitch.cli.main import main
 from stitch.effects import EFFECTS
 from stitch.effects.chain import Term, chain_of
 from stitch.effects.slopes import shifts, twists
@@ -211,6 +213,26 @@ def test_a_bad_effects_file_is_one_line(tmp_path, text, expected):
     assert str(file) in str(error.value)
 
 
+def test_what_goes_wrong_in_an_effect_of_ones_own_is_one_line(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(USER.replace("    return ", "    raise KeyError('dust')\n    return "))
+    try:
+        (name,) = load(file)
+        with pytest.raises(InputError, match=rf"mine.py line \d+: effect {name}: KeyError: 'dust'") as error:
+            EFFECTS[name].function(np.zeros((2, 3)), None, 0.1)
+    finally:
+        del EFFECTS["humidity_bias"]
+    assert "\n" not in str(error.value)
+
+
+def test_effects_as_json(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["effects", "part_slip", "--json"])
+    assert not ended.value.code
+    (told,) = json.loads(capsys.readouterr().out)
+    assert told["effect"] == "part_slip" and [p["unit"] for p in told["parameters"]] == ["rad", "view"]
+
+
 def test_unknown_and_impossible_effects_are_refused(cells):
     with pytest.raises(InputError, match="no effect 'elbow'"):
         known("elbow")
@@ -258,6 +280,7 @@ def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(pla
     (term,) = terms_of(model, wrist)
     np.testing.assert_array_equal(term.values, values)
     np.testing.assert_array_equal(sigmas_of(model, wrist)[0], sigmas)
+    assert {f.unit for f in model.effects["joint_compliance"].values()} == {"kg rad/(N m)"}
     unit, bent = unit_torques(wrist.robot, wrist.views.joints), np.zeros(wrist.views.joints.shape)
     for name, f in model.effects["joint_compliance"].items():
         joint, link = (int(number) - 1 for number in name[1:].split("_"))

@@ -1,7 +1,8 @@
 """`stitch effects`: the library with formulas; `stitch effects NAME`: one of them."""
 
+from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -10,6 +11,7 @@ from rich.table import Table
 from stitch.effects.contract import EFFECTS, PLACES, Effect
 from stitch.effects.terms import known
 from stitch.effects.user_file import load
+from stitch.writing.json_file import to_json
 
 
 def effects(
@@ -17,11 +19,15 @@ def effects(
     effects_file: Annotated[
         Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the effects as JSON.")] = False,
 ) -> None:
     """List the physical effects with place, formula, parameters and plausible sizes."""
     if effects_file:
         load(effects_file)
     console = Console()
+    if as_json:
+        print(to_json([_document(e) for e in ([known(name)] if name else EFFECTS.values())]))
+        return
     if name:
         _one(console, name)
         return
@@ -36,6 +42,24 @@ def effects(
 def signature(effect: Effect) -> str:
     """The parameters with their units: c₁… (rad/(N m))."""
     return ", ".join(f"{key}{'' if s.kind == 'number' else '₁…'} ({s.unit})" for key, s in effect.specs.items())
+
+
+def _document(effect: Effect) -> dict[str, Any]:
+    parameters = [
+        {
+            "name": key,
+            "kind": s.kind,
+            "unit": s.unit,
+            "plausible": s.typical,
+            "limit": s.limit if isfinite(s.limit) else None,
+        }
+        | ({"unit_shift": s.unit_shift, "plausible_shift": s.typical_shift} if s.kind == "twist" else {})
+        for key, s in effect.specs.items()
+    ]
+    return {
+        "effect": effect.name, "place": effect.place, "tier": effect.tier, "formula": effect.formula,
+        "parameters": parameters, "needs": list(effect.needs), "uses": list(effect.prefers),
+    }  # fmt: skip
 
 
 def _one(console: Console, name: str) -> None:

@@ -129,11 +129,12 @@ class Effect:
                 names = {"number": [key], "offset": [key + axis for axis in "xyz"],
                          "joint": [f"{key}{i + 1}" for i in range(joints)],
                          "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
-                # A torque between two joints is that of 1 kg there; the link's mass is in the coefficient.
+                # A torque between two joints is that of 1 kg there: the coefficient holds the link's mass.
                 for name in names:
                     massless = spec.kind == "torque" and "_" in name[len(key) :]
                     typical, limit = (_LINK_MASS, _LINK_MASS_LIMIT) if massless else (1.0, 1.0)
-                    out.append(_in_unit(name, spec.unit, typical * spec.typical, limit * spec.limit, spec.grid,
+                    unit = f"kg {spec.unit}" if massless else spec.unit
+                    out.append(_in_unit(name, unit, typical * spec.typical, limit * spec.limit, spec.grid,
                                         length_unit))  # fmt: skip
         return tuple(out)
 

@@ -1,9 +1,13 @@
 """A user's own effects from a Python file, written in the form of the library's."""
 
 import importlib.util
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
-from stitch.effects.contract import EFFECTS
+from stitch.effects.contract import EFFECTS, Effect
 from stitch.errors import InputError
 
 
@@ -29,13 +33,30 @@ def load(path: Path) -> list[str]:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # whatever a user's file may raise
         line = _line(error, path)
-        raise InputError(f"{path}{line}: {type(error).__name__}: {error}") from None
+        raise InputError(f"{path}{line}: {_told(error)}") from None
     names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
     if not names:
         raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
     for name in names:
-        object.__setattr__(EFFECTS[name], "tier", "user")
+        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guarded(EFFECTS[name], path))
     return names
+
+
+def _guarded(effect: Effect, path: Path) -> Callable[..., Any]:
+    """The effect's function; what goes wrong in it names the file and the line."""
+
+    @wraps(effect.function)
+    def function(*args: Any, **parameters: Any) -> Any:
+        try:
+            return effect.function(*args, **parameters)
+        except Exception as error:  # whatever a user's function may raise
+            raise InputError(f"{path}{_line(error, path)}: effect {effect.name}: {_told(error)}") from None
+
+    return function
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _line(error: Exception, path: Path) -> str:
