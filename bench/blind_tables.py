@@ -132,8 +132,8 @@ def _outside(rows: list[Row]) -> str:
         "the user's own effect is named then | held-out residual within 5 % of the floor after adding it |",
         "|---|---:|---|---|---|---|---|",
     ]
-    keys = dict.fromkeys((r["effect"], r["multiple"]) for r in rows)
-    for name, multiple in [*keys, *(("all", m) for m in dict.fromkeys(m for _, m in keys))]:
+    keys = sorted({(r["effect"], r["multiple"]) for r in rows})
+    for name, multiple in [*keys, *(("all", m) for m in sorted({m for _, m in keys}))]:
         own = [r for r in rows if name in ("all", r["effect"]) and r["multiple"] == multiple]
         user = [r for r in own if "user" in r]
         unknown = [r for r in own if r["verdict"] == "unknown_effect"]
