@@ -41,8 +41,8 @@ def test_sigmas_hold_whatever_the_scanner_repeats():
 def test_what_incidence_shows_is_not_laid_on_the_field():
     """A carried scanner on a coarse surface: grazing points pretend a bias, while its field has no error at all."""
     scene = load_scene("blade-table")
-    scanner = replace(scene.scanner, columns=90, rows=90, field_error=0.0)
-    measured = simulate(replace(scene, scanner=scanner), {}, 3, views=12)
+    scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
+    measured = simulate(replace(scene, scanner=scanner), {}, 3, views=10)
     evidence = evidence_of_state(state_of(pipeline.run(session_of(measured))))
     shown, unit = (field_scatter(evidence.chain, evidence.freed, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
