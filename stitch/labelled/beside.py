@@ -8,13 +8,11 @@ import numpy as np
 from stitch.effects.chain import Chain
 from stitch.effects.undo import corrected
 from stitch.labelled.fit import LabelledFit, rms_of
+from stitch.labelled.fitted_landmarks import fitted_landmarks, landmarks_covariance
 from stitch.labelled.gross import Outlier, gross
-from stitch.labelled.landmark_blocks import landmark_blocks, landmarks_covariance
-from stitch.labelled.landmarks import settled
 from stitch.labelled.robust import taken_out
-from stitch.labelled.rows import evidence_of_rows, rows_of
+from stitch.labelled.rows import rows_of
 from stitch.stages.correct import Correction
-from stitch.variance import fit_variances
 
 
 @dataclass(frozen=True)
@@ -56,11 +54,7 @@ def placed_targets(chain: Chain, correction: Correction) -> LabelledFit | None:
         return None
     hand_eye = correction.hand_eye
     own = corrected(chain, correction.terms, hand_eye.T_mount)
-    landmarks = settled(own, hand_eye.T_mount)
-    rows = rows_of(own, hand_eye.T_mount, landmarks)
-    variances = fit_variances(evidence_of_rows(rows, rows.landmarks), both_starts=True).variances
-    blocks = landmark_blocks(rows, variances)
-    landmarks = landmarks.moved(blocks.solve())
+    landmarks, blocks, variances = fitted_landmarks(own, hand_eye.T_mount)
     rows = rows_of(own, hand_eye.T_mount, landmarks)
     covariance = landmarks_covariance(blocks, rows, hand_eye.covariance)
     distances = rows.distances(rows.left)

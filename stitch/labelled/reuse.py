@@ -9,8 +9,8 @@ from stitch.effects.terms import sigmas_of
 from stitch.effects.undo import corrected
 from stitch.frames import Array
 from stitch.labelled.fit import LabelledFit, rms_of
-from stitch.labelled.landmark_blocks import landmark_blocks, landmarks_covariance
-from stitch.labelled.landmarks import Landmarks, settled
+from stitch.labelled.fitted_landmarks import fitted_landmarks, landmarks_covariance
+from stitch.labelled.landmarks import Landmarks
 from stitch.labelled.rows import evidence_of_rows, rows_of
 from stitch.model import Model
 from stitch.variance import fit_variances
@@ -19,11 +19,8 @@ from stitch.variance import fit_variances
 def judged(chain: Chain, model: Model, terms: Sequence[Term]) -> LabelledFit:
     """Rows and scatter under the model; a target that it does not know sits where the views have it."""
     own = corrected(chain, terms, model.T_mount)
-    landmarks = settled(own, model.T_mount)
-    rows = rows_of(own, model.T_mount, landmarks)
-    variances = fit_variances(evidence_of_rows(rows, rows.landmarks), both_starts=True).variances
-    blocks = landmark_blocks(rows, variances)
-    landmarks = _known(landmarks.moved(blocks.solve()), chain, model)
+    free, blocks, _ = fitted_landmarks(own, model.T_mount)
+    landmarks = _known(free, chain, model)
     rows = rows_of(own, model.T_mount, landmarks)
     variances = fit_variances(evidence_of_rows(rows, rows.hand_eye[..., :0]), both_starts=True).variances
     covariance = landmarks_covariance(blocks, rows, model.covariance)
