@@ -14,14 +14,14 @@ from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, part_mesh, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.detectable import least_noncentrality
-from stitch.diagnosis.pose_evidence import PoseEvidence
 from stitch.diagnosis.score import form_weights
+from stitch.diagnosis.sensitivity.detectable import least_noncentrality
 from stitch.effects import EFFECTS
-from stitch.effects.chain import Chain
 from stitch.effects.user_file import load
 from stitch.frames import Array
-from stitch.result import Run
+from stitch.measurement.measurement import Measurement
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
+from stitch.runs.run import Run
 
 # Evidence counts in views: a few thousand points a view show what millions would.
 _PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80}
@@ -82,12 +82,14 @@ def measure(
     )
 
 
-def drawn(name: str, plan: Plan, chain: Chain, laws: Sequence[str], chance: int) -> dict[str, dict[str, float]]:
+def drawn(
+    name: str, plan: Plan, measurement: Measurement, laws: Sequence[str], chance: int
+) -> dict[str, dict[str, float]]:
     """What nature draws for these laws, in this order, at amplitude 1 in this very cell, as a model counts it."""
     out = nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
     if "part_growth" in out:
         # About another origin than the part's own, growth is a motion too.
-        off = chain.scan_views[0].origin - load_scene(name).T_reference_part[:3, 3]
+        off = measurement.scan_views[0].origin - load_scene(name).T_reference_part[:3, 3]
         out["part_growth"] |= dict(zip(("cx", "cy", "cz"), out["part_growth"]["g"] * off, strict=True))
     return out
 
@@ -99,7 +101,7 @@ def user_effect(law: str) -> str:
 
 def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> float | None:
     """Factor on the parameters `true` that is detectable at the least; None where cell or belief cannot hold it."""
-    if evidence.chain.lacks(EFFECTS[effect]) or not true:
+    if evidence.measurement.lacks(EFFECTS[effect]) or not true:
         return None
     candidate = candidate_of(evidence, EFFECTS[effect])
     if candidate is None:
@@ -113,8 +115,10 @@ def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> flo
         off = np.abs(form.term.values - values)[~fitted].sum()
         if not values[fitted & ~form.keep].any():
             white = evidence.whiten_channel(form.columns)
-            freedom = evidence.freedom.of(evidence.in_blocks(white))
-            least = least_noncentrality(white * form.sizes, float(weight), tests, e.size - e.A.shape[2], freedom)
+            degrees_of_freedom = evidence.degrees_of_freedom.of(evidence.in_blocks(white))
+            least = least_noncentrality(
+                white * form.sizes, float(weight), tests, e.size - e.A.shape[2], degrees_of_freedom
+            )
             found.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
     nearest = min(off for off, _ in found)
     amplitude = float(min(size for off, size in found if off == nearest))

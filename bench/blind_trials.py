@@ -27,18 +27,18 @@ from blind_cells import (
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
-from stitch.diagnosis.answer import Diagnosis
 from stitch.diagnosis.diagnose import diagnose
-from stitch.diagnosis.heldout import Left
-from stitch.diagnosis.pose_evidence import PoseEvidence
-from stitch.diagnosis.start import evidence_of_state
-from stitch.diagnosis.suggest import suggest
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
 from stitch.pipeline import change, run
-from stitch.result import Run
-from stitch.state import State, state_of
-from stitch.threads import library_threads_off
+from stitch.runs.run import Run
+from stitch.stepwise import suggest
+from stitch.stored.load_state import State, state_of
+from stitch.system.threads import library_threads_off
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from in_memory import session_of
@@ -90,7 +90,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     # What follows a covariate shows as well as that one's course of the day, which is drawn too.
     own = any(law in OUTSIDE or law in CLIMATE for law in laws)
     cell = cell_without(job["scene"], job["seed"], _chance(job) if own else None)
-    true = drawn(job["scene"], cell.plan, cell.evidence.chain, laws, _chance(job))
+    true = drawn(job["scene"], cell.plan, cell.evidence.measurement, laws, _chance(job))
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law
@@ -107,21 +107,21 @@ def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measu
     measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())), _chance(job))
     first = run(session_of(measured))
     found = diagnose(state_of(first))
-    ranked = [s.name for s in found.suspects if s.ranked.score.observable]
+    ranked = [s.name for s in found.candidates if s.ranked.score.observable]
     row = {
         "hidden": {name: measured.hidden[name] for name in hidden}, "verdict": found.verdict,
         "named": list(found.effects), "first": ranked[0] if ranked else None,
-        "p": min((s.ranked.adjusted for s in found.suspects if s.name in found.effects), default=1.0),
+        "p": min((s.ranked.adjusted for s in found.candidates if s.name in found.effects), default=1.0),
         "follows": [d.covariate for d in found.depends_on[:3] if d.p_value < 0.05], "notes": list(found.notes),
         "scatter": [found.rotation * 1e6, found.translation * 1e3],
-        "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.suspects[:3]],
-        "left": [_left(s.left) for s in found.suspects[:3]],
+        "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.candidates[:3]],
+        "left": [_left(s.cross_validation) for s in found.candidates[:3]],
         "hand_eye_chi_square": hand_eye_chi_square(measured, first),
     }  # fmt: skip
     return measured, first, found, row
 
 
-def _left(left: Left | None) -> list[float]:
+def _left(left: CrossValidation | None) -> list[float]:
     """Share of the mean square pose error of left-out views, its sigma, steadiness."""
     return [] if left is None else [round(x, 3) for x in (left.poses, left.poses_sigma, left.steadiness)]
 
@@ -143,7 +143,7 @@ def _effect(job: Row) -> Row:
 def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
     """What the change brought: held-out residual, hand-eye against the truth, amplitudes in sigmas."""
     true = in_session_units(measured)[job["effect"]]
-    parameters = added.chain.parameters(added.terms[0].effect)
+    parameters = added.measurement.parameters(added.terms[0].effect)
     names = [p.name for p in parameters if not p.grid]
     values = dict(zip([p.name for p in parameters], added.terms[0].values, strict=True))
     sigmas = dict(zip([p.name for p in parameters], added.sigmas[0], strict=True))
@@ -165,7 +165,7 @@ def _empty(job: Row) -> Row:
 def _alias(job: Row) -> Row:
     """What these views cannot tell from the hand-eye, at a size of nature's own."""
     _, _, found, row = _diagnosed(job, {job["effect"]: job["amplitude"]}, job["how"])
-    suspect = next((s for s in found.suspects if s.name == job["effect"]), None)
+    suspect = next((s for s in found.candidates if s.name == job["effect"]), None)
     return {**row, "observable": bool(suspect and suspect.ranked.score.observable)}
 
 

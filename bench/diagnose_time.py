@@ -22,14 +22,14 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch.diagnosis.candidates import _grid_terms
-from stitch.effects.columns import POINTS, point_gram
 from stitch.effects.contract import EFFECTS
-from stitch.effects.undo import corrected
-from stitch.overlap.free_poses import FreePoses
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import collect
-from stitch.state import load_state
-from stitch.threads import library_threads_off
+from stitch.model.forward import corrected
+from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.point_effects import POINTS, point_gram
+from stitch.stored.load_state import load_state
+from stitch.system.threads import library_threads_off
 
 # Points of a view of the blade scene with 280 × 280 rays.
 _USUAL_RAYS, _USUAL_POINTS = 280, 15_840
@@ -66,16 +66,16 @@ def streamed(run: Path, correspondences: int) -> None:
     """The sums over many correspondences, in this process."""
     state = load_state(run)
     with library_threads_off():
-        own = corrected(state.chain, state.terms, state.T_mount)
+        own = corrected(state.measurement, state.terms, state.T_mount)
         poses = own.poses(state.T_mount)
         few = collect(own, poses, state.gate, [sample(scan, 1000) for scan in own.scans])
         per_view = round(1000 * correspondences / few.gram.count.sum())
         many = collect(own, poses, state.gate, [sample(scan, per_view) for scan in own.scans])
     before = _peak()
-    effects = [e for e in EFFECTS.values() if e.place in POINTS and not state.chain.lacks(e)]
-    terms = [t for e in effects for t in _grid_terms(e, state.chain.parameters(e))]
+    effects = [e for e in EFFECTS.values() if e.place in POINTS and not state.measurement.lacks(e)]
+    terms = [t for e in effects for t in _grid_terms(e, state.measurement.parameters(e))]
     start = time.perf_counter()
-    sums = point_gram(state.chain, state.terms, terms, FreePoses(poses, np.zeros((len(poses), 6)), many))
+    sums = point_gram(state.measurement, state.terms, terms, FreePoses(poses, np.zeros((len(poses), 6)), many))
     count, columns = sum(len(m.residual) for m in many.matches), sums.residual.shape[1]
     print(
         f"{count:,} correspondences × {columns} columns: {time.perf_counter() - start:.1f} s, peak {_peak():.2f} GB, "

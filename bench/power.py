@@ -14,22 +14,22 @@ import numpy as np
 from blind_cells import drawn, smallest
 from blind_trials import LIBRARY, cell_without, pin
 
-from stitch.diagnosis.answer import Suspect
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.diagnose import checked
-from stitch.diagnosis.heldout import left_by
-from stitch.diagnosis.pose_evidence import PoseEvidence
-from stitch.diagnosis.select import implausible, select
+from stitch.diagnosis.diagnosis import CandidateEffect
+from stitch.diagnosis.selection.select import implausible, select
+from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
-from stitch.variance import fit_variances
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
+from stitch.statistics.variance_components import fit_variances
 
 
 def verdict(evidence: PoseEvidence, candidates: list[Candidate]) -> str:
     """As `diagnose` judges, less what it says about it."""
     selection = select(evidence, candidates, "mm")
     asked = {r.name: r for r in (*selection.named, selection.second) if r is not None}
-    suspects = [Suspect(r, (), left_by(evidence, r.score, None), {}, None) for r in asked.values()]
-    return checked(selection, suspects, implausible(evidence, "mm"))[0].verdict
+    candidates = [CandidateEffect(r, (), cross_validate(evidence, r.score, None), {}, None) for r in asked.values()]
+    return checked(selection, candidates, implausible(evidence, "mm"))[0].verdict
 
 
 def redrawn(evidence: PoseEvidence, shift: Array, rng: np.random.Generator) -> PoseEvidence:
@@ -61,7 +61,7 @@ def main() -> None:
     for scene in options.scenes.split(","):
         cell = cell_without(scene, 0)
         candidates, rng = candidates_of(cell.evidence)[0], np.random.default_rng(1)
-        true = drawn(scene, cell.plan, cell.evidence.chain, LIBRARY, 0)
+        true = drawn(scene, cell.plan, cell.evidence.measurement, LIBRARY, 0)
         for candidate in candidates:
             size = smallest(cell.evidence, candidate.name, true[candidate.name]) if candidate.name in true else None
             if size is None:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.diagnosis.suggest import suggest
+from stitch.measurement.session import Session
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
-from stitch.result import Run
-from stitch.session import Session
-from stitch.state import state_of
+from stitch.runs.run import Run
+from stitch.stepwise import suggest
+from stitch.stored.load_state import state_of
 from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,7 +59,7 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     for fit_on, judge_on in way:
         model = model_of(run(only(session, fit_on), effects=effects))
         found: Run = run(only(session, judge_on), model)
-        d = found.labelled.rows.distances(found.labelled.rows.left)
+        d = found.labelled.rows.distances(found.labelled.rows.residual)
         distances.append(d[np.isfinite(d)])
     d = np.concatenate(distances)
     return float(np.sqrt(np.mean(d**2))), float(d.mean())

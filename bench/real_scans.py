@@ -12,10 +12,10 @@ import numpy as np
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from stitch import frames
-from stitch.overlap.capture import capture, place
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import collect
-from stitch.overlap.scan import prepare_view
+from stitch.measurement.capture import capture, place
+from stitch.measurement.scan import prepare_view
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 from stitch.stages.coarse import part_size

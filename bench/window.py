@@ -21,7 +21,7 @@ from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.scans import join
 from stitch.cells.window.seam import Limits, Station, measure_seam
 from stitch.cells.window.start import find_start
-from stitch.overlap.scan import prepare_view
+from stitch.measurement.scan import prepare_view
 from viz.cells.window_fit import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]

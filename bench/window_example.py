@@ -12,7 +12,7 @@ from data_synth import window, window_job, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import Pane
 from stitch import frames
-from stitch.native import load_open3d
+from stitch.system.native import load_open3d
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "window"
 NOISE = 0.05

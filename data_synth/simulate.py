@@ -14,7 +14,7 @@ from data_synth.scanner import Cloud, field_map, half_field, profile_times, scan
 from data_synth.scene import Scene
 from data_synth.shapes import build_shape, load_mesh
 from stitch import frames
-from stitch.threads import parallel
+from stitch.system.threads import parallel
 
 Array = NDArray[np.float64]
 

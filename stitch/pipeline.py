@@ -4,31 +4,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from stitch.diagnosis.start import evidence_at, evidence_of_state, start_values
-from stitch.effects.chain import Chain, about_part, chain_of
-from stitch.effects.scanner_field import field_scatters
-from stitch.effects.terms import known, sigmas_of, terms_of
-from stitch.effects.undo import corrected
+from stitch.diagnosis.initial_values import evidence_at, evidence_of_state, start_values
 from stitch.frames import Array
-from stitch.labelled.beside import Beside, fitted_beside, weighed
-from stitch.labelled.run import change_labelled, run_labelled
-from stitch.labelled.words import beside_notes
-from stitch.model import Model, in_unit
-from stitch.overlap.capture import Capture, capture
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import collect
-from stitch.recorder import Recorder, Silent
-from stitch.result import Run, StageResult, Step
-from stitch.rig import require_effects, require_same_rig
-from stitch.session import Session
+from stitch.measurement.capture import Capture, capture
+from stitch.measurement.measurement import Measurement, about_part, measurement_of
+from stitch.measurement.session import Session
+from stitch.model.forward import corrected
+from stitch.model.model_toml import Model, in_unit
+from stitch.model.terms import known, sigmas_of, terms_of
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.runs.recorder import Recorder, Silent
+from stitch.runs.run import Run, StageResult, Step
+from stitch.runs.sentences import coarse_note
+from stitch.runs.target_sentences import beside_notes
 from stitch.stages.coarse import COARSE_GATE, REUSED, STATED, Coarse, coarse, given, part_size
 from stitch.stages.correct import COARSE_SAMPLES, Correction, correct
 from stitch.stages.finish import finish, show
-from stitch.stages.refine import refine
+from stitch.stages.joint_fit import refine
+from stitch.stages.mixed_fit import Beside, fitted_beside, weighed
 from stitch.stages.reuse import reuse
-from stitch.state import State
-from stitch.threads import Clock, library_threads_off
-from stitch.verdict import coarse_note
+from stitch.stages.rig import require_effects, require_same_rig
+from stitch.stages.target_run import change_labelled, run_labelled
+from stitch.stored.load_state import State
+from stitch.system.threads import Clock, library_threads_off
 
 
 def run(
@@ -57,19 +57,19 @@ def run_rig(
         clock = Clock()
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
-        chains = [chain_of(session, capture(session)) for session in sessions]
+        measurements = [measurement_of(session, capture(session)) for session in sessions]
         effects = list(dict.fromkeys(effects))
         model = in_unit(model, sessions[0].length_unit) if model else None
-        require_effects(chains, [*effects, *(model.effects if model else ())])
+        require_effects(measurements, [*effects, *(model.effects if model else ())])
         if not sessions[0].has_clouds:
-            found = run_labelled(sessions[0], chains[0], model, effects, recorders[0])
+            found = run_labelled(sessions[0], measurements[0], model, effects, recorders[0])
             return [_in_ledger(found, (), model.effects_file if model else None, recorders[0])]
-        start = _start(sessions, chains, model)
-        chains = [about_part(chain, start.T_mount) for chain in chains]
+        start = _start(sessions, measurements, model)
+        measurements = [about_part(measurement, start.T_mount) for measurement in measurements]
         seconds = clock.lap()
-        before = [_begin(c, start, seconds, r) for c, r in zip(chains, recorders, strict=True)]
+        before = [_begin(c, start, seconds, r) for c, r in zip(measurements, recorders, strict=True)]
         clock.lap()
-        correction, both = fitted_beside(chains, lambda own: _correct(own, start, model, effects, recorders[0]))
+        correction, both = fitted_beside(measurements, lambda own: _correct(own, start, model, effects, recorders[0]))
         seconds = clock.lap()
         place = _Place(start, correction, (), model.effects_file if model else None)
         return [
@@ -88,26 +88,26 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
     recorder = recorder or Silent()
     with library_threads_off():
         clock = Clock()
-        chain = state.chain
+        measurement = state.measurement
         recorder.start(state.session)
         effects = list(dict.fromkeys(effects))
-        require_effects([chain], effects)
+        require_effects([measurement], effects)
         kept = [t for t in state.terms if t.effect.name in effects]
         used = [t.effect.name for t in kept]
         new = [known(name) for name in effects if name not in used]
-        terms = [*kept, *start_values(chain, new, partial(evidence_of_state, state))]
+        terms = [*kept, *start_values(measurement, new, partial(evidence_of_state, state))]
         if not state.session.has_clouds:
-            found = change_labelled(state.session, chain, terms, state.T_mount, state.T_mount_coarse, recorder)
-            found = replace(found, poses_before=corrected(chain, state.terms, state.T_mount).poses(state.T_mount))
+            found = change_labelled(state.session, measurement, terms, state.T_mount, state.T_mount_coarse, recorder)
+            found = replace(found, poses_before=corrected(measurement, state.terms, state.T_mount).poses(state.T_mount))
             return _in_ledger(found, state.ledger, state.effects_file, recorder)
-        start = Coarse(state.T_mount_coarse, part_size([chain.capture]) * COARSE_GATE, "of the first run", ())
-        before = _begin(chain, start, clock.lap(), recorder)
+        start = Coarse(state.T_mount_coarse, part_size([measurement.capture]) * COARSE_GATE, "of the first run", ())
+        before = _begin(measurement, start, clock.lap(), recorder)
         clock.lap()
         correction, both = fitted_beside(
-            [chain], lambda own: refine(own, terms, state.T_mount, [state.gate]).as_correction()
+            [measurement], lambda own: refine(own, terms, state.T_mount, [state.gate]).as_correction()
         )
         place = _Place(start, correction, state.ledger, state.effects_file)
-        poses_before = corrected(chain, state.terms, state.T_mount).poses(state.T_mount)
+        poses_before = corrected(measurement, state.terms, state.T_mount).poses(state.T_mount)
         return _finish(state.session, both[0], 0, place, before, recorder, clock.lap(), poses_before)
 
 
@@ -121,8 +121,8 @@ class _Place:
     effects_file: str | None
 
 
-def _start(sessions: Sequence[Session], chains: Sequence[Chain], model: Model | None) -> Coarse:
-    captures = [chain.capture for chain in chains]
+def _start(sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model | None) -> Coarse:
+    captures = [measurement.capture for measurement in measurements]
     if model:
         return given(captures, model.T_mount, REUSED)
     stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
@@ -130,29 +130,31 @@ def _start(sessions: Sequence[Session], chains: Sequence[Chain], model: Model | 
 
 
 def _correct(
-    chains: Sequence[Chain], start: Coarse, model: Model | None, effects: Sequence[str], recorder: Recorder
+    measurements: Sequence[Measurement], start: Coarse, model: Model | None, effects: Sequence[str], recorder: Recorder
 ) -> Correction:
     """The hand-eye from the scans; with effects, both; with a model, neither is changed."""
-    captures: list[Capture] = [chain.capture for chain in chains]
+    captures: list[Capture] = [measurement.capture for measurement in measurements]
     if model:
-        terms = terms_of(model, chains[0])
-        captures = [corrected(chain, terms, model.T_mount) for chain in chains]
-        return reuse(captures, model, terms, sigmas_of(model, chains[0]))
-    repeating = partial(field_scatters, chains)
+        terms = terms_of(model, measurements[0])
+        captures = [corrected(measurement, terms, model.T_mount) for measurement in measurements]
+        return reuse(captures, model, terms, sigmas_of(model, measurements[0]))
+    repeating = partial(field_scatters, measurements)
     first = correct(captures, start.T_mount, start.gate, recorder, repeating)
     if not effects:
         return first
     T_mount, gates = first.hand_eye.T_mount, [overlaps.gate for overlaps in first.overlaps]
-    chains = [weighed(chain, own.noise_factor) for chain, own in zip(chains, first.captures, strict=True)]
+    measurements = [
+        weighed(measurement, own.noise_factor) for measurement, own in zip(measurements, first.captures, strict=True)
+    ]
     # An event or a time constant is one for the whole rig: the first session says where it begins.
-    evidence = partial(evidence_at, chains[0], (), T_mount, gates[0])
-    terms = start_values(chains[0], [known(name) for name in effects], evidence)
-    return refine(chains, terms, T_mount, gates).as_correction()
+    evidence = partial(evidence_at, measurements[0], (), T_mount, gates[0])
+    terms = start_values(measurements[0], [known(name) for name in effects], evidence)
+    return refine(measurements, terms, T_mount, gates).as_correction()
 
 
-def _begin(chain: Chain, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+def _begin(measurement: Measurement, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
     """How well the views of one session meet under the coarse hand-eye."""
-    own, poses = chain.capture, chain.capture.poses(start.T_mount)
+    own, poses = measurement.capture, measurement.capture.poses(start.T_mount)
     g = collect(own, poses, start.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
     stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
     show(recorder, stage, own, poses, g.rms)
@@ -163,7 +165,7 @@ def _finish(
     session: Session, both: Beside, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float,
     poses_before: Array | None = None,
 ) -> Run:  # fmt: skip
-    result = finish(session, both.chain, index, place.start, place.correction, before, recorder, seconds)
+    result = finish(session, both.measurement, index, place.start, place.correction, before, recorder, seconds)
     if both.found is not None:
         notes = (*result.notes, *beside_notes(both.found, both.outliers, session))
         result = replace(result, labelled=both.found, outliers=both.outliers, notes=notes)

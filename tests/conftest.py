@@ -11,9 +11,9 @@ import pytest
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, part_mesh, simulate
 from stitch import frames
-from stitch.overlap.capture import Capture, place
-from stitch.overlap.scan import prepare_view
-from stitch.threads import library_threads_off
+from stitch.measurement.capture import Capture, place
+from stitch.measurement.scan import prepare_view
+from stitch.system.threads import library_threads_off
 
 # Two test processes that each use all cores would fight for them.
 if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):

@@ -6,9 +6,9 @@ import numpy as np
 
 from data_synth.simulate import Measured
 from data_synth.write import robot_table
-from stitch.reading.cloud import Cloud
-from stitch.robot import robot_from_dh
-from stitch.session import Scanner, Session, View
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Scanner, Session, View
+from stitch.reading.dh_rows import robot_from_dh
 
 
 def session_of(measured: Measured) -> Session:

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.calibrate.axxb import SOLVERS, axis_spread
+from stitch.closed_form.axxb import SOLVERS, axis_spread
 from stitch.errors import NoResultError
 
 

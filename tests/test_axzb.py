@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.calibrate.axzb import SOLVERS, shah
 from stitch.calibrate.refine import refine_axxb, refine_axzb
+from stitch.closed_form.axzb import SOLVERS, shah
 from stitch.errors import NoResultError
 
 NOISE = np.array([1e-3] * 3 + [0.2] * 3)

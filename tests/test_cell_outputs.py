@@ -23,7 +23,7 @@ import viz.cells.window_fit
 import viz.cells.window_seam
 from data_synth.drilling import DrillingCell, Sizes
 from data_synth.drilling_job import write_job
-from stitch.cli import outputs
+from stitch.cells import outputs
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session

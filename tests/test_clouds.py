@@ -7,9 +7,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
-from stitch.native import load_open3d
 from stitch.reading import lzf
 from stitch.reading.clouds import read_cloud
+from stitch.system.native import load_open3d
 
 POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
 

@@ -11,8 +11,8 @@ from stitch.cli import main as cli
 from stitch.controllers.importer import import_file
 from stitch.controllers.taught import fixed_xyz, quaternion_w_first, rotation_vector, zyx
 from stitch.errors import InputError, NoResultError
+from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.views_csv import read_views
-from stitch.robot import robot_from_dh
 
 
 def about(axis, degrees):

@@ -9,17 +9,17 @@ from in_memory import session_of
 from scipy.spatial import cKDTree
 
 from stitch import frames
-from stitch.diagnosis.unknown import course_of
+from stitch.diagnosis.covariate_dependence import course_of
 from stitch.effects import EFFECTS
-from stitch.effects.chain import chain_of
-from stitch.hand_eye import scatter_of
-from stitch.overlap.capture_evidence import jacobian
-from stitch.overlap.free_poses import free_poses
-from stitch.overlap.match import match, overlapping_pairs, sample
-from stitch.overlap.overlaps import collect
-from stitch.overlap.scan import prepare_view
-from stitch.rounding import rounded
-from stitch.solve import assemble, gram, pair_squares
+from stitch.measurement.measurement import measurement_of
+from stitch.measurement.scan import prepare_view
+from stitch.observations.surfaces.capture_evidence import jacobian
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.gram import assemble, gram, pair_squares
+from stitch.observations.surfaces.hand_eye import scatter_of
+from stitch.observations.surfaces.match import match, overlapping_pairs, sample
+from stitch.observations.surfaces.overlaps import collect
+from stitch.units import rounded
 
 
 @pytest.fixture(scope="module")
@@ -158,18 +158,20 @@ def test_numbers_end_where_their_sigma_begins():
 def test_an_intensity_that_is_not_finite_counts_as_none(cell, wrong):
     measured, capture = cell
     session = session_of(measured)
-    assert chain_of(session, capture).has_intensity
+    assert measurement_of(session, capture).has_intensity
     assert session.views[1].cloud is not None
     session.views[1].cloud.scalars["intensity"] = np.full(len(session.views[1].cloud.points), 0.5)
     session.views[1].cloud.scalars["intensity"][3] = wrong
-    chain = chain_of(session, capture)
-    assert not chain.has_intensity and chain.lacks(EFFECTS["intensity_bias"]) == ("intensity",)
+    measurement = measurement_of(session, capture)
+    assert not measurement.has_intensity and measurement.lacks(EFFECTS["intensity_bias"]) == ("intensity",)
 
 
 def test_what_a_covariate_is_called_does_not_make_it_a_joint(cell):
     measured, capture = cell
     tilt = np.arange(5.0)
-    views = replace(chain_of(session_of(measured), capture).views, covariates={"jig_deg": tilt, "j_deg": 2 * tilt})
+    views = replace(
+        measurement_of(session_of(measured), capture).views, covariates={"jig_deg": tilt, "j_deg": 2 * tilt}
+    )
     assert np.array_equal(course_of(views, "jig_deg"), tilt) and np.array_equal(course_of(views, "j_deg"), 2 * tilt)
     assert np.allclose(course_of(views, "j2_deg"), np.degrees(measured.plan.joints[:, 1]))
 
@@ -180,9 +182,9 @@ def test_what_a_covariate_is_called_does_not_make_it_a_joint(cell):
 def test_a_scanner_that_looks_along_minus_z_has_the_same_errors(cell, name):
     """Turning the scanner's frame by 180° about x turns every effect of the scanner with it."""
     measured, capture = cell
-    chain, effect, turn = chain_of(session_of(measured), capture), EFFECTS[name], np.diag([1.0, -1.0, -1.0])
-    arguments = chain.arguments(effect, np.array([p.typical for p in chain.parameters(effect)]))
+    measurement, effect, turn = measurement_of(session_of(measured), capture), EFFECTS[name], np.diag([1.0, -1.0, -1.0])
+    arguments = measurement.arguments(effect, np.array([p.typical for p in measurement.parameters(effect)]))
     points = capture.scans[0].points
-    moved = effect.function(points, chain.scan_views[0], **arguments)
+    moved = effect.function(points, measurement.scan_views[0], **arguments)
     assert np.abs(moved - points).max() > 1e-3
-    assert np.allclose(effect.function(points @ turn, chain.scan_views[0], **arguments) @ turn, moved, atol=1e-12)
+    assert np.allclose(effect.function(points @ turn, measurement.scan_views[0], **arguments) @ turn, moved, atol=1e-12)

@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from stitch.diagnosis.detectable import least_noncentrality
-from stitch.diagnosis.freedom import freedom_of
-from stitch.diagnosis.thresholds import ALPHA_NAME, GAIN
-from stitch.variance import Evidence, VarianceFit, fit_variances
+from stitch.diagnosis.selection.thresholds import ALPHA_NAME, GAIN
+from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.statistics.satterthwaite import satterthwaite
+from stitch.statistics.variance_components import Evidence, VarianceFit, fit_variances
 
 GROUPS = (30, 20, 500)
 
@@ -29,7 +29,7 @@ def test_a_group_of_numbers_knows_its_own_variance(share, expected):
     white = np.zeros((1, sum(GROUPS), 1))
     white[0, :2, 0] = np.sqrt((1 - share) / 2) * np.array([1, -1])
     white[0, 30:32, 0] = np.sqrt(share / 2) * np.array([1, -1])
-    assert freedom_of(evidence, null).of(white) == pytest.approx(expected, rel=1e-6)
+    assert satterthwaite(evidence, null).of(white) == pytest.approx(expected, rel=1e-6)
 
 
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
@@ -49,8 +49,8 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     free = columns - A @ np.linalg.lstsq(A, columns, rcond=None)[0]
     plausible = Evidence(np.zeros((1, n)), A[None], components[:, None])
     unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
-    freedom = freedom_of(plausible, unit).of(free[None])
-    least = least_noncentrality(free * 2.0, 1.0, tests, n - 1 - p, freedom)
+    degrees_of_freedom = satterthwaite(plausible, unit).of(free[None])
+    least = least_noncentrality(free * 2.0, 1.0, tests, n - 1 - p, degrees_of_freedom)
     theta = np.ones(p) * np.sqrt(least) / np.linalg.norm(free.sum(axis=1))
     shown = 0
     for _ in range(draws):

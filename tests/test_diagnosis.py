@@ -17,17 +17,17 @@ from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch import frames
 from stitch.cli.main import main
-from stitch.diagnosis.compare import compare
-from stitch.diagnosis.document import diagnosis_document
-from stitch.diagnosis.heldout import null_left
-from stitch.diagnosis.start import evidence_of_state
-from stitch.effects.supported import left_at_zero, supported
-from stitch.effects.visible import independent
+from stitch.comparison.compare_surfaces import compare
+from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.diagnosis.validation.cross_validation import present_square
 from stitch.errors import InputError
-from stitch.folds import grouped_folds, joint_ends
 from stitch.pipeline import run
-from stitch.state import load_state, state_of
-from stitch.variance import Evidence, at_variances, fit_variances
+from stitch.statistics.folds import grouped_folds, joint_ends
+from stitch.statistics.identifiability import independent
+from stitch.statistics.parameter_selection import omitted_rms, supported
+from stitch.statistics.variance_components import Evidence, at_variances, fit_variances
+from stitch.stored.load_state import load_state, state_of
+from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 
 
@@ -55,7 +55,7 @@ def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     assert after.heldout_rms < before.heldout_rms
     assert [s.effects for s in after.ledger] == [(), (name,)]
     # What the linear prediction promised comes true when everything is fitted and matched anew.
-    left = next(s.left for s in found.suspects if s.name == name)
+    left = next(s.cross_validation for s in found.candidates if s.name == name)
     assert after.residual_rms == pytest.approx(before.residual_rms * np.sqrt(left.inside), rel=0.15)
     # The truth, which no overlap knows, comes nearer too: a fit that borrows from the hand-eye would not show above.
     errors = [frames.log(frames.inverse(measured.T_mount) @ r.T_mount)[3:] for r in (before, after)]
@@ -65,7 +65,7 @@ def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     term, sigmas = after.terms[0], after.sigmas[0]
     z = [
         (value - measured.hidden[name].get(p.name, 0.0)) / sigma
-        for p, value, sigma in zip(after.chain.parameters(term.effect), term.values, sigmas, strict=True)
+        for p, value, sigma in zip(after.measurement.parameters(term.effect), term.values, sigmas, strict=True)
         if np.isfinite(sigma) and not p.grid
     ]
     assert np.max(np.abs(z)) < 4.0
@@ -192,12 +192,12 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
         own, further, size = rng.standard_normal((12, 2)), 0.4 * rng.standard_normal((12, 1)), rng.uniform(0.2, 3)
         amplitude = size * rng.standard_normal() * rng.integers(0, 2)
         z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
-        told.append(left_at_zero(own, further, z, np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
+        told.append(omitted_rms(own, further, z, np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
         true.append(amplitude**2 / size**2)
     apart = np.array(told) - true
     assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
     # Beside a column that is fitted and says the same nothing is known of it but its size.
-    same = left_at_zero(own, np.tile(further, 2), z, np.full(2, 0.3), np.array([True, False]))
+    same = omitted_rms(own, np.tile(further, 2), z, np.full(2, 0.3), np.array([True, False]))
     np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)
 
 
@@ -240,7 +240,7 @@ def test_prediction_of_the_null_is_the_present_residual():
     _, result = blade_run(6, {})
     evidence = evidence_of_state(state_of(result))
     g = evidence.freed.overlaps.gram
-    assert np.sqrt(null_left(evidence) / g.weight.sum()) == pytest.approx(result.residual_rms, rel=0.15)
+    assert np.sqrt(present_square(evidence) / g.weight.sum()) == pytest.approx(result.residual_rms, rel=0.15)
 
 
 @pytest.fixture(scope="module")

@@ -11,17 +11,17 @@ from in_memory import session_of
 from stitch import frames
 from stitch.cli.main import main
 from stitch.effects import EFFECTS
-from stitch.effects.chain import Term, chain_of
-from stitch.effects.slopes import shifts, twists
-from stitch.effects.terms import fitted_of, known, require, sigmas_of, terms_of
-from stitch.effects.undo import corrected, placed
 from stitch.effects.user_file import load
 from stitch.errors import InputError
-from stitch.model import Model
-from stitch.overlap.capture import capture
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.robot import forward, forward_with_errors, unit_torques
+from stitch.model.forward import corrected, placed
+from stitch.model.jacobian import shifts, twists
+from stitch.model.model_toml import Model
+from stitch.model.terms import fitted_of, known, require, sigmas_of, terms_of
 from stitch.pipeline import run_rig
-from stitch.rig import require_effects
-from stitch.robot import forward, forward_with_errors, unit_torques
+from stitch.stages.rig import require_effects
 
 # Amplitude 1 is a tenth of a millimetre; a hundredth of that must remain: second-order terms are smaller still.
 _LEFT = 0.03
@@ -39,7 +39,7 @@ def cells():
 
 def chain_for(measured):
     session = session_of(measured)
-    return chain_of(session, capture(session))
+    return measurement_of(session, capture(session))
 
 
 def hidden(name, mount):
@@ -57,13 +57,13 @@ RIGID = [
 def test_undoing_an_effect_gives_natures_poses(cells, name, mount):
     """The model with nature's own parameters places every view where it truly was."""
     measured = hidden(name, mount)
-    chain = chain_for(measured)
+    measurement = chain_for(measured)
     told = measured.hidden[name]
     effect = EFFECTS[name]
-    values = np.array([told.get(p.name, 0.0) for p in chain.parameters(effect)])
-    left, right = placed(chain, [Term(effect, values)])
+    values = np.array([told.get(p.name, 0.0) for p in measurement.parameters(effect)])
+    left, right = placed(measurement, [Term(effect, values)])
     poses = left @ measured.T_mount @ right
-    plain, still = placed(chain, [])
+    plain, still = placed(measurement, [])
     middle = np.array([[0.0, 0.0, 420.0]])
     truth = frames.transform(measured.T_reference_scanner, middle)
     off = np.linalg.norm(frames.transform(poses, middle) - truth, axis=-1).max()
@@ -78,10 +78,10 @@ def test_undoing_an_effect_gives_natures_poses(cells, name, mount):
 def test_undoing_a_scanner_effect_gives_the_true_points(name):
     """Same seed with and without: the corrected points are those of the cell without the effect."""
     plain, bent = hidden_pair(name, "eye_to_hand")
-    chain = chain_for(bent)
+    measurement = chain_for(bent)
     effect = EFFECTS[name]
-    values = np.array([bent.hidden[name][p.name] for p in chain.parameters(effect)])
-    mended = corrected(chain, [Term(effect, values)], bent.T_mount)
+    values = np.array([bent.hidden[name][p.name] for p in measurement.parameters(effect)])
+    mended = corrected(measurement, [Term(effect, values)], bent.T_mount)
     for scan, true, wrong in zip(mended.scans, plain.clouds, bent.clouds, strict=True):
         before = np.abs(wrong.points - true.points).max()
         assert np.abs(scan.points - true.points).max() <= _LEFT * before + 1e-9
@@ -95,16 +95,16 @@ def hidden_pair(name, mount):
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.place in ("robot", "links", "mount", "part")])
 def test_twists_are_the_derivative_of_the_poses(cells, name):
     """Central differences of half the size about the same place, by another route: a point carried along."""
-    chain = chain_for(cells["eye_to_hand"])
+    measurement = chain_for(cells["eye_to_hand"])
     effect = EFFECTS[name]
-    if chain.lacks(effect):
-        pytest.skip(f"needs {chain.lacks(effect)}")
-    parameters = chain.parameters(effect)
+    if measurement.lacks(effect):
+        pytest.skip(f"needs {measurement.lacks(effect)}")
+    parameters = measurement.parameters(effect)
     # A twist that is zero hides its time constant: begin where it is not.
     values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
     T = cells["eye_to_hand"].T_mount
     centre = np.array([5.0, -3.0, 80.0])
-    slopes = twists(chain, [], Term(effect, values), T, centre)
+    slopes = twists(measurement, [], Term(effect, values), T, centre)
     point = np.array([10.0, 20.0, 120.0])
     for i, parameter in enumerate(parameters):
         if parameter.discrete:
@@ -113,8 +113,8 @@ def test_twists_are_the_derivative_of_the_poses(cells, name):
         h = (0.001 if parameter.grid else 0.01) * parameter.typical
         carried = []
         for sign in (1, -1):
-            left, right = placed(chain, [Term(effect, values + sign * h * np.eye(len(values))[i])])
-            left0, right0 = placed(chain, [Term(effect, values)])
+            left, right = placed(measurement, [Term(effect, values + sign * h * np.eye(len(values))[i])])
+            left0, right0 = placed(measurement, [Term(effect, values)])
             carried.append(frames.transform(left @ T @ right @ frames.inverse(left0 @ T @ right0), point[None])[:, 0])
         expected = (carried[0] - carried[1]) / (2 * h)
         predicted = slopes[i][:, 3:] + np.cross(slopes[i][:, :3], point - centre)
@@ -127,19 +127,19 @@ def test_twists_are_the_derivative_of_the_poses(cells, name):
 def test_point_slopes_are_minus_what_nature_does(cells, name):
     """To first order the correction is the negative of the effect itself."""
     measured = cells["eye_to_hand"]
-    chain = chain_for(measured)
+    measurement = chain_for(measured)
     effect = EFFECTS[name]
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
-    slopes = shifts(chain, [], Term(effect, np.zeros(len(chain.parameters(effect)))), 2, pose, index)
-    view = chain.scan_views[2]
+    slopes = shifts(measurement, [], Term(effect, np.zeros(len(measurement.parameters(effect)))), 2, pose, index)
+    view = measurement.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
-    points = chain.capture.scans[2].points[index]
+    points = measurement.capture.scans[2].points[index]
     at = frames.transform(pose, points) if effect.place == "shape" else points
-    for i, parameter in enumerate(chain.parameters(effect)):
+    for i, parameter in enumerate(measurement.parameters(effect)):
         h = 1e-3 * parameter.typical
         values = h * np.eye(len(slopes))[i]
-        moved = (effect.function(at, view, **chain.arguments(effect, values)) - at) / h
+        moved = (effect.function(at, view, **measurement.arguments(effect, values)) - at) / h
         expected = -frames.rotate(frames.inverse(pose), moved) if effect.place == "shape" else -moved
         assert np.allclose(slopes[i], expected, rtol=1e-2, atol=1e-6 * np.abs(expected).max())
 
@@ -147,7 +147,7 @@ def test_point_slopes_are_minus_what_nature_does(cells, name):
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 def test_wrong_rows_are_another_arm(convention):
     """Errors of DH rows give the same pose as an arm built with those rows."""
-    from stitch.robot import robot_from_dh
+    from stitch.reading.dh_rows import robot_from_dh
 
     rng = np.random.default_rng(0)
     rows = [{"a": float(rng.uniform(0, 400)), "alpha_deg": float(rng.uniform(-90, 90)), "d": float(rng.uniform(0, 300)),
@@ -264,18 +264,18 @@ def placed_session(cells):
     return session, capture(session)
 
 
-def fitted(chain, name):
+def fitted(measurement, name):
     """A model in which every parameter of an effect has a value and a sigma of its own."""
-    size = len(chain.parameters(EFFECTS[name]))
+    size = len(measurement.parameters(EFFECTS[name]))
     values, sigmas = np.arange(1.0, size + 1) * 1e-6, np.arange(1.0, size + 1) * 1e-8
-    told = fitted_of(chain, [Term(EFFECTS[name], values)], [sigmas])
+    told = fitted_of(measurement, [Term(EFFECTS[name], values)], [sigmas])
     return Model("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), told), values, sigmas
 
 
 def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(placed_session):
     """Fitted on views that move all joints, used on views that move the wrist alone: every coefficient still bends."""
     session, own = placed_session
-    full, wrist = (chain_of(s, own) for s in (massless(session), wrist_only(massless(session))))
+    full, wrist = (measurement_of(s, own) for s in (massless(session), wrist_only(massless(session))))
     model, values, sigmas = fitted(full, "joint_compliance")
     (term,) = terms_of(model, wrist)
     np.testing.assert_array_equal(term.values, values)
@@ -290,13 +290,13 @@ def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(pla
 
 def test_what_a_model_knows_is_never_dropped_or_read_in_another_unit(placed_session):
     session, own = placed_session
-    with_masses, bare = (chain_of(s, own) for s in (session, massless(session)))
+    with_masses, bare = (measurement_of(s, own) for s in (session, massless(session)))
     for there, here in ((with_masses, bare), (bare, with_masses)):
         with pytest.raises(InputError, match="the model's joint_compliance has c.*link masses") as error:
             terms_of(fitted(there, "joint_compliance")[0], here)
         assert "\n" not in str(error.value)
     for name, column in (("part_growth", "part_temperature_c"), ("robot_thermal_growth", "robot_temperature_c")):
-        warm, timed = with_masses, chain_of(without(session, column), own)
+        warm, timed = with_masses, measurement_of(without(session, column), own)
         assert all(p.unit.endswith("/°C") for p in warm.parameters(EFFECTS[name]))
         assert all(p.unit.endswith("/h") for p in timed.parameters(EFFECTS[name]))
         for there, here in ((warm, timed), (timed, warm)):
@@ -308,7 +308,7 @@ def test_what_a_model_knows_is_never_dropped_or_read_in_another_unit(placed_sess
 def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_session):
     session, own = placed_session
     bare = massless(session)
-    require_effects([chain_of(s, own) for s in (bare, wrist_only(bare))], ["joint_compliance"])
+    require_effects([measurement_of(s, own) for s in (bare, wrist_only(bare))], ["joint_compliance"])
     for others, effect, told in (
         ((session, bare), "joint_compliance", r"do not share c1 \(rad/\(N m\)\)"),
         ((session, without(session, "part_temperature_c")), "part_growth", r"do not share .*g \(1/h\)"),
@@ -318,4 +318,4 @@ def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_sessio
         with pytest.raises(InputError, match=told):
             run_rig(rig, effects=[effect])
         with pytest.raises(InputError, match=told):
-            run_rig(rig, fitted(chain_of(session, own), effect)[0])
+            run_rig(rig, fitted(measurement_of(session, own), effect)[0])

@@ -11,36 +11,37 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stitch.calibrate.robot import calibrated, dh_rows
+from stitch.calibrate.robot_calibration import calibrated, dh_rows
 from stitch.cli.main import main
 from stitch.diagnosis import candidates
-from stitch.diagnosis.beyond import beyond
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.design.candidate_views import candidate_measurement
 from stitch.diagnosis.diagnose import diagnose
-from stitch.diagnosis.hold import idle_effect
-from stitch.diagnosis.imagined import imagined_chain
-from stitch.diagnosis.ranking import certain, rank
+from stitch.diagnosis.initial_values import evidence_of_state
 from stitch.diagnosis.score import score
-from stitch.diagnosis.start import evidence_of_state
-from stitch.diagnosis.suggest import suggest
-from stitch.effects.chain import Term, chain_of
+from stitch.diagnosis.selection.backward_elimination import eliminated_effect
+from stitch.diagnosis.selection.ranking import certain, rank
+from stitch.diagnosis.validation.extrapolation import extrapolation
 from stitch.effects.contract import EFFECTS
-from stitch.effects.slopes import target_shifts
-from stitch.effects.undo import corrected, shift_targets
 from stitch.errors import InputError
-from stitch.labelled.landmarks import settled
-from stitch.labelled.rows import effect_rows, rows_of
-from stitch.labelled.start import closed_form
-from stitch.overlap.capture import capture
+from stitch.measurement.capture import capture
+from stitch.measurement.labelled_points import Sighting
+from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.robot import forward
+from stitch.measurement.session import Scanner, Session, View
+from stitch.model.forward import corrected, shift_targets
+from stitch.model.jacobian import target_shifts
+from stitch.observations.targets.closed_form import closed_form
+from stitch.observations.targets.landmarks import initial_landmarks
+from stitch.observations.targets.rows import effect_rows, rows_of
 from stitch.pipeline import run
-from stitch.reading.points_csv import Sighting
+from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.session_folder import load_session
 from stitch.reading.urdf import robot_from_urdf
-from stitch.robot import forward, robot_from_dh
-from stitch.session import Scanner, Session, View
-from stitch.state import state_of
-from stitch.urdf_write import to_urdf
+from stitch.stepwise import suggest
+from stitch.stored.load_state import state_of
 from stitch.writing.result_document import model_of
+from stitch.writing.urdf_file import to_urdf
 
 ROWS = [
     {"a": 0, "alpha_deg": -90, "d": 290}, {"a": 270, "alpha_deg": 0, "d": 0, "theta_deg": -90},
@@ -186,19 +187,19 @@ def test_fit_equals_scipy_least_squares_where_all_rows_weigh_alike():
 
 def test_rows_are_the_slopes_of_what_is_left():
     session, T_mount, *_ = cell(1, views=6, scatter=(0, 0), noise=1e-9)
-    chain = chain_of(session, capture(session))
+    measurement = measurement_of(session, capture(session))
     for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
         effect = EFFECTS[name]
-        if chain.lacks(effect):
+        if measurement.lacks(effect):
             continue
-        zero = Term(effect, np.zeros(len(chain.parameters(effect))))
-        landmarks = settled(chain.capture, T_mount)
-        rows = rows_of(chain.capture, T_mount, landmarks)
-        slopes = effect_rows(rows, chain, (), zero)
-        for i, parameter in enumerate(chain.parameters(effect)):
+        zero = Term(effect, np.zeros(len(measurement.parameters(effect))))
+        landmarks = initial_landmarks(measurement.capture, T_mount)
+        rows = rows_of(measurement.capture, T_mount, landmarks)
+        slopes = effect_rows(rows, measurement, (), zero)
+        for i, parameter in enumerate(measurement.parameters(effect)):
             step = 0.01 * parameter.typical
-            both = [rows_of(corrected(chain, [replace(zero, values=s * step * np.eye(len(zero.values))[i])], T_mount),
-                            T_mount, landmarks).left for s in (1, -1)]  # fmt: skip
+            both = [rows_of(corrected(measurement, [replace(zero, values=s * step * np.eye(len(zero.values))[i])], T_mount),
+                            T_mount, landmarks).residual for s in (1, -1)]  # fmt: skip
             numeric = (both[0] - both[1]) / (2 * step)
             scale = max(np.abs(numeric).max(), 1e-12)
             np.testing.assert_allclose(
@@ -209,11 +210,11 @@ def test_rows_are_the_slopes_of_what_is_left():
 def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
     # The last joint's offset must not borrow from what is left, however large that is.
     session, T_mount, *_ = cell(1, views=12, scatter=(1e-3, 1.0))
-    chain = chain_of(session, capture(session))
+    measurement = measurement_of(session, capture(session))
     term = Term(EFFECTS["joint_offset"], np.zeros(6))
-    rows = rows_of(chain.capture, T_mount, settled(chain.capture, T_mount))
-    column = effect_rows(rows, chain, (), term)[..., 5].ravel()
-    landmarks = rows.landmarks.reshape(rows.left.size, -1)
+    rows = rows_of(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
+    column = effect_rows(rows, measurement, (), term)[..., 5].ravel()
+    landmarks = rows.landmarks.reshape(rows.residual.size, -1)
     left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
     assert np.abs(left).max() < 1e-6 * np.abs(column).max()
 
@@ -227,7 +228,7 @@ def test_a_hidden_joint_offset_is_named_and_found():
     after = before.add("joint_offset")
     assert after.heldout_rms < 0.2 * before.heldout_rms
     values = dict(
-        zip([p.name for p in after.chain.parameters(after.terms[0].effect)], after.terms[0].values, strict=True)
+        zip([p.name for p in after.measurement.parameters(after.terms[0].effect)], after.terms[0].values, strict=True)
     )
     for name, true in zip(("d2", "d3", "d5"), offset[[1, 2, 4]], strict=True):
         assert values[name] == pytest.approx(true, abs=2e-4)
@@ -254,7 +255,7 @@ def stands(session, name):
     """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
     evidence = evidence_of_state(state_of(run(session)))
     own = rank([score(evidence, candidate_of(evidence, EFFECTS[name]))])[0][0]
-    return certain(own), beyond(evidence, own.score)
+    return certain(own), extrapolation(evidence, own.score)
 
 
 def test_a_gear_error_of_a_joint_that_was_driven_everywhere_helps_at_left_out_ends_too():
@@ -290,9 +291,9 @@ def test_gear_errors_that_imitate_another_error_are_told_by_left_out_ends():
 def test_an_effect_that_another_made_idle_is_dropped():
     session, *_ = cell(12, views=100, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), targets=TARGETS[:2])
     state = state_of(run(session, effects=["gear_eccentricity", "joint_offset"]))
-    name, reason = idle_effect(state, {"gear_eccentricity", "joint_offset"})
+    name, reason = eliminated_effect(state, {"gear_eccentricity", "joint_offset"})
     assert name == "gear_eccentricity", reason
-    assert idle_effect(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
+    assert eliminated_effect(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
 
 
 def test_an_honest_cell_is_adequate():
@@ -368,15 +369,15 @@ def test_every_command_works(kind, tmp_path, capsys, monkeypatch, few_effects):
     assert second["heldout_rms"] < first["heldout_rms"]
     # The model of one run judges other poses of the rig without fitting anything.
     other, *_ = cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
-    judged = json.loads(
+    evaluate = json.loads(
         stitch("run", str(written(tmp_path / "o", other, kind)), "--hand-eye", out, "-o", str(tmp_path / "q"), "--json")
     )
     assert (
-        judged["hand_eye"] == second["hand_eye"]
-        and judged["targets"][0]["position"] == second["targets"][0]["position"]
+        evaluate["hand_eye"] == second["hand_eye"]
+        and evaluate["targets"][0]["position"] == second["targets"][0]["position"]
     )
-    assert judged["targets"][0]["sigma"] == second["targets"][0]["sigma"]
-    assert judged["residual_rms"] == pytest.approx(second["residual_rms"], rel=0.05)
+    assert evaluate["targets"][0]["sigma"] == second["targets"][0]["sigma"]
+    assert evaluate["residual_rms"] == pytest.approx(second["residual_rms"], rel=0.05)
     stitch("drop", out, "joint_offset")
     stitch("add", out, "--suggested", "--no-recording")
     assert "joint_offset" in json.loads((tmp_path / "r" / "result.json").read_text())["effects"]
@@ -407,16 +408,18 @@ def test_rows_and_urdf_place_the_flange_as_the_chain_does(convention, tmp_path):
     views = tuple(replace(v, T_base_flange=forward(nominal, v.joints)) for v in session.views)
     session = replace(session, robot=nominal, views=views)
     found = run(session)
-    terms = [Term(EFFECTS[name], rng.normal(size=len(found.chain.parameters(EFFECTS[name]))) * size)
+    terms = [Term(EFFECTS[name], rng.normal(size=len(found.measurement.parameters(EFFECTS[name]))) * size)
              for name, size in (("joint_offset", 1e-3), ("link_geometry", 1e-3))]  # fmt: skip
     arm = calibrated(replace(found, terms=tuple(terms))).robot
     (tmp_path / "a.urdf").write_text(to_urdf(arm))
     urdf = robot_from_urdf(tmp_path / "a.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
     rows = robot_from_dh("arm", convention, dh_rows(arm), None, np.array([0, 0, -9.81]), "mm")
-    own = corrected(found.chain, terms, found.T_mount)
+    own = corrected(found.measurement, terms, found.T_mount)
     T_base_flange = np.linalg.inv(own.T_reference_mount)
     for robot in (urdf, rows):
-        np.testing.assert_allclose(forward(robot, found.chain.views.joints), T_base_flange, atol=1e-6)  # mm: 1e-9 m
+        np.testing.assert_allclose(
+            forward(robot, found.measurement.views.joints), T_base_flange, atol=1e-6
+        )  # mm: 1e-9 m
 
 
 BROKEN = [
@@ -466,7 +469,7 @@ def test_growth_is_found_wherever_the_part_is_held(mount):
     assert diagnose(state_of(found)).effects == ("part_growth",)
     found = run(session, effects=["part_growth"])
     values, sigmas = found.terms[0].values, found.sigmas[0]
-    true = 2e-4 * np.append(1.0, found.chain.target_views[0].origin - still)
+    true = 2e-4 * np.append(1.0, found.measurement.target_views[0].origin - still)
     assert (sigmas < [1e-5, 2e-3, 2e-3, 2e-3]).all()  # mm: a quarter of the motion of the middle
     assert (np.abs(values - true) < 4 * sigmas).all()
 
@@ -475,7 +478,7 @@ def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
     """Offsets of the smallest detectable size, put into the same measurements joint by joint."""
     session, *_ = cell(5)
     found = run(session)
-    suspect = next(s for s in diagnose(state_of(found)).suspects if s.name == "joint_offset")
+    suspect = next(s for s in diagnose(state_of(found)).candidates if s.name == "joint_offset")
     sizes = [min(suspect.detectable.get(f"d{i + 1}", np.inf), 1e-3) for i in range(6)]
     middle = np.mean([v.sighting.points.mean(axis=0) for v in session.views], axis=0)
     pushed = []
@@ -500,8 +503,8 @@ def test_views_not_taken_yet_come_after_those_that_were():
     session, *_ = cell(2, views=9, grown=(0.0, 0.0))
     speeds = {f"j{i + 1}_velocity_deg_s": 5.0 for i in range(6)}
     session = replace(session, views=tuple(replace(v, covariates=v.covariates | speeds) for v in session.views))
-    chain = chain_of(session, capture(session))
-    later = imagined_chain(chain, chain.views.joints[:3] + 0.1).views
+    measurement = measurement_of(session, capture(session))
+    later = candidate_measurement(measurement, measurement.views.joints[:3] + 0.1).views
     warmth = [v.covariates["part_temperature_c"] for v in session.views]
     np.testing.assert_allclose(later.since_first("part_temperature_c"), warmth[-1] - warmth[0])
     assert EFFECTS["part_slip"].function(later, xi=np.ones(6), v=8.0).all()
@@ -517,8 +520,8 @@ def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):
 
 def test_slopes_of_shifts_are_linear_in_small_steps():
     session, T_mount, *_ = cell(1, views=4)
-    chain = chain_of(session, capture(session))
+    measurement = measurement_of(session, capture(session))
     term = Term(EFFECTS["range_scale"], np.zeros(1))
-    poses = chain.capture.poses(T_mount)
-    moved = shift_targets(chain, [replace(term, values=np.array([1e-4]))], poses)
-    np.testing.assert_allclose(moved, 1e-4 * target_shifts(chain, (), term, poses)[0], rtol=1e-3)
+    poses = measurement.capture.poses(T_mount)
+    moved = shift_targets(measurement, [replace(term, values=np.array([1e-4]))], poses)
+    np.testing.assert_allclose(moved, 1e-4 * target_shifts(measurement, (), term, poses)[0], rtol=1e-3)

@@ -14,17 +14,17 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
-from stitch.effects.chain import Term, chain_of
-from stitch.effects.columns import point_gram
 from stitch.effects.contract import EFFECTS
-from stitch.effects.undo import corrected
-from stitch.overlap.capture import capture
-from stitch.overlap.free_poses import answer, free_poses
-from stitch.overlap.target_pairs import joined, target_pairs
+from stitch.measurement.capture import capture
+from stitch.measurement.labelled_points import Sighting
+from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.sightings import Sightings
+from stitch.model.forward import corrected
+from stitch.observations.surfaces.free_poses import answer, free_poses
+from stitch.observations.surfaces.gram import Gram, assemble
+from stitch.observations.surfaces.point_effects import point_gram
+from stitch.observations.surfaces.target_pairs import joined, target_pairs
 from stitch.pipeline import run
-from stitch.reading.points_csv import Sighting
-from stitch.sightings import Sightings
-from stitch.solve import Gram, assemble
 
 VIEWS = 12
 
@@ -228,16 +228,16 @@ def test_a_wrong_point_is_found_and_listed_and_pulls_nothing():
 
 def test_sums_of_targets_are_the_slopes_of_what_sets_them_apart():
     session = mixed(plate(0))
-    chain = chain_of(session, capture(session))
+    measurement = measurement_of(session, capture(session))
     T_mount = plate(0).T_mount
-    own = chain.capture
+    own = measurement.capture
     freed = free_poses(own, own.poses(T_mount), 2.0)
     term = Term(EFFECTS["range_scale"], np.zeros(1))
-    sums, g = point_gram(chain, (), [term], freed), freed.overlaps.gram
-    step = 0.01 * chain.parameters(term.effect)[0].typical
+    sums, g = point_gram(measurement, (), [term], freed), freed.overlaps.gram
+    step = 0.01 * measurement.parameters(term.effect)[0].typical
     pulls, squares = [], []
     for sign in (1, -1):
-        moved = corrected(chain, [replace(term, values=np.array([sign * step]))], T_mount)
+        moved = corrected(measurement, [replace(term, values=np.array([sign * step]))], T_mount)
         pairs = target_pairs(moved.sightings, freed.poses)
         both = joined(no_surface(VIEWS, g.centre, g.variance), pairs, 1.0)
         pulls.append(both.vector[both.labelled])

@@ -17,7 +17,7 @@ def run_python(code: str) -> str:
 def test_open3d_loads_and_computes():
     extent = run_python("""
         import numpy as np
-        from stitch.native import load_open3d
+        from stitch.system.native import load_open3d
         o3d = load_open3d()
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array([[0.0, 0, 0], [1, 2, 3]])))
         print(*cloud.get_axis_aligned_bounding_box().get_extent())
@@ -26,11 +26,11 @@ def test_open3d_loads_and_computes():
 
 
 def test_importing_stitch_does_not_import_open3d():
-    assert run_python("import sys, stitch.native, stitch.pipeline; print('open3d' in sys.modules)") == "False"
+    assert run_python("import sys, stitch.system.native, stitch.pipeline; print('open3d' in sys.modules)") == "False"
 
 
 def test_second_call_gives_the_same_module():
-    assert run_python("from stitch.native import load_open3d; print(load_open3d() is load_open3d())") == "True"
+    assert run_python("from stitch.system.native import load_open3d; print(load_open3d() is load_open3d())") == "True"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads which libraries are mapped from /proc")
@@ -43,7 +43,7 @@ def test_packaged_libusb_serves_where_the_system_has_none():
                 raise OSError("as on a machine without libusb")
             return real(name, *args, **kwargs)
         ctypes.CDLL = bare
-        from stitch.native import load_open3d
+        from stitch.system.native import load_open3d
         load_open3d()
         print(*{line.split()[-1] for line in open("/proc/self/maps") if "libusb-1.0" in line}, sep="\\n")
     """)

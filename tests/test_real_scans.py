@@ -8,10 +8,10 @@ import pytest
 
 from stitch import frames
 from stitch.cli.main import main
-from stitch.model import read_model
-from stitch.overlap.capture import capture
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import collect
+from stitch.measurement.capture import capture
+from stitch.model.model_toml import read_model
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 

@@ -5,8 +5,9 @@ import pytest
 
 from stitch import frames
 from stitch.errors import InputError
+from stitch.measurement.robot import forward, gravity_torques, jacobian, joint_axes, link_frames
+from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.urdf import robot_from_urdf, to_urdf
-from stitch.robot import forward, gravity_torques, jacobian, joint_axes, link_frames, robot_from_dh
 
 ROWS = [
     {"a": 350, "alpha_deg": -90, "d": 815, "theta_deg": 0, "mass": 120, "com": [-175, 20, 10]},

@@ -13,13 +13,13 @@ from data_synth.write import write_session
 from stitch.cli import change as change_command
 from stitch.cli.main import main
 from stitch.errors import NoResultError
-from stitch.model import read_model
+from stitch.model.model_toml import read_model
 from stitch.pipeline import run as stitched
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
-from stitch.result import Step
-from stitch.state import load_state, state_of
-from stitch.stored import stored_run
+from stitch.runs.run import Step
+from stitch.stored.load_state import load_state, state_of
+from stitch.stored.stored_run import stored_run
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
 from viz import report, sections

@@ -9,9 +9,9 @@ from scipy.stats import chi2
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames, pipeline
-from stitch.diagnosis.start import evidence_of_state
-from stitch.effects.scanner_field import field_scatter
-from stitch.state import state_of
+from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.stored.load_state import state_of
 
 SEEDS = 2
 
@@ -44,6 +44,6 @@ def test_what_incidence_shows_is_not_laid_on_the_field():
     scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
     measured = simulate(replace(scene, scanner=scanner), {}, 3, views=10)
     evidence = evidence_of_state(state_of(pipeline.run(session_of(measured))))
-    shown, unit = (field_scatter(evidence.chain, evidence.freed, share) for share in (None, 1.0))
+    shown, unit = (field_scatter(evidence.measurement, evidence.freed, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
     assert np.max(shares[:-1]) < 0.2

@@ -17,10 +17,11 @@ from stitch import frames
 from stitch.cli.main import main
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
-from stitch.model import Model, read_model, write_model
+from stitch.measurement.robot import forward
+from stitch.model.model_toml import Model, read_model, write_model
 from stitch.pipeline import run
+from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.session_folder import load_session
-from stitch.robot import forward, robot_from_dh
 
 
 @pytest.fixture

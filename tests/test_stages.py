@@ -6,15 +6,15 @@ from conftest import blade_mesh, disturbed, synthetic
 
 from stitch import frames
 from stitch.errors import NoResultError
-from stitch.native import load_open3d
-from stitch.observability import unobservable
-from stitch.overlap.capture import Capture
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import collect
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
 from stitch.stages.coarse import coarse, part_size
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse, view_residuals
+from stitch.stages.observability import unobservable
 from stitch.stages.register import register, sign_weights
+from stitch.system.native import load_open3d
 
 
 def at_part(capture: Capture, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from in_memory import session_of
 
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from stitch.diagnosis import next_view
+from stitch.diagnosis.design import next_view
 from stitch.pipeline import run
 
 
@@ -20,7 +20,7 @@ def test_a_slip_that_the_run_is_told_of_is_found_where_it_was():
     assert true != 6  # the middle, where a fit that does not look would begin
     found = run(session_of(measured), effects=["part_slip"])
     (term,) = found.terms
-    names = [p.name for p in found.chain.parameters(term.effect)]
+    names = [p.name for p in found.measurement.parameters(term.effect)]
     assert term.values[names.index("v")] == true
 
 
@@ -28,7 +28,7 @@ def test_the_next_view_serves_the_two_that_stay_most_alike(monkeypatch):
     """Of three suspects no two may stay together, however well others come apart."""
     gains = {"ab": [9, 2, 0], "ac": [0, 2, 9], "bc": [0, 3, 9]}
 
-    class Suspect:
+    class CandidateEffect:
         def __init__(self, name):
             self.name = name
 
@@ -36,6 +36,6 @@ def test_the_next_view_serves_the_two_that_stay_most_alike(monkeypatch):
         return next_view._Gains(0.4, np.radians([[10.0], [20.0], [30.0]]), np.array(gains[a.name + b.name], float))
 
     monkeypatch.setattr(next_view, "_gains", of_two)
-    joints, count, separated = next_view._best_pose(None, [Suspect(name) for name in "abc"])
+    joints, count, separated = next_view._best_pose(None, [CandidateEffect(name) for name in "abc"])
     assert joints == pytest.approx([20.0])
     assert count == 3 and separated == ("a", "b", "c")  # (5.4 − 0.4)/2

@@ -1,4 +1,4 @@
-"""Arms of the simulator against second sources: a plain product of matrices, a pendulum, stitch.robot."""
+"""Arms of the simulator against second sources: a plain product of matrices, a pendulum, stitch.measurement.robot."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from data_synth import kinematics
 from data_synth.arms import ARMS, Arm, with_payload
-from stitch import robot
+from stitch.measurement import robot
 
 RNG = np.random.default_rng(5)
 

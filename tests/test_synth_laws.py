@@ -15,7 +15,8 @@ from data_synth.laws import points as point_laws
 from data_synth.moment import Plan
 from data_synth.scanner import Cloud
 from data_synth.simulate import Measured
-from stitch import frames, robot
+from stitch import frames
+from stitch.measurement import robot
 
 VIEWS = 3
 HOUR = 3600.0

@@ -8,11 +8,11 @@ from synthetic_cells import clean, simulated
 
 from data_synth.write import write_session
 from stitch import pipeline
-from stitch.overlap.capture import capture
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import FINE_SAMPLES, collect
+from stitch.measurement.capture import capture
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
 from stitch.reading.session_folder import load_session
-from stitch.threads import library_threads_off
+from stitch.system.threads import library_threads_off
 
 VIEWS = 8
 HIDDEN = ("joint_compliance", "part_slip")

@@ -25,7 +25,7 @@ from stitch.cells.window.seam import Limits, Station, measure_seam
 from stitch.cells.window.start import find_start
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
-from stitch.overlap.scan import prepare_view
+from stitch.measurement.scan import prepare_view
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "window"
 NOISE = 0.05

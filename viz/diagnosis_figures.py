@@ -3,9 +3,9 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from stitch.diagnosis.answer import Diagnosis, Suspect
-from stitch.diagnosis.comparison import Comparison, Table
-from stitch.result import Step
+from stitch.comparison.tables import Comparison, Table
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.runs.run import Step
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, covariate, plain
 from viz.units import to_micrometres
@@ -41,9 +41,9 @@ def change_of(ledger: tuple[Step, ...], i: int) -> str:
     return "\n".join([*new, *gone]) or "fitted again"
 
 
-def suspects(found: Diagnosis) -> Figure:
+def candidates(found: Diagnosis) -> Figure:
     """Log evidence of the best candidates, named ones in red."""
-    shown = [s for s in found.suspects if s.ranked.score.observable][:8][::-1]
+    shown = [s for s in found.candidates if s.ranked.score.observable][:8][::-1]
     figure = Figure(figsize=(7, 0.4 + 0.3 * max(len(shown), 1)), layout="constrained")
     axes = figure.subplots()
     colours = [ORANGE if s.name in found.effects else BLUE for s in shown]
@@ -60,7 +60,7 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
     is an effect that is there as fitted.
     """
     # Of candidates that gain nothing no amplitude was fitted.
-    shown = [s for s in found.suspects if s.ranked.score.observable and s.ranked.score.p_value < 1.0][:at_most]
+    shown = [s for s in found.candidates if s.ranked.score.observable and s.ranked.score.p_value < 1.0][:at_most]
     figure = Figure(figsize=(7, 3.0), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, suspect in zip(axes, shown, strict=False):
@@ -72,7 +72,7 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
     return plain(figure)
 
 
-def _added(ax, found: Diagnosis, suspect: Suspect) -> None:
+def _added(ax, found: Diagnosis, suspect: CandidateEffect) -> None:
     s = suspect.ranked.score
     predicted = found.evidence.whiten_channel(s.form.columns) @ s.values
     ax.scatter(predicted, found.evidence.white_z, s=6, color=BLUE, alpha=0.7, lw=0)
@@ -83,8 +83,8 @@ def _added(ax, found: Diagnosis, suspect: Suspect) -> None:
 
 def alias_picture(found: Diagnosis, at_most: int = 12) -> Figure:
     """How much of each suspect's pattern the others can imitate."""
-    keep = [k for k, s in enumerate(found.suspects) if s.ranked.score.observable][:at_most]
-    names = [found.suspects[k].name for k in keep]
+    keep = [k for k, s in enumerate(found.candidates) if s.ranked.score.observable][:at_most]
+    names = [found.candidates[k].name for k in keep]
     figure = Figure(figsize=(7, 5.6), layout="constrained")
     axes = figure.subplots()
     matrix = found.matrix[np.ix_(keep, keep)]
@@ -119,7 +119,10 @@ def budget(found: Diagnosis, length_unit: str) -> Figure:
     """Mean squares between the views: sensor noise, what the best suspect explains, the rest."""
     um = to_micrometres(length_unit)
     total, noise = (found.residual_rms * um) ** 2, (found.noise_floor * um) ** 2
-    left = next((s.left for s in found.suspects if s.left is not None and s.name in found.effects), None)
+    left = next(
+        (s.cross_validation for s in found.candidates if s.cross_validation is not None and s.name in found.effects),
+        None,
+    )
     explained = 0.0 if left is None else max(total * (1 - left.inside), 0.0)
     parts = [("sensor noise", min(noise, total), DARK), (", ".join(found.effects) or "explained", explained, ORANGE),
              ("scatter of the poses and the rest", max(total - noise - explained, 0.0), BLUE)]  # fmt: skip
@@ -169,7 +172,7 @@ def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     for i, (axis, colour, marker) in enumerate(zip("xyz", (ORANGE, GREEN, BLUE), "osv", strict=True)):
         axes.plot(moved[:, i], marker=marker, ms=4, lw=0.8, color=colour, label=axis)
     axes.axhline(0, color="k", lw=0.6)
-    names = [scan.name for scan in found.evidence.chain.capture.scans]
+    names = [scan.name for scan in found.evidence.measurement.capture.scans]
     if 0 < len(names) <= _NAMED:
         axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     axes.set_ylabel("displaced (µm)")

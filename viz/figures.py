@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from stitch.result import Run
+from stitch.runs.run import Run
 from viz.colours import BLUE, GREEN
 from viz.drawing import above, plain
 from viz.recording import view_shifts

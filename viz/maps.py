@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.frames import Array, transform
-from stitch.result import Run
-from stitch.solve import RMS_GATE
+from stitch.observations.surfaces.gram import RMS_GATE
+from stitch.runs.run import Run
 from viz.colours import UNSIGNED
 from viz.units import to_micrometres
 

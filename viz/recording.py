@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.frames import Array
-from stitch.result import Run, StageResult
-from stitch.session import Session, View
+from stitch.measurement.session import Session, View
+from stitch.runs.run import Run, StageResult
 from viz.blueprint import blueprint
 from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
 from viz.diagnosis_figures import waterfall
@@ -27,7 +27,7 @@ _POINTS_FUSED = 200_000
 
 
 class RerunRecorder:
-    """A `stitch.recorder.Recorder` that writes one .rrd file.
+    """A `stitch.runs.recorder.Recorder` that writes one .rrd file.
 
     Every cloud is stored once, in its scanner's frame; iterations only move its transform.
     """

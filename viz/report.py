@@ -10,9 +10,9 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from stitch.result import Run
-from stitch.rounding import rounded
-from stitch.writing.whole import whole
+from stitch.runs.run import Run
+from stitch.system.whole_file import whole
+from stitch.units import rounded
 from viz import captions, figures, maps, target_figures
 from viz.diagnosis_figures import waterfall
 from viz.recording import shown_points, view_shifts
@@ -70,7 +70,7 @@ def _pictures(run: Run) -> list[tuple[str, str, str]]:
 
 def _targets(run: Run) -> list[dict[str, object]]:
     """Rows of the table of targets; their places stand where a cloud would."""
-    sightings = run.chain.capture.sightings
+    sightings = run.measurement.capture.sightings
     if run.labelled is None or sightings is None:
         return []
     um = to_micrometres(run.session.length_unit)
@@ -85,7 +85,7 @@ def _effects(run: Run) -> list[dict[str, str]]:
     """Fitted parameters that the views can see."""
     rows = []
     for term, sigmas in zip(run.terms, run.sigmas, strict=True):
-        for p, value, sigma in zip(run.chain.parameters(term.effect), term.values, sigmas, strict=True):
+        for p, value, sigma in zip(run.measurement.parameters(term.effect), term.values, sigmas, strict=True):
             if np.isfinite(sigma) or p.grid:
                 told = f"{sigma:.1g}" if np.isfinite(sigma) else "–"
                 rows.append({"effect": term.effect.name, "name": p.name, "value": rounded(value, sigma), "sigma": told,

@@ -7,11 +7,11 @@ import rerun as rr
 from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
-from stitch.diagnosis.answer import Diagnosis
-from stitch.diagnosis.comparison import Comparison
-from stitch.diagnosis.words import amounts_of
-from stitch.state import State
-from stitch.writing.whole import whole
+from stitch.comparison.tables import Comparison
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.sentences import amounts_of
+from stitch.stored.load_state import State
+from stitch.system.whole_file import whole
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.blueprint import diagnosis_blueprint
@@ -22,10 +22,10 @@ from viz.units import to_micrometres
 def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     """Section of report.html, pictures/*.svg and *.png, diagnosis.rrd."""
     unit = state.session.length_unit
-    um = to_micrometres(unit)
+    now = found.residual_rms * to_micrometres(unit)
     pictures = {
         "budget": ("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
-        "suspects": ("How likely each suspect is", draw.suspects(found), captions.SUSPECTS),
+        "suspects": ("How likely each suspect is", draw.candidates(found), captions.SUSPECTS),
         "added_variable": ("What the views show against what the first suspects predict", draw.added_variable(found),
                            captions.ADDED),
         "shape": ("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
@@ -35,12 +35,12 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     rows = [
         {"name": s.name, "p": f"{s.ranked.adjusted:.1g}", "posterior": f"{s.ranked.posterior:.2f}",
          "amounts": amounts_of(s.ranked),
-         "left": "–" if s.left is None else f"{found.residual_rms * um * s.left.inside**0.5:.1f}",
-         "heldout": "–" if s.left is None else f"{found.residual_rms * um * s.left.heldout**0.5:.1f}",
+         "left": "–" if s.cross_validation is None else f"{now * s.cross_validation.inside**0.5:.1f}",
+         "heldout": "–" if s.cross_validation is None else f"{now * s.cross_validation.heldout**0.5:.1f}",
          "alike": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])}
-        for s in found.suspects if s.ranked.score.observable
+        for s in found.candidates if s.ranked.score.observable
     ][:8]  # fmt: skip
-    unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
+    unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
     addresses = _save(folder / "pictures", {name: figure for name, (_, figure, _) in pictures.items()})
     shown = [(title, addresses[name], caption) for name, (title, _, caption) in pictures.items()]
     _insert(folder / "report.html", "diagnosis", _render("diagnosis.html.j2", found=found, rows=rows, unseen=unseen,

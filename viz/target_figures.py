@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.frames import Array
-from stitch.result import Run
+from stitch.runs.run import Run
 from viz.units import to_micrometres
 
 _BLUE, _RED, _GREY = "#4878a8", "#b5532a", "grey"
@@ -34,7 +34,7 @@ def errors(run: Run) -> Figure:
     """3D distance of the targets under the model, in the order of views and as a distribution."""
     assert run.labelled is not None
     um, rows = to_micrometres(run.session.length_unit), run.labelled.rows
-    distances = rows.distances(rows.left) * um
+    distances = rows.distances(rows.residual) * um
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     course, share = figure.subplots(1, 2, width_ratios=[2, 1])
     course.plot(np.nanmax(distances, axis=1), ".", ms=2, color=_BLUE)
@@ -53,7 +53,7 @@ def residual_vectors(run: Run) -> tuple[Array, Array]:
     assert run.labelled is not None
     rows, s = run.labelled.rows, run.labelled.rows.capture.sightings
     assert s is not None
-    left = rows.left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)
+    left = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)
     return s.target[s.used], left[s.used]
 
 

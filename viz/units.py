@@ -1,6 +1,6 @@
 """Lengths as people read them."""
 
-from stitch.rounding import MICROMETRES
+from stitch.units import MICROMETRES
 
 _MILLIMETRES = {"mm": 1.0, "m": 1e3}
 

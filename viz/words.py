@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.result import Run
+from stitch.runs.run import Run
 from viz.units import to_micrometres
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.calibrate.axxb import park_martin
-from stitch.calibrate.axzb import require_poses, shah
 from stitch.calibrate.jackknife import jackknife
 from stitch.calibrate.motions import require_motion
+from stitch.closed_form.axxb import park_martin
+from stitch.closed_form.axzb import require_poses, shah
 from stitch.frames import Array
 
 _STEPS = 30

@@ -11,7 +11,7 @@ from stitch.calibrate.sphere_views import SphereView, centres, sphere_view
 from stitch.calibrate.weak import require_turns
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.session import Session
+from stitch.measurement.session import Session
 
 # Answers whose fits differ by less than this factor cannot be told apart.
 _CLEAR = 1.3

@@ -8,7 +8,7 @@ from stitch import frames
 from stitch.calibrate.motions import axis_spread
 from stitch.calibrate.sphere import SphereCalibration
 from stitch.calibrate.weak import hardly_turned, turned, weak_components
-from stitch.session import Session
+from stitch.measurement.session import Session
 
 # A view's points are off by more than their noise beyond this ratio.
 _BEYOND_NOISE = 3.0

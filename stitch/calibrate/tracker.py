@@ -12,15 +12,15 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from stitch import frames
-from stitch.calibrate.axxb import park_martin
-from stitch.calibrate.axzb import shah
 from stitch.calibrate.motions import axis_spread
 from stitch.calibrate.refine import Refined, refine_axzb
 from stitch.calibrate.weak import hardly_turned, turned, weak_components
+from stitch.closed_form.axxb import park_martin
+from stitch.closed_form.axzb import shah
 from stitch.errors import NoResultError
 from stitch.frames import Array
+from stitch.measurement.session import Session
 from stitch.reading.frames_csv import MeasuredFrames, read_frames
-from stitch.session import Session
 
 # Second opinions further off than this many sigmas speak against independent errors.
 _SURE = 3.0

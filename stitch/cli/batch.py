@@ -16,7 +16,7 @@ from stitch.errors import InputError, NoResultError, StitchError
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.reading.session_toml import document
-from stitch.rounding import MICROMETRES
+from stitch.units import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 

@@ -9,20 +9,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.calibrate.robot import calibrated
-from stitch.calibrate.robot_report import beyond_sentence, write_robot
-from stitch.calibrate.robot_report import document_of as robot_document
+from stitch.calibrate.robot_calibration import calibrated
+from stitch.calibrate.robot_files import beyond_sentence, write_robot
+from stitch.calibrate.robot_files import document_of as robot_document
 from stitch.calibrate.sphere import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
 from stitch.calibrate.tracker import calibrate_tracker
 from stitch.calibrate.tracker import document_of as tracker_document
 from stitch.cli.change import show_ledger
 from stitch.cli.diagnose import write_diagnosis
-from stitch.diagnosis.suggest import suggest
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
-from stitch.result import Run
-from stitch.state import state_of
+from stitch.runs.run import Run
+from stitch.stepwise import suggest
+from stitch.stored.load_state import state_of
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json, write_json
 

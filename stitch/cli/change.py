@@ -11,13 +11,13 @@ from rich.table import Table
 
 from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.run import recorder_for
-from stitch.diagnosis.suggest import suggest
-from stitch.effects.terms import known, require
 from stitch.errors import InputError
+from stitch.model.terms import known, require
 from stitch.pipeline import change
-from stitch.result import Run
-from stitch.rounding import MICROMETRES, rounded
-from stitch.state import State, load_state, state_of
+from stitch.runs.run import Run
+from stitch.stepwise import suggest
+from stitch.stored.load_state import State, load_state, state_of
+from stitch.units import MICROMETRES, rounded
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.result_document import result_document
@@ -48,7 +48,7 @@ def add(
         return
     used = [t.effect.name for t in state.terms]
     for name in effects or []:
-        require(state.chain, known(name))
+        require(state.measurement, known(name))
         if name in used:
             raise InputError(f"{name} is in the model of {run} already")
     _change(run, state, [*used, *(effects or [])], recording, as_json)
@@ -114,7 +114,7 @@ def show_ledger(result: Run) -> None:
         table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
     console.print(table)
     for term, sigmas in zip(result.terms, result.sigmas, strict=True):
-        for p, value, sigma in zip(result.chain.parameters(term.effect), term.values, sigmas, strict=True):
+        for p, value, sigma in zip(result.measurement.parameters(term.effect), term.values, sigmas, strict=True):
             told = f"± {sigma:.1g}" if np.isfinite(sigma) else "(explains most)"
             if np.isfinite(sigma) or p.grid:
                 console.print(
@@ -138,7 +138,7 @@ def remarks(result: Run) -> list[str]:
                 else f"{', '.join(grown)} did not earn a place: the held-out residual did not fall."
             )
     for term in result.terms:
-        parameters = result.chain.parameters(term.effect)
+        parameters = result.measurement.parameters(term.effect)
         wild = [p.name for p, v in zip(parameters, term.values, strict=True) if not p.grid and abs(v) > p.limit]
         if wild:
             out.append(f"{term.effect.name}: {', '.join(wild)} is larger than anybody would believe.")
@@ -150,6 +150,6 @@ def remarks(result: Run) -> list[str]:
 def _clearest(result: Run, name: str) -> float:
     """The largest |value|/sigma of an effect's parameters; 0 where the views see none."""
     k = list(result.effects).index(name)
-    parameters = result.chain.parameters(result.terms[k].effect)
+    parameters = result.measurement.parameters(result.terms[k].effect)
     fitted = np.array([not p.grid for p in parameters]) & np.isfinite(result.sigmas[k])
     return float(np.max(np.abs(result.terms[k].values[fitted]) / result.sigmas[k][fitted], initial=0.0))

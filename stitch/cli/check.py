@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.errors import InputError
+from stitch.measurement.session import Session
 from stitch.reading.session_folder import load_session
-from stitch.session import Session
 
 
 def check(

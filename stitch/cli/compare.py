@@ -8,11 +8,11 @@ import typer
 from rich.console import Console
 from rich.table import Table as Printed
 
-from stitch.diagnosis.compare import compare
-from stitch.diagnosis.compare_targets import compare_targets
-from stitch.diagnosis.comparison import Comparison, Table, comparison_document
-from stitch.rounding import MICROMETRES
-from stitch.state import State, load_state
+from stitch.comparison.compare_surfaces import compare
+from stitch.comparison.compare_targets import compare_targets
+from stitch.comparison.tables import Comparison, Table, comparison_document
+from stitch.stored.load_state import State, load_state
+from stitch.units import MICROMETRES
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend
 
@@ -32,7 +32,7 @@ def compare_run(
         return
     to_um = MICROMETRES[state.session.length_unit]
     console = Console(stderr=True)
-    what = "between the views" if state.chain.capture.scans else "from the targets to their place (3D)"
+    what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
     console.print(f"{found.rms * to_um:.1f} µm rms {what} under the model.", highlight=False)
     for table in found.labelled:
         _worst(console, table, to_um)
@@ -47,7 +47,7 @@ def compare_run(
 
 def write_comparison(state: State, run: Path) -> Comparison:
     """compare.json and what other packages make of it."""
-    found = compare(state) if state.chain.capture.scans else compare_targets(state)
+    found = compare(state) if state.measurement.capture.scans else compare_targets(state)
     write_json(comparison_document(found), run / "compare.json")
     extend("stitch.comparison_reports", found, state, run)
     return found

@@ -7,12 +7,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.diagnosis.answer import Diagnosis, Suspect
 from stitch.diagnosis.diagnose import diagnose
-from stitch.diagnosis.document import diagnosis_document
-from stitch.diagnosis.words import amounts_of
-from stitch.rounding import MICROMETRES
-from stitch.state import State, load_state
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.sentences import amounts_of
+from stitch.stored.load_state import State, load_state
+from stitch.units import MICROMETRES
+from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend
 
@@ -82,15 +82,15 @@ def show(found: Diagnosis, length_unit: str) -> None:
     table = Table(title="Suspects", title_justify="left")
     for heading in ("effect", "p", "posterior", "left (µm)", "held-out (µm)"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
-    for s in found.suspects[:_SHOWN]:
+    for s in found.candidates[:_SHOWN]:
         table.add_row(*_row(found, s, to_um))
     console.print(table)
-    for s in found.suspects[:3]:
+    for s in found.candidates[:3]:
         if s.ranked.score.observable:
             alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
             told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; looks like {alike}" if alike else "")
             console.print(told, soft_wrap=True, highlight=False)
-    unseen = [s.name for s in found.suspects if not s.ranked.score.observable]
+    unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
     if unseen:
         console.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True, highlight=False)
     lacking = sorted({need for needs in found.missing.values() for need in needs})
@@ -107,17 +107,20 @@ def show(found: Diagnosis, length_unit: str) -> None:
 
 def _show_missed(console: Console, found: Diagnosis, to_um: float) -> None:
     """What effects too small to be seen could still do to the hand-eye."""
-    known = sorted(((s.hand_eye, s.name) for s in found.suspects if s.hand_eye is not None), reverse=True)
+    known = sorted(((s.hand_eye, s.name) for s in found.candidates if s.hand_eye is not None), reverse=True)
     told = ", ".join(f"{name} {size * to_um:.2g} µm" for size, name in known[:3])
     if told:
         console.print(f"An effect too small to be seen could still displace the hand-eye, at the part by as much as: "
                       f"{told}. Its sigma does not hold that.", soft_wrap=True, highlight=False)  # fmt: skip
 
 
-def _row(found: Diagnosis, s: Suspect, to_um: float) -> list[str]:
+def _row(found: Diagnosis, s: CandidateEffect, to_um: float) -> list[str]:
     if not s.ranked.score.observable:
         return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
-    if s.left is not None:
-        left = [f"{found.residual_rms * to_um * x**0.5:.1f}" for x in (s.left.inside, s.left.heldout)]
+    if s.cross_validation is not None:
+        left = [
+            f"{found.residual_rms * to_um * x**0.5:.1f}"
+            for x in (s.cross_validation.inside, s.cross_validation.heldout)
+        ]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

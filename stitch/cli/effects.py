@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.effects.contract import EFFECTS, PLACES, Effect
-from stitch.effects.terms import known
 from stitch.effects.user_file import load
+from stitch.model.terms import known
 from stitch.writing.json_file import to_json
 
 

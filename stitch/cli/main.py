@@ -1,6 +1,6 @@
 """`stitch`: parsing and printing only; every command is also a library function.
 
-Other packages add commands through the entry-point group `stitch.commands`.
+Other packages, and the cells, add commands through the entry-point group `stitch.commands`.
 """
 
 import sys
@@ -9,21 +9,16 @@ from importlib.metadata import entry_points
 
 import typer
 
-from stitch.cli.base import base
 from stitch.cli.batch import batch
 from stitch.cli.calibrate import calibrate
 from stitch.cli.change import add, drop
 from stitch.cli.check import check
 from stitch.cli.compare import compare_run
 from stitch.cli.diagnose import diagnose_run, next_measurement
-from stitch.cli.drill import drill
 from stitch.cli.effects import effects
-from stitch.cli.fit import fit
 from stitch.cli.import_file import import_command
-from stitch.cli.panel import panel
 from stitch.cli.report import report
 from stitch.cli.run import run
-from stitch.cli.seam import seam
 from stitch.errors import StitchError
 
 app = typer.Typer(
@@ -44,13 +39,8 @@ def build() -> typer.Typer:
     app.command()(effects)
     app.command()(report)
     app.command()(batch)
-    app.command()(base)
-    app.command()(drill)
     app.command("import")(import_command)
     app.add_typer(calibrate, name="calibrate")
-    app.command()(panel)
-    app.command()(fit)
-    app.command()(seam)
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
     return app

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from stitch.frames import Array
-from stitch.recorder import Recorder
-from stitch.result import Run, StageResult
-from stitch.rounding import MICROMETRES
-from stitch.session import Session
+from stitch.measurement.session import Session
+from stitch.runs.recorder import Recorder
+from stitch.runs.run import Run, StageResult
+from stitch.units import MICROMETRES
 
 
 class Progress:

@@ -9,8 +9,8 @@ from rich.console import Console
 from stitch.cli.compare import write_comparison
 from stitch.cli.diagnose import write_diagnosis
 from stitch.diagnosis.diagnose import diagnose
-from stitch.state import load_state
-from stitch.stored import stored_run
+from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import stored_run
 from stitch.writing import run_folder
 
 

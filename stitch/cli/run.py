@@ -10,16 +10,16 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.cli.progress import Progress, Tee
-from stitch.effects.terms import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
-from stitch.model import read_model, write_model
+from stitch.measurement.session import Session
+from stitch.model.model_toml import read_model, write_model
+from stitch.model.terms import known
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
-from stitch.recorder import Recorder
-from stitch.result import Run
-from stitch.rounding import MICROMETRES
-from stitch.session import Session
+from stitch.runs.recorder import Recorder
+from stitch.runs.run import Run
+from stitch.units import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.mesh import write_mesh

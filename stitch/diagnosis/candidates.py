@@ -6,13 +6,13 @@ from itertools import product
 
 import numpy as np
 
-from stitch.diagnosis.evidence import ViewEvidence
-from stitch.effects.chain import Term
-from stitch.effects.columns import PointGram
 from stitch.effects.contract import EFFECTS, Effect, Parameter
 from stitch.effects.empirical import empirical_effects
 from stitch.effects.groups import by_joint, one_by_one, without_offset
 from stitch.frames import Array
+from stitch.measurement.measurement import Term
+from stitch.observations.evidence import ViewEvidence
+from stitch.observations.surfaces.point_effects import PointGram
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Candidate:
 
 def candidates_of(evidence: ViewEvidence) -> tuple[list[Candidate], PointGram | None, dict[str, tuple[str, ...]]]:
     """Physical, user and empirical effects that are not in the model, and what each unavailable one lacks."""
-    chain = evidence.chain
+    measurement = evidence.measurement
     used = {term.effect.name for term in evidence.terms}
     library = [e for e in EFFECTS.values() if e.name not in used]
-    missing = {e.name: chain.lacks(e) for e in library if chain.lacks(e)}
-    effects = [e for e in library if e.name not in missing] + empirical_effects(chain.views)
+    missing = {e.name: measurement.lacks(e) for e in library if measurement.lacks(e)}
+    effects = [e for e in library if e.name not in missing] + empirical_effects(measurement.views)
     terms, owner = [], []
     for k, effect in enumerate(effects):
-        for term in _grid_terms(effect, chain.parameters(effect)):
+        for term in _grid_terms(effect, measurement.parameters(effect)):
             terms.append(term)
             owner.append(k)
     columns, sums, where = evidence.columns(terms)
     out = []
     for k, effect in enumerate(effects):
         own = [i for i, o in enumerate(owner) if o == k]
-        parameters = chain.parameters(effect)
+        parameters = measurement.parameters(effect)
         forms = [f for i in own for f in _forms(evidence, terms[i], parameters, columns[i])]
         if forms:
             out.append(Candidate(effect, parameters, tuple(forms), columns[own[0]], where[own[0]]))
@@ -66,7 +66,7 @@ def candidates_of(evidence: ViewEvidence) -> tuple[list[Candidate], PointGram | 
 
 def candidate_of(evidence: ViewEvidence, effect: Effect) -> Candidate | None:
     """One effect as a candidate."""
-    parameters = evidence.chain.parameters(effect)
+    parameters = evidence.measurement.parameters(effect)
     terms = _grid_terms(effect, parameters)
     columns, _, where = evidence.columns(terms)
     forms = [f for term, c in zip(terms, columns, strict=True) for f in _forms(evidence, term, parameters, c)]
@@ -75,7 +75,7 @@ def candidate_of(evidence: ViewEvidence, effect: Effect) -> Candidate | None:
 
 def as_fitted(evidence: ViewEvidence, term: Term) -> Candidate:
     """An effect with those of its parameters that a fit left in use, as the one form it may have."""
-    parameters = evidence.chain.parameters(term.effect)
+    parameters = evidence.measurement.parameters(term.effect)
     held = np.array([bool(p.grid) for p in parameters])
     zero, keep = replace(term, values=np.where(held, term.values, 0.0)), ~held & (term.values != 0)
     twists = evidence.columns([zero])[0][0]

@@ -13,9 +13,9 @@ from scipy.special import logsumexp
 from scipy.stats import f as f_distribution
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.evidence import ViewEvidence
 from stitch.frames import Array
-from stitch.variance import MANY_NUMBERS, VarianceFit, at_variances, fit_variances
+from stitch.observations.evidence import ViewEvidence
+from stitch.statistics.variance_components import MANY_NUMBERS, VarianceFit, at_variances, fit_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 _SEEN = 0.5

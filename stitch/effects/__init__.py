@@ -3,7 +3,7 @@
 Importing the package registers the library; `user_file.load` adds a user's own.
 """
 
-from stitch.effects import empirical, mount, part, robot, sensor
+from stitch.effects import arm, empirical, mount, part, sensor
 from stitch.effects.contract import (
     EFFECTS,
     Effect,
@@ -18,6 +18,6 @@ from stitch.effects.contract import (
 )
 
 __all__ = [
-    "EFFECTS", "Effect", "Parameter", "effect", "empirical", "event", "mount", "number", "offset", "part", "per_joint",
-    "per_torque", "robot", "sensor", "twist",
+    "EFFECTS", "Effect", "Parameter", "arm", "effect", "empirical", "event", "mount", "number", "offset", "part",
+    "per_joint", "per_torque", "sensor", "twist",
 ]  # fmt: skip

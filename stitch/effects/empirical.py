@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from stitch.effects.contract import Effect, Spec, event, number, twist
-from stitch.effects.views import ScanView, Views
 from stitch.frames import Array
+from stitch.measurement.views import ScanView, Views
 
 _HARMONICS = (1, 2, 3, 4)
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch.effects.contract import effect, number, twist
-from stitch.effects.views import Views
 from stitch.frames import Array
+from stitch.measurement.views import Views
 
 
 @effect("mount", needs=("time",), xi=twist("/h", 1e-3, 0.4))

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from stitch.effects.arm import warmer
 from stitch.effects.contract import effect, event, number, offset, twist
-from stitch.effects.robot import warmer
-from stitch.effects.views import ScanView, Views
 from stitch.frames import Array
+from stitch.measurement.views import ScanView, Views
 
 
 @effect("part", needs=("time",), xi=twist("/h", 1e-3, 0.4))

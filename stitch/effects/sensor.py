@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch.effects.contract import effect, number
-from stitch.effects.views import ScanView
 from stitch.frames import Array
+from stitch.measurement.views import ScanView
 
 
 @effect("sensor", s=number("1", typical=1e-3, limit=0.02))

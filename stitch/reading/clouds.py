@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.cloud import Cloud
+from stitch.measurement.cloud import Cloud
 from stitch.reading.csv_number import is_number
 from stitch.reading.pcd import read_pcd
 

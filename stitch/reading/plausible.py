@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.robot import METRES
-from stitch.session import Session
+from stitch.measurement.session import Session
+from stitch.units import METRES
 
 # Working distances of scanners on robots, in metres: from a borescope to a hall.
 _RANGE_M = (0.01, 20.0)

@@ -1,37 +1,16 @@
 """points.csv and targets.csv: points that a sensor knows by name, and where a drawing puts them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.frames import Array
+from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
 
 _XYZ = ("x", "y", "z")
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """What one view shows of named targets, sensor frame; a 6D probe is a target with an orientation."""
-
-    targets: tuple[str, ...]  # k
-    points: Array  # (k, 3) length_unit
-    sigma: Array  # (k,) of a coordinate; NaN where nobody states it
-    rotation: Array | None = None  # (3, 3) R_sensor_probe of the one target
-    sigma_rotation: float = float("nan")  # rad
-
-
-@dataclass(frozen=True)
-class Nominal:
-    """Where targets.csv puts the targets, part frame."""
-
-    targets: tuple[str, ...]  # T
-    points: Array  # (T, 3) length_unit
-    sigma: Array  # (T,) of a coordinate; NaN where nobody states it
 
 
 def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:

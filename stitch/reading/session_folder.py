@@ -6,15 +6,16 @@ from typing import get_args
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.measurement.labelled_points import Nominal, Sighting
+from stitch.measurement.session import Mount, Session, View
 from stitch.reading import session_toml
 from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.plausible import check_scale
-from stitch.reading.points_csv import Nominal, Sighting, read_points, read_targets
+from stitch.reading.points_csv import read_points, read_targets
 from stitch.reading.toml_file import choice
 from stitch.reading.views_csv import Row, read_views
-from stitch.robot import METRES
-from stitch.session import Mount, Session, View
+from stitch.units import METRES
 
 # Fewer points span no surface.
 _FEWEST = 3

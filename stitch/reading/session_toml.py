@@ -9,11 +9,12 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.robot_table import numbers
+from stitch.measurement.robot import Robot
+from stitch.measurement.session import Scanner
+from stitch.reading.dh_rows import numbers, robot_from_dh
 from stitch.reading.toml_file import choice, read_toml, text
 from stitch.reading.urdf import robot_from_urdf
-from stitch.robot import METRES, Robot, robot_from_dh
-from stitch.session import Scanner
+from stitch.units import METRES
 
 FORMAT = "stitch-session/1"
 

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.robot_table import gravity_of, payload_of
-from stitch.robot import METRES, Robot
-from stitch.urdf_write import to_urdf
+from stitch.measurement.robot import Robot
+from stitch.reading.dh_rows import gravity_of, payload_of
+from stitch.units import METRES
+from stitch.writing.urdf_file import to_urdf
 
 __all__ = ["robot_from_urdf", "to_urdf"]
 Element = ElementTree.Element

@@ -10,9 +10,9 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.measurement.robot import Robot, forward
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number, number
-from stitch.robot import Robot, forward
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _JOINT = re.compile(r"j([1-9]\d*)_deg$")

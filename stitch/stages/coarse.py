@@ -15,14 +15,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.coarse_starts.centroids import centroid_hand_eyes, scanner_centre
-from stitch.coarse_starts.relative_motion import motion_candidates
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.overlap.capture import Capture
-from stitch.overlap.match import sample, search
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.match import sample, search
 from stitch.stages.correct import close_in
-from stitch.threads import parallel
+from stitch.stages.initial_guess.centroids import centroid_hand_eyes, scanner_centre
+from stitch.stages.initial_guess.relative_motion import motion_candidates
+from stitch.system.threads import parallel
 
 _SEARCH_SAMPLES = 120
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.

@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.effects.chain import Term
 from stitch.frames import Array
-from stitch.hand_eye import HandEye, fit_hand_eye
-from stitch.overlap.capture import Capture
-from stitch.overlap.capture_evidence import jacobian
-from stitch.overlap.free_poses import FreePoses, free_poses
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
-from stitch.recorder import Recorder, Silent
-from stitch.repeatability import Repeatability
-from stitch.solve import assemble, least_squares
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Term
+from stitch.observations.surfaces.capture_evidence import jacobian
+from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.gram import assemble, least_squares
+from stitch.observations.surfaces.hand_eye import HandEye, fit_hand_eye
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.runs.recorder import Recorder, Silent
 
 # Queries per view while the gate closes; the final normal equations take FINE_SAMPLES.
 COARSE_SAMPLES = 600
@@ -46,7 +46,7 @@ class Correction:
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
     """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
     D, b, moved = np.zeros((6, 6)), np.zeros(6), []
-    jacobians = [jacobian(c.carriers(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
+    jacobians = [jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
     for J, o in zip(jacobians, overlaps, strict=True):
         # Sessions of different noise count by their own variance.
         H, vector = assemble(o.gram)

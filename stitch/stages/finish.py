@@ -2,26 +2,26 @@
 
 import numpy as np
 
-from stitch.effects.chain import Chain
 from stitch.frames import Array
-from stitch.observability import unobservable
-from stitch.overlap.capture import Capture
-from stitch.overlap.noise import noise_floor
-from stitch.overlap.overlaps import Overlaps
-from stitch.recorder import Recorder, Silent
-from stitch.result import Run, StageResult
-from stitch.session import Session
-from stitch.solve import RMS_GATE
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.gram import RMS_GATE
+from stitch.observations.surfaces.noise_floor import noise_floor
+from stitch.observations.surfaces.overlaps import Overlaps
+from stitch.runs.recorder import Recorder, Silent
+from stitch.runs.run import Run, StageResult
+from stitch.runs.sentences import correct_note, sentence, warnings
 from stitch.stages.coarse import Coarse
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import fuse, view_residuals
+from stitch.stages.observability import unobservable
 from stitch.stages.register import register
-from stitch.threads import Clock
-from stitch.verdict import correct_note, sentence, warnings
+from stitch.system.threads import Clock
 
 
 def finish(
-    session: Session, chain: Chain, index: int, start: Coarse, correction: Correction, before: StageResult,
+    session: Session, measurement: Measurement, index: int, start: Coarse, correction: Correction, before: StageResult,
     recorder: Recorder, seconds: float,
 ) -> Run:  # fmt: skip
     """Register and fuse session `index` of a rig under the common model, and show it to the recorder."""
@@ -46,7 +46,7 @@ def finish(
     joints = None if any(v.joints is None for v in session.views) else np.array([v.joints for v in session.views])
     alone = len(correction.captures) == 1
     return Run(
-        session=session, chain=chain, T_mount=hand_eye.T_mount, T_mount_coarse=start.T_mount,
+        session=session, measurement=measurement, T_mount=hand_eye.T_mount, T_mount_coarse=start.T_mount,
         mount_covariance=hand_eye.covariance,
         unobservable=unobservable(correction.captures, hand_eye.T_mount, session.robot, joints if alone else None),
         stages=tuple(stages), poses_model=poses_model, poses=registration.poses,

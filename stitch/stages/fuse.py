@@ -6,9 +6,9 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.overlap.capture import Capture
-from stitch.overlap.scan import Scan
-from stitch.result import FusedCloud
+from stitch.measurement.capture import Capture
+from stitch.measurement.scan import Scan
+from stitch.runs.run import FusedCloud
 
 # Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
 _EDGE_WEIGHT = 0.05

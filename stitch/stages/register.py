@@ -19,14 +19,14 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.overlap.capture import Capture
-from stitch.overlap.match import Match, sample
-from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
-from stitch.overlap.scan import Scan
-from stitch.overlap.target_pairs import joined
-from stitch.recorder import Recorder, Silent
-from stitch.repeatability import Repeatability
-from stitch.solve import assemble, gram
+from stitch.measurement.capture import Capture
+from stitch.measurement.scan import Scan
+from stitch.observations.surfaces.gram import assemble, gram
+from stitch.observations.surfaces.match import Match, sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.surfaces.target_pairs import joined
+from stitch.runs.recorder import Recorder, Silent
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.effects.chain import Term
 from stitch.frames import Array
-from stitch.hand_eye import HandEye, scatter_of
-from stitch.model import Model
-from stitch.overlap.capture import Capture
-from stitch.overlap.free_poses import free_poses
-from stitch.overlap.match import sample
-from stitch.overlap.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Term
+from stitch.model.model_toml import Model
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.hand_eye import HandEye, scatter_of
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.stages.coarse import part_size
 from stitch.stages.correct import Correction, weighing
 
@@ -33,7 +33,7 @@ def reuse(
         NoResultError: no two views overlap under the hand-eye.
     """
     size = part_size(captures)
-    overlaps = tuple(settle(c, model.T_mount, REUSE_GATE * size) for c in captures)
+    overlaps = tuple(converged_overlaps(c, model.T_mount, REUSE_GATE * size) for c in captures)
     poses = [c.poses(model.T_mount) for c in captures]
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(scatter_of(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
@@ -49,7 +49,7 @@ def reuse(
     )
 
 
-def settle(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
+def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
     """Correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
 
     Raises:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.writing.whole import whole
+from stitch.system.whole_file import whole
 
 
 def write_json(document: Any, path: Path) -> None:

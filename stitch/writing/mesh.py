@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.native import load_open3d
-from stitch.result import FusedCloud
+from stitch.runs.run import FusedCloud
+from stitch.system.native import load_open3d
 
 _DEPTH = 9
 # Poisson closes what nobody saw; the least supported 4 % of its vertices are such fill.

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from stitch.effects.terms import fitted_of
-from stitch.labelled.document import labelled_facts, target_rows, targets_of
-from stitch.model import Model
-from stitch.result import Run
-from stitch.session import View
+from stitch.measurement.session import View
+from stitch.model.model_toml import Model
+from stitch.model.terms import fitted_of
+from stitch.runs.run import Run
+from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
 FORMAT = "stitch-run/1"
 _VERSIONS = ("stitch", "numpy", "scipy", "open3d-cpu", "open3d", "pykdtree", "rerun-sdk", "kiss-icp", "trimesh")
@@ -19,7 +19,7 @@ def model_of(run: Run) -> Model:
     """The model that a run fitted."""
     return Model(
         run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance,
-        fitted_of(run.chain, run.terms, run.sigmas), run.effects_file, targets_of(run.labelled),
+        fitted_of(run.measurement, run.terms, run.sigmas), run.effects_file, targets_of(run.labelled),
     )  # fmt: skip
 
 
@@ -48,7 +48,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
         "effects": {
             name: {p: {"value": f.value, "sigma": f.sigma, "unit": f.unit} for p, f in fitted.items()}
-            for name, fitted in fitted_of(run.chain, run.terms, run.sigmas).items()
+            for name, fitted in fitted_of(run.measurement, run.terms, run.sigmas).items()
         },
         "views": [
             {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),

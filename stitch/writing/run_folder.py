@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from stitch.errors import InputError
-from stitch.model import write_model
-from stitch.result import Run
+from stitch.model.model_toml import write_model
+from stitch.runs.run import Run
 from stitch.writing.json_file import write_json
 from stitch.writing.result_document import ledger, model_of, result_document
 from stitch.writing.tables import write_cloud, write_residuals

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 from plyfile import PlyData, PlyElement
 
 from stitch.frames import Array
-from stitch.labelled.document import residual_columns
-from stitch.overlap.match import Match
-from stitch.result import FusedCloud, Run
-from stitch.session import Session
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.match import Match
+from stitch.runs.run import FusedCloud, Run
+from stitch.writing.target_rows import residual_columns
 
 _Value = TypeVar("_Value")
 

@@ -10,7 +10,7 @@ from stitch.cells.toml_tables import check_keys, choice, finite, table
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.toml_file import read_toml
-from stitch.robot import METRES
+from stitch.units import METRES
 
 FORMAT = "stitch-base/1"
 # Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance

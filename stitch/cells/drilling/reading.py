@@ -14,7 +14,7 @@ from stitch.cells.toml_tables import check_keys, choice, finite
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.toml_file import read_toml
-from stitch.robot import METRES
+from stitch.units import METRES
 
 FORMAT = "stitch-drill/1"
 _FILES = {"plate", "holes", "placed", "rangers", "joint1", "joint6", "checks"}

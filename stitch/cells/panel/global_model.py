@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from stitch import frames
-from stitch.calibrate.axxb import park_martin
 from stitch.cells.panel.contact_frame import contact_frame
+from stitch.closed_form.axxb import park_martin
 from stitch.errors import NoResultError
 from stitch.frames import Array
 

@@ -11,7 +11,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.native import load_open3d
+from stitch.system.native import load_open3d
 
 # Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
 _SAME_SIDE = np.cos(np.radians(45.0))

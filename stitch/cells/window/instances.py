@@ -5,7 +5,7 @@ import numpy as np
 from stitch.cells.window.cad import Surface
 from stitch.cells.window.scans import Joined
 from stitch.errors import NoResultError
-from stitch.native import load_open3d
+from stitch.system.native import load_open3d
 
 # Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
 _GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40

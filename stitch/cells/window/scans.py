@@ -13,10 +13,10 @@ from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import COLUMNS, from_columns
 from stitch.errors import InputError
 from stitch.frames import Array, Indices
-from stitch.overlap.scan import Scan, prepare_view
+from stitch.measurement.scan import Scan, prepare_view
 from stitch.reading.clouds import read_cloud
 from stitch.reading.session_folder import load_session
-from stitch.robot import METRES
+from stitch.units import METRES
 
 # Fewer points have no neighbourhoods from which normals could be taken.
 _FEWEST = 50

@@ -10,7 +10,7 @@ from stitch.cells.window.cad import Surface, sample_partners
 from stitch.cells.window.scans import Joined
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.native import load_open3d
+from stitch.system.native import load_open3d
 
 _FEWEST = 50
 _POINTS = 1500  # of the scan that judge a candidate

@@ -1,0 +1,106 @@
+"""Kinematic calibration of a robot: the nominal arm with what a model found, as DH rows and as URDF."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from stitch.diagnosis.design.candidate_targets import candidate_rows
+from stitch.diagnosis.design.candidate_views import candidate_measurement, nearby
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.measurement.measurement import Term
+from stitch.measurement.robot import Robot, elementary
+from stitch.runs.run import Run
+
+# The effects that DH rows can express.
+GEOMETRY = ("joint_offset", "link_geometry")
+_PROPOSED, _TRIED = 6, 250
+
+
+@dataclass(frozen=True)
+class CalibratedRobot:
+    """The corrected arm, and the effects in use that no table of links can hold."""
+
+    robot: Robot
+    beyond: tuple[str, ...]
+
+
+def calibrated(run: Run) -> CalibratedRobot:
+    """The session's robot with the joint offsets and link errors of a run.
+
+    Raises:
+        InputError: the session has no robot with joints.
+    """
+    robot = run.session.robot
+    if robot is None or not run.measurement.views.joints.shape[1]:
+        raise InputError(f"{run.session.path}: no joint angles or no [robot]; a kinematic calibration needs both")
+    beyond = tuple(t.effect.name for t in run.terms if t.effect.place in ("robot", "links") and
+                   t.effect.name not in GEOMETRY)  # fmt: skip
+    return CalibratedRobot(with_geometry(robot, run.measurement.arguments, run.terms), beyond)
+
+
+def with_geometry(robot: Robot, arguments: Any, terms: Sequence[Term]) -> Robot:
+    """The arm with offsets on its joints and errors in its rows, exactly as the effects put them into the chain.
+
+    Args:
+        arguments: from an effect and its values to keyword arguments, `Measurement.arguments`.
+    """
+    values = {t.effect.name: arguments(t.effect, t.values) for t in terms if t.effect.name in GEOMETRY}
+    n = np.zeros(robot.n_joints)
+    offset = values.get("joint_offset", {"d": n})["d"]
+    links = values.get("link_geometry", {"da": n, "dd": n, "dalpha": n})
+    x_error, z_error = elementary("x", links["dalpha"], links["da"]), elementary("z", 0, links["dd"])
+    if robot.convention == "modified":
+        before, after = robot.before @ x_error, robot.after @ z_error
+    else:
+        before, after = robot.before, z_error @ robot.after @ x_error
+    robot = replace(robot, before=before, after=after, theta=robot.theta + offset)
+    if robot.a is None or robot.alpha is None or robot.d is None:
+        return robot
+    return replace(
+        robot, a=robot.a + links["da"], alpha=robot.alpha + links["dalpha"], d=robot.d + links["dd"]
+    )  # fmt: skip
+
+
+def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
+    """Rows of [robot] joints in session.toml, angles in degrees; None for an arm that came as URDF."""
+    if robot.a is None or robot.alpha is None or robot.d is None:
+        return None
+    rows = []
+    for i in range(robot.n_joints):
+        row: dict[str, Any] = {
+            "a": float(robot.a[i]), "alpha_deg": float(np.degrees(robot.alpha[i])), "d": float(robot.d[i]),
+            "theta_deg": float(np.degrees(robot.theta[i])),
+        }  # fmt: skip
+        if robot.mass[i]:
+            row |= {"mass": float(robot.mass[i]), "com": robot.com[i].tolist()}
+        rows.append(row)
+    return rows
+
+
+def poses_to_add(run: Run) -> Array:
+    """(K, n) joint angles in degrees whose measurement would tell most of the effects' parameters.
+
+    The determinant of the parameters' covariance falls most (D-optimal design, Fedorov 1972), one pose after
+    the other, each seen beside those before it.
+    """
+    found = run.labelled
+    if found is None or not run.terms:
+        return np.zeros((0, run.measurement.views.joints.shape[1]))
+    joints = nearby(run.measurement)[:_TRIED]
+    _, columns, covariance = candidate_rows(
+        candidate_measurement(run.measurement, joints), found.rows, found.landmarks, found.variances, run.terms
+    )
+    keep = np.concatenate([np.isfinite(s) for s in run.sigmas])
+    spread = np.concatenate(run.sigmas)[keep]
+    half = np.linalg.inv(np.linalg.cholesky(covariance))
+    # In units of what is known now: an information of one doubles it.
+    white = half @ np.concatenate(columns, axis=2)[..., keep] * spread
+    known, chosen = np.eye(int(keep.sum())), list[int]()
+    for _ in range(min(_PROPOSED, len(joints))):
+        gains = [np.linalg.slogdet(known + w.T @ w)[1] if k not in chosen else -np.inf for k, w in enumerate(white)]
+        chosen.append(int(np.argmax(gains)))
+        known = known + white[chosen[-1]].T @ white[chosen[-1]]
+    return np.asarray(np.degrees(joints[chosen]))

@@ -1,0 +1,42 @@
+"""What every cell's command can hand out beside its result: a Rerun recording, a page, a session folder.
+
+Recording and page come from whoever offers them under the entry points `stitch.cell_recordings` and
+`stitch.cell_reports`, by the command's name.
+"""
+
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stitch.errors import InputError
+from stitch.system.whole_file import whole
+
+RecordingOption = Annotated[
+    Path | None, typer.Option("--recording", metavar="FILE", help="Write a Rerun recording, .rrd.")
+]
+ReportOption = Annotated[Path | None, typer.Option("--report", metavar="FILE", help="Write one page, .html.")]
+SessionOption = Annotated[
+    Path | None,
+    typer.Option("--session", metavar="FOLDER", help="Write the readings as a session for `stitch run` and diagnose."),
+]
+
+
+def show(command: str, recording: Path | None, report: Path | None, *found: Any) -> None:
+    """Write recording and page of a command's job and result (`found`), each whole or not at all.
+
+    Raises:
+        InputError: nobody offers one for this command, or its folder does not exist.
+    """
+    for group, path in (("stitch.cell_recordings", recording), ("stitch.cell_reports", report)):
+        if path is None:
+            continue
+        offered = entry_points(group=group, name=command)
+        if not offered:
+            raise InputError(f"{path}: no writer for `stitch {command}` is installed; install stitch anew")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; make it first")
+        with whole(path) as scratch:
+            for writer in offered:
+                writer.load()(*found, scratch)

@@ -1,0 +1,66 @@
+"""`stitch fit JOB`: where the parts lie, how they differ from their CAD, and the robot path that follows them."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.cells.session_folder import write_sessions
+from stitch.cells.window import fit_parts, handover, read_fit_job
+from stitch.cells.window.job import Part, fit_document, write_fit
+
+
+def fit(
+    file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+) -> None:
+    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path."""
+    job = read_fit_job(file)
+    parts = fit_parts(job)
+    written = write_fit(job, parts, output) if output is not None else []
+    if session is not None:
+        write_sessions(session, [handover.session(file.stem, job.placed, job.cad_file)])
+    show("fit", recording, report, job, parts)
+    if as_json:
+        print(json.dumps(fit_document(job, parts), indent=1))
+        return
+    console = Console(stderr=True)
+    for i, part in enumerate(parts):
+        _print(console, i + 1, part)
+    for name in written:
+        print(f"{output}/{name}")
+
+
+def _print(console: Console, number: int, part: Part) -> None:
+    found, cells = part.fit, part.deviations.cells
+    x, y, z = found.T_base_part[:3, 3]
+    console.print(
+        f"Part {number}: origin {x:.3f} {y:.3f} {z:.3f} in the base, σ {found.sigma[3:].max():.4f} and "
+        f"{np.degrees(found.sigma[:3]).max():.5f}°; distances {found.scale:.3f} robust, {found.rms:.3f} rms."
+    )
+    if part.start.runner_up > 0.9 * part.start.share:
+        console.print(
+            f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part "
+            "is nearly symmetric, or too little of it was scanned."
+        )
+    bad = part.deviations.outside
+    if bad.any():
+        worst = int(np.argmax(np.abs(cells.mean)))
+        at = " ".join(f"{value:.0f}" for value in cells.middle[worst])
+        console.print(
+            f"  {bad.sum()} of {len(bad)} cells beyond {part.deviations.tolerance:g}; worst "
+            f"{cells.mean[worst]:+.2f} at {at}."
+        )
+    else:
+        console.print(f"  All {len(bad)} cells within {part.deviations.tolerance:g}.")
+    for name, count in part.forbidden.items():
+        if count:
+            console.print(f"  {count} points in forbidden region {name}; they did not count.")

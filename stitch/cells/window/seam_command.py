@@ -1,0 +1,55 @@
+"""`stitch seam JOB`: flush and gap around a window."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.cells.session_folder import write_sessions
+from stitch.cells.window import handover, read_seam_job, solve_seam
+from stitch.cells.window.job import write_seam
+from stitch.cells.window.seam import Limits, Seam
+
+
+def seam(
+    file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the stations.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+) -> None:
+    """Measure flush and gap at the stations of a seam, with uncertainty and verdict."""
+    job = read_seam_job(file)
+    seams = solve_seam(job)
+    if output is not None:
+        write_seam(seams, output)
+    if session is not None:
+        write_sessions(session, [handover.session(file.stem, job.placed)])
+    show("seam", recording, report, job, seams)
+    if as_json:
+        rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
+        print(json.dumps(rows, indent=1))
+        return
+    _print(seams, job.limits)
+    if output is not None:
+        print(output)
+
+
+def _print(seams: list[Seam], limits: Limits) -> None:
+    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
+    table = Table(title=f"Flush {flush} mm, gap {gap} mm", title_justify="left")
+    for heading in ("station", "flush / mm", "gap / mm", "verdict"):
+        table.add_column(heading)
+    for s in seams:
+        values = (f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}")
+        table.add_row(
+            s.station, *(("", "") if s.reason else values), f"{s.verdict}{': ' if s.reason else ''}{s.reason}"
+        )
+    Console(stderr=True).print(table)

@@ -1,0 +1,140 @@
+"""Where model and measurement part: the distance between views against everything that is known of them.
+
+Every correspondence counts twice, with its distance as seen from either view: + e with the properties of
+one point, − e with those of the other. A mean that differs from zero then says that one end of the property
+sits off against the other end. Intervals count views: points of one view share its error.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.comparison.tables import Comparison, Table, edges_of, view_properties
+from stitch.frames import Array, Indices
+from stitch.model.forward import corrected
+from stitch.observations.surfaces.gram import RMS_GATE
+from stitch.observations.surfaces.match import Match, sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
+from stitch.stored.load_state import State
+from stitch.system.threads import library_threads_off
+
+# Correspondences of a view in a bin that make a sample.
+_ENOUGH = 30
+_PLACES = 4  # cells along each axis of the part
+
+
+def compare(state: State) -> Comparison:
+    """Tables of the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate, place.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    with library_threads_off():
+        own = corrected(state.measurement, state.terms, state.T_mount)
+        poses = own.poses(state.T_mount)
+        overlaps = collect(own, poses, state.gate, [sample(s, FINE_SAMPLES) for s in own.scans])
+    rows = _Rows(state, poses, overlaps.matches, overlaps.gram.scale)
+    names = [view.name for view in state.session.views]
+    tables = [_labelled(rows, "view", rows.view, names), _pairs(rows, names)]
+    tables += [_binned(rows, name, unit, values) for name, unit, values in _properties(state, rows)]
+    tables.append(_regions(rows))
+    return Comparison(tuple(t for t in tables if len(t.count)), overlaps.gram.rms, overlaps.gram.scale)
+
+
+class _Rows:
+    """Both sides of every correspondence inside the robust gate."""
+
+    def __init__(self, state: State, poses: Array, matches: Sequence[Match], scale: float) -> None:
+        self.count = len(poses)
+        parts: list[list[Array]] = [[], [], [], [], [], []]
+        for m in matches:
+            inside = np.abs(m.residual) < RMS_GATE * scale
+            for sign, v, w, index in ((1.0, m.v, m.w, m.index_v), (-1.0, m.w, m.v, m.index_w)):
+                size = int(inside.sum())
+                points = state.measurement.capture.scans[v].points[index[inside]]
+                values = (np.full(size, v), np.full(size, w), sign * m.residual[inside], points,
+                          state.measurement.scan_views[v].cosine[index[inside]], m.middle[inside])  # fmt: skip
+                for part, value in zip(parts, values, strict=True):
+                    part.append(value)
+        view, partner, self.residual, self.points, self.cosine, self.place = (np.concatenate(p) for p in parts)
+        self.view, self.partner = view.astype(np.int64), partner.astype(np.int64)
+
+    def sums(self, bins: Indices, size: int) -> tuple[Array, Array, Array]:
+        """(size, V, V) counts, sums of e and of e² by bin, view and partner."""
+        key = (bins * self.count + self.view) * self.count + self.partner
+        shape, length = (size, self.count, self.count), size * self.count**2
+        return tuple(  # type: ignore[return-value]
+            np.bincount(key, w, length).reshape(shape) for w in (None, self.residual, self.residual**2)
+        )
+
+
+def _statistics(rows: _Rows, bins: Indices, size: int) -> tuple[Array, ...]:
+    """Mean, its sigma, rms, its sigma, count, views of every bin.
+
+    The sample is a view: its mean and rms in a bin. Their spread about the bin's is pooled over all bins,
+    because two or three views in one bin do not know it.
+    """
+    n, s, q = (x.sum(axis=2) for x in rows.sums(bins, size))  # (B, V)
+    use = n >= _ENOUGH
+    views = use.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, rms = s.sum(axis=1) / n.sum(axis=1), np.sqrt(q.sum(axis=1) / n.sum(axis=1))
+        sigmas = [_pooled(x, middle, use) for x, middle in ((s / n, mean), (np.sqrt(q / n), rms))]
+    return mean, sigmas[0], rms, sigmas[1], n.sum(axis=1), views
+
+
+def _pooled(values: Array, middle: Array, use: Array) -> Array:
+    count = use.sum(axis=1)
+    square = np.where(use, (values - middle[:, None]) ** 2, 0.0).sum()
+    freedom = int((count - 1)[count > 1].sum())
+    if freedom < 1:
+        return np.full(len(values), np.nan)
+    return np.asarray(np.sqrt(square / freedom / np.maximum(count, 1)))
+
+
+def _labelled(rows: _Rows, name: str, bins: Indices, labels: Sequence[str]) -> Table:
+    number = np.arange(len(labels), dtype=float)
+    return Table(name, "", number, number, tuple(labels), *_statistics(rows, bins, len(labels)))
+
+
+def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
+    n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
+    v, w = np.nonzero(np.triu(n, 1))
+    count, mean, square = n[v, w], s[v, w], q[v, w]
+    nothing = np.full(len(v), np.nan)
+    return Table(
+        "pair", "", np.arange(len(v), dtype=float), np.arange(len(v), dtype=float),
+        tuple(f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)), mean / count, nothing,
+        np.sqrt(square / count), nothing, count, np.full(len(v), 2),
+    )  # fmt: skip
+
+
+def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
+    """Name, unit and value of every property, per row."""
+    views, unit = state.measurement.views, state.session.length_unit
+    r = np.linalg.norm(rows.points, axis=1)
+    out = [
+        ("range", unit, r), ("incidence", "deg", np.degrees(np.arccos(np.clip(rows.cosine, -1, 1)))),
+        ("field a = x/z", "", rows.points[:, 0] / rows.points[:, 2]),
+        ("field b = y/z", "", rows.points[:, 1] / rows.points[:, 2]),
+        ("field ρ", "", np.hypot(rows.points[:, 0], rows.points[:, 1]) / rows.points[:, 2]),
+    ]  # fmt: skip
+    return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if np.ptp(values) > 1e-9]
+
+
+def _binned(rows: _Rows, name: str, unit: str, values: Array) -> Table:
+    """Bins with about equal counts; equal values stay together."""
+    edges = edges_of(values)
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
+    return Table(name, unit, edges[:-1], edges[1:], (), *_statistics(rows, bins, len(edges) - 1))
+
+
+def _regions(rows: _Rows) -> Table:
+    """Cells of the part along the axes of the reference frame."""
+    low, high = np.quantile(rows.place, [0.005, 0.995], axis=0)
+    cell = np.clip(((rows.place - low) / np.maximum(high - low, 1e-12) * _PLACES).astype(np.int64), 0, _PLACES - 1)
+    bins = (cell[:, 0] * _PLACES + cell[:, 1]) * _PLACES + cell[:, 2]
+    used, bins = np.unique(bins, return_inverse=True)
+    centre = [low + (np.array(np.unravel_index(b, (_PLACES,) * 3)) + 0.5) / _PLACES * (high - low) for b in used]
+    labels = [f"({c[0]:.4g}, {c[1]:.4g}, {c[2]:.4g})" for c in centre]
+    return _labelled(rows, "place on the part", bins.astype(np.int64), labels)

@@ -1,0 +1,46 @@
+"""What a diagnosis says: verdict, suspects, what depends on what, what to measure next."""
+
+from dataclasses import dataclass
+
+from stitch.diagnosis.covariate_dependence import Dependence
+from stitch.diagnosis.design.next_view import Proposal
+from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.sensitivity.aliases import Alias
+from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.frames import Array
+from stitch.observations.evidence import ViewEvidence
+
+
+@dataclass(frozen=True)
+class CandidateEffect:
+    """One candidate as diagnosis.json shows it."""
+
+    ranked: Ranked
+    aliases: tuple[Alias, ...]
+    cross_validation: CrossValidation | None
+    detectable: dict[str, float]  # smallest detectable size per parameter, alone
+    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`missed.py`)
+
+    @property
+    def name(self) -> str:
+        return self.ranked.name
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Verdict, suspects, dependences, next measurement."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    sentence: str
+    residual_rms: float
+    noise_floor: float
+    rotation: float  # repeatability under the present model, rad
+    translation: float  # length_unit
+    candidates: tuple[CandidateEffect, ...]
+    matrix: Array  # (S, S) alias matrix of the suspects
+    depends_on: tuple[Dependence, ...]
+    next: tuple[Proposal, ...]
+    missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
+    evidence: ViewEvidence
+    notes: tuple[str, ...] = ()

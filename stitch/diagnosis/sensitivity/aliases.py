@@ -1,0 +1,62 @@
+"""Which candidates look alike in these views: correlation of what they do, hand-eye and model projected out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.score import Score
+from stitch.frames import Array
+from stitch.observations.evidence import ViewEvidence
+
+SIMILAR = 0.9
+
+
+@dataclass(frozen=True)
+class Alias:
+    """Another effect that could do what this one does."""
+
+    name: str
+    correlation: float  # of this one's fitted pattern with the best that the other can do
+
+
+def pattern(evidence: ViewEvidence, scored: Score) -> Array:
+    """(n,) what the fitted candidate does to the views, in units of their scatter."""
+    white = evidence.whiten_channel(scored.form.columns)
+    if np.any(scored.values):
+        return np.asarray(white @ scored.values)
+    # Nothing fitted: the most visible combination of plausible size.
+    U, s, _ = np.linalg.svd(white * scored.form.sizes, full_matrices=False)
+    return np.asarray(U[:, 0] * s[0])
+
+
+def alias_matrix(evidence: ViewEvidence, scores: Sequence[Score]) -> Array:
+    """(K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
+
+    The other effect may use all its parameters, but none beyond ten times its plausible size.
+    """
+    patterns = [pattern(evidence, s) for s in scores]
+    whites = [evidence.whiten(s.candidate.twists)[:, s.candidate.forms[0].keep] for s in scores]
+    out = np.eye(len(scores))
+    for i, y in enumerate(patterns):
+        for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):
+            if i != j:
+                out[i, j] = _imitated(y, white * scored.candidate.forms[0].sizes)
+    return out
+
+
+def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = 0.7) -> list[Alias]:
+    """The most similar effects of candidate k."""
+    order = np.argsort(-matrix[k])
+    return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
+
+
+def _imitated(y: Array, X: Array) -> float:
+    length = float(np.linalg.norm(y))
+    if length == 0 or not X.size:
+        return 0.0
+    # Ridge at ten plausible sizes: what is invisible cannot be blown up to imitate anything.
+    M = X.T @ X + 0.01 * np.eye(X.shape[1])
+    fitted = X @ np.linalg.solve(M, X.T @ y)
+    reach = length * max(float(np.linalg.norm(fitted)), 1e-300)
+    return float(np.clip(float(fitted @ y) / reach, 0.0, 1.0))

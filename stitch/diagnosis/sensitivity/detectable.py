@@ -1,0 +1,74 @@
+"""The smallest size of an effect that these views would show: both tests in use pass with 80 % probability.
+
+An effect of true parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The
+scatter is known to ν degrees of freedom only, and takes its share of what the effect does: the test statistic q
+is non-central F, and the log evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the
+p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import f as f_distribution
+from scipy.stats import ncf
+
+from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.score import form_weights
+from stitch.diagnosis.selection.thresholds import ALPHA_NAME, GAIN, POWER
+from stitch.frames import Array
+from stitch.observations.evidence import ViewEvidence
+
+
+def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degrees_of_freedom: float) -> float:
+    """θᵀIθ that a form needs to be detected.
+
+    Args:
+        white: (n, p) whitened columns at their plausible sizes.
+        weight: share of the candidate's prior that the form has.
+        tests: number of candidates.
+        rest: numbers that are left beside the model.
+        degrees_of_freedom: degrees of freedom of the scatter along the columns.
+    """
+    information = np.linalg.eigvalsh(white.T @ white)
+    rank = int((information > 1e-2).sum())
+    if rank == 0:
+        return float("inf")
+    by_p = rank * float(f_distribution.isf(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1)))
+    evidence = GAIN - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
+    needed = max(by_p, degrees_of_freedom * float(np.expm1(2 * evidence / degrees_of_freedom)))
+    return float(
+        brentq(lambda size: ncf.sf(needed / rank, rank, degrees_of_freedom, size) - POWER, 1e-9, 9 * needed + 99)
+    )
+
+
+def smallest_detectable(evidence: ViewEvidence, candidate: Candidate, tests: int) -> dict[str, float]:
+    """Smallest detectable size of every free parameter of a candidate among so many."""
+    told = []
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        names = tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep)
+        white = evidence.whiten_channel(form.columns)
+        told.append(
+            (names, white, form.sizes, float(weight), evidence.degrees_of_freedom.of(evidence.in_blocks(white)))
+        )
+    e = evidence.evidence
+    return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
+
+
+def smallest_sizes(
+    forms: Sequence[tuple[tuple[str, ...], Array, Array, float, float]], tests: int, rest: int
+) -> dict[str, float]:
+    """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best.
+
+    Args:
+        forms: names of the parameters (p,), their whitened columns (n, p) per unit, plausible sizes (p,), weight,
+            degrees of freedom of the scatter along them.
+    """
+    found: dict[str, dict[tuple[str, ...], list[float]]] = {}
+    for names, white, sizes, weight, degrees_of_freedom in forms:
+        least = least_noncentrality(white * sizes, weight, tests, rest, degrees_of_freedom)
+        for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
+            size = float(np.sqrt(least) / length) if length > 0 else float("inf")
+            found.setdefault(name, {}).setdefault(names, []).append(size)
+    # Forms of the same parameters differ in when something happened: any of them could be true.
+    return {name: min(float(np.median(own)) for own in by_form.values()) for name, by_form in found.items()}

@@ -1,0 +1,82 @@
+"""The diagnosis in one plain sentence with its numbers."""
+
+import numpy as np
+
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.selection.select import IMPLAUSIBLE
+from stitch.units import MICROMETRES, rounded
+
+
+def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
+    """One sentence for each verdict."""
+    to_um = MICROMETRES[length_unit]
+    now, floor = (f"{x * to_um:.3g} µm" for x in (d.residual_rms, d.noise_floor))
+    scatter = f"{d.translation * to_um:.3g} µm and {d.rotation * 1e6:.3g} µrad"
+    if d.verdict == "adequate":
+        return (
+            f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}, and a pose "
+            f"repeatability of {scatter} explains the rest."
+        )
+    if d.verdict == "missing_effect":
+        return _missing(d, to_um, now, floor, second)
+    if d.verdict == "cannot_tell":
+        names = " or ".join(d.effects)
+        return f"Something is missing ({now} remain, noise {floor}), but these views cannot tell {names} apart" + (
+            f"; {d.next[0].do}." if d.next else "."
+        )
+    return _unknown(d, to_um, now, floor, scatter)
+
+
+def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | None) -> str:
+    name = d.effects[0]
+    candidate = next(s for s in d.candidates if s.name == name)
+    amounts = amounts_of(candidate.ranked)
+    gain = ""
+    if candidate.cross_validation is not None:
+        left = d.residual_rms * np.sqrt(candidate.cross_validation.inside) * to_um
+        out = d.residual_rms * np.sqrt(candidate.cross_validation.heldout) * to_um
+        gain = f"; adding it should leave about {left:.3g} µm, {out:.3g} µm on views left out"
+    more = f" {second.name} seems to be there too." if second else ""
+    return (
+        f"{name} is missing ({amounts}; p = {candidate.ranked.adjusted:.1g}): {now} remain where noise would leave "
+        f"{floor}{gain}.{more}"
+    )
+
+
+def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> str:
+    start = f"No effect of the library explains what is left ({now}, noise {floor}): "
+    clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
+    follows = f"it follows {', '.join(clear)}; " if clear else ""
+    notes = "".join(f"; {note}" for note in d.notes)
+    wild = d.rotation > IMPLAUSIBLE[0] or d.translation * to_um > 1e3 * IMPLAUSIBLE[1]
+    if not wild:
+        return f"{start}{follows}the poses scatter by {scatter} otherwise{notes}{_lack(d)}."
+    return (
+        f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, which no sound arm does; such "
+        f"errors repeat at the same poses, so that those found on one object mend another{notes}{_lack(d)}."
+    )
+
+
+def _lack(d: Diagnosis) -> str:
+    untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
+    if not untested:
+        return ""
+    return f"; without joint angles and the robot's geometry joint effects ({', '.join(untested)}) cannot be tested"
+
+
+def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
+    """The clearest parameters: c2 = 4.4e-07 ± 4e-08 rad/(N m)."""
+    s = ranked.score
+    if not np.isfinite(s.sigmas).all():
+        return "too small to be worth a fit"
+    kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
+    order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
+    told = [
+        f"{kept[i].name} = {rounded(s.values[i], s.sigmas[i])} ± {s.sigmas[i]:.1g} {kept[i].unit}".removesuffix(" 1")
+        for i in sorted(order)
+    ]
+    grid = [
+        f"{p.name} = {v:g} {p.unit}" for p, v in zip(s.candidate.parameters, s.form.term.values, strict=True) if p.grid
+    ]
+    return ", ".join(grid + told)

@@ -1,0 +1,103 @@
+"""What a candidate would leave, in the fit and on views left out, in the linear approximation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.score import Score
+from stitch.frames import Array
+from stitch.observations.evidence import Trial, ViewEvidence
+from stitch.observations.surfaces.point_effects import PointGram
+
+# Of a plausible size: what was not found has some size, or its prior would have none.
+_NOTHING = 1e-6
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Mean square of what remains over that of the present model."""
+
+    inside: float  # fitted on all views
+    heldout: float  # each fold judged by a fit without it
+    poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
+    poses_sigma: float  # standard error of `poses` over folds
+    steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
+
+    @property
+    def helps(self) -> bool:
+        """True if views left out are predicted better, by more than a standard error."""
+        return self.poses <= 1 - self.poses_sigma
+
+
+def present_square(evidence: ViewEvidence) -> float:
+    """Weighted sum of squares of the present model."""
+    present = evidence.trial(evidence.model)
+    return float(present.squares(present.solve(None)).sum())
+
+
+def cross_validate(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> CrossValidation:
+    """Add the best form of a candidate to the model, in the linear approximation."""
+    X = np.hstack([evidence.model, scored.form.twists])
+    own = None if points is None or scored.candidate.points is None else _own(points, scored)
+    trial, present = evidence.trial(X, own), evidence.trial(evidence.model)
+    believed = evidence.trial(X, own, believed_size(evidence, scored))
+    whole = trial.solve(None)
+    shares, weights = [], []
+    scatter = np.zeros((2, 0))
+    for fold in evidence.folds():
+        touched = evidence.touched(fold)
+        without = [t.solve(fold) for t in (believed, present)]
+        squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
+        shares.append(squares[0] / max(squares[1], 1e-300))
+        weights.append(squares[1])
+        off = [t.scatter(fold, x) for t, x in zip((trial, present), without, strict=True)]
+        scatter = np.column_stack([scatter, off])
+    return CrossValidation(
+        float(trial.squares(whole).sum() / present_square(evidence)), float(np.average(shares, weights=weights)),
+        *share_of(*scatter), _steadiness(evidence, trial, X, whole),
+    )  # fmt: skip
+
+
+def believed_size(evidence: ViewEvidence, scored: Score) -> Array:
+    """(k,) precision of a prior for model and candidate in fits without some views.
+
+    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
+    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
+    left to see does not count for more than that.
+    """
+    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
+    size = np.maximum(size, _NOTHING * scored.form.sizes)
+    return np.append(np.zeros(evidence.model.shape[1]), 1 / size**2)
+
+
+def share_of(with_it: Array, without: Array) -> tuple[float, float]:
+    """How far left-out views lie from one prediction over the other, squared, and its standard error.
+
+    Args:
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under one prediction.
+        without: (G,) under the other.
+    """
+    share = float(with_it.sum() / max(without.sum(), 1e-300))
+    spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
+    return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
+
+
+def _own(points: PointGram, scored: Score) -> PointGram:
+    keep = np.arange(points.residual.shape[1])[scored.candidate.points][scored.form.keep]
+    return PointGram(points.vector[:, :, keep], points.residual[:, keep], points.square[:, keep][:, :, keep])
+
+
+def _steadiness(evidence: ViewEvidence, trial: Trial, X: Array, whole: Array) -> float:
+    """A combination of parameters that one view carries alone vanishes without it."""
+    size = X.shape[1] - evidence.model.shape[1]
+    theta = whole[-size:]
+    norm = float(theta @ theta)
+    if norm == 0:
+        return 0.0
+    white = evidence.whiten(X[:, -size:])
+    strength = float(np.sum((white @ theta) ** 2))
+    shares = [
+        float((white @ theta) @ (white @ trial.solve(np.array([v]))[-size:])) / max(strength, 1e-300)
+        for v in trial.influential_views(whole)
+    ]
+    return min(shares)

@@ -1,1 +1,0 @@
-"""Labelled points and measured probes: the same chain, effects and statistics without a cloud to match."""

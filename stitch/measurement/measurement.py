@@ -1,0 +1,137 @@
+"""The chain of frames with effects in it: everything that a model needs to place the points.
+
+    x_ref = part⁻¹( robot(q*) · mount* · sensor⁻¹(x) )
+
+A capture keeps this form: `T_reference_mount` holds what stands left of the hand-eye, `T_behind_mount`
+what stands right of it, and the points are those that sensor and part would have shown without effects.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch import frames
+from stitch.effects.contract import EVERY_VIEW, Effect, Parameter
+from stitch.frames import Array
+from stitch.measurement.capture import Capture
+from stitch.measurement.robot import Robot
+from stitch.measurement.session import Session
+from stitch.measurement.views import ScanView, Views, views_of
+
+# Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
+_SMALLEST_COSINE = 0.1
+_EVENT_PLACES = 50
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured: everything that a model needs to place the points."""
+
+    capture: Capture  # without any effect
+    T_base_flange: Array  # (V, 4, 4) reported
+    eye_to_hand: bool
+    robot: Robot | None
+    views: Views
+    scan_views: tuple[ScanView, ...]
+    length_unit: str
+    target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
+
+    def parameters(self, effect: Effect) -> tuple[Parameter, ...]:
+        """The parameters of an effect in this session; where time stands in for a temperature, rates are per hour."""
+        found = effect.parameters(self.views.joints.shape[1], self.views.torques.names, self.length_unit)
+        timed = bool(effect.prefers) and not any(self.views.has(name) for name in effect.prefers)
+        return tuple(replace(p, grid=self._grid(p), unit=p.unit.replace("°C", "h") if timed else p.unit) for p in found)
+
+    def _grid(self, parameter: Parameter) -> tuple[float, ...]:
+        if parameter.grid != EVERY_VIEW:
+            return parameter.grid
+        # An event can come before any view but the first two and the last: one view alone shows no event.
+        places = range(2, self.views.count - 1)
+        # Among hundreds of views the place of an event matters less than the time to try them all.
+        return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
+
+    def arguments(self, effect: Effect, values: Array) -> dict[str, float | Array]:
+        """Keyword arguments of the effect's function."""
+        return effect.arguments(values, self.views.joints.shape[1], len(self.views.torques.names))
+
+    def lacks(self, effect: Effect) -> tuple[str, ...]:
+        """What an effect needs and this session has not; time stands in for a covariate that it prefers."""
+        known = {"intensity": self.has_intensity}
+        lacking = [need for need in effect.needs if not known.get(need, self.views.has(need))]
+        if effect.prefers and not any(self.views.has(name) for name in (*effect.prefers, "time")):
+            lacking.append("time")
+        return tuple(lacking)
+
+    @property
+    def has_intensity(self) -> bool:
+        """True if every point has an intensity."""
+        return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect in use with the values of its parameters (P,), in the order of its specs."""
+
+    effect: Effect
+    values: Array
+
+
+def measurement_of(session: Session, capture: Capture) -> Measurement:
+    """Collect a session and its prepared scans."""
+    views = views_of(session)
+    eye_to_hand = session.mount == "eye_to_hand"
+    T_base_flange = np.array([view.T_base_flange for view in session.views])
+    down = downwards(session.robot, T_base_flange, eye_to_hand)
+    intensity = _intensities(session)
+    size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
+    scan_views = tuple(
+        ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v], down[v], size)
+        for v, scan in enumerate(capture.scans)
+    )  # fmt: skip
+    target_views: tuple[ScanView, ...] = ()
+    if capture.sightings is not None:
+        # Nobody knows at what slant a target was seen, or how bright: effects of these have nothing to say about it.
+        straight = np.ones(capture.sightings.used.shape[1])
+        usual = None if intensity[0] is None else np.zeros(len(straight))
+        target_views = tuple(ScanView(v, views, straight, usual, down[v], size) for v in range(views.count))
+    return Measurement(
+        capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit, target_views
+    )
+
+
+def downwards(robot: Robot | None, T_base_flange: Array, eye_to_hand: bool) -> Array:
+    """(V, 3) unit vector of gravity in the reference frame."""
+    gravity = np.array([0.0, 0.0, -1.0])
+    if robot is not None and np.linalg.norm(robot.gravity) > 0:
+        gravity = robot.gravity / np.linalg.norm(robot.gravity)
+    if not eye_to_hand:
+        return np.tile(gravity, (len(T_base_flange), 1))
+    return np.asarray(frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0])
+
+
+def about_part(measurement: Measurement, T_mount: Array) -> Measurement:
+    """The chain with the origin about which a part grows; a coarse hand-eye is enough.
+
+    On the flange that is the flange, which holds it; in the cell it is the middle of what the views show.
+    """
+    if measurement.eye_to_hand:
+        return measurement
+    views = zip(measurement.capture.poses(T_mount), measurement.capture.shown, strict=True)
+    origin = np.mean([frames.transform(T, points).mean(axis=0) for T, points in views if len(points)], axis=0)
+    scan_views, target_views = (
+        tuple(replace(v, origin=origin) for v in w) for w in (measurement.scan_views, measurement.target_views)
+    )
+    return replace(measurement, scan_views=scan_views, target_views=target_views)
+
+
+def _intensities(session: Session) -> list[Array | None]:
+    """Standardised over the session: (I − Ī)/σ_I."""
+    raw = [None if v.cloud is None else v.cloud.scalars.get("intensity") for v in session.views]
+    if any(values is None for values in raw):
+        return [None] * len(raw)
+    everything = np.concatenate([values for values in raw if values is not None])
+    # One value that is not finite would spoil the mean of all: intensity then counts as absent, in every view.
+    if not np.isfinite(everything).all() or everything.std() <= 0:
+        return [None] * len(raw)
+    spread = float(everything.std())
+    return [None if values is None else (values - everything.mean()) / spread for values in raw]

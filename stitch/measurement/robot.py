@@ -1,0 +1,139 @@
+"""Serial robots: forward kinematics, joint axes, Jacobian and gravity torques, vectorised over poses.
+
+One joint is `before · Rz(q + theta) · after`: standard DH has before = 1 and after = Tz(d)Tx(a)Rx(α)
+(Denavit & Hartenberg 1955), modified DH before = Rx(α)Tx(a) and after = Tz(d) (Craig 1986), URDF
+before = origin with the joint axis turned to z and after = its inverse turn.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A chain of n revolute joints. Lengths in length_unit, angles in rad, masses in kg."""
+
+    name: str
+    convention: str  # standard | modified | urdf
+    before: Array  # (n, 4, 4)
+    after: Array  # (n, 4, 4)
+    theta: Array  # (n,) offset added to the joint angle
+    mass: Array  # (n,) of link i, which joint i moves
+    com: Array  # (n, 3) in the link's own frame, after joint i
+    payload_mass: float
+    payload_com: Array  # (3,) in the flange frame
+    gravity: Array  # (3,) m/s² in the base frame
+    metres_per_unit: float
+    a: Array | None = None  # (n,) DH parameters, None for URDF
+    alpha: Array | None = None
+    d: Array | None = None
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.theta)
+
+    @property
+    def has_masses(self) -> bool:
+        """True if any link or payload mass is known, so that torques mean something."""
+        return bool(self.mass.any() or self.payload_mass)
+
+
+def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
+    """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
+    angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    T = np.zeros((*angle.shape, 4, 4))
+    T[..., i, i] = T[..., 3, 3] = 1.0
+    T[..., j, j] = T[..., k, k] = np.cos(angle)
+    T[..., k, j] = np.sin(angle)
+    T[..., j, k] = -T[..., k, j]
+    T[..., i, 3] = shift
+    return T
+
+
+def link_frames(robot: Robot, joints: Array) -> Array:
+    """T_base_link (..., n+1, 4, 4) for joint angles (..., n) in rad; index 0 is the base itself."""
+    joints = np.asarray(joints, float)
+    out = [np.broadcast_to(np.eye(4), (*joints.shape[:-1], 4, 4))]
+    for i in range(robot.n_joints):
+        turn = elementary("z", joints[..., i] + robot.theta[i])
+        out.append(out[-1] @ robot.before[i] @ turn @ robot.after[i])
+    return np.stack(out, axis=-3)
+
+
+def forward(robot: Robot, joints: Array) -> Array:
+    """T_base_flange (..., 4, 4) for joint angles (..., n) in rad."""
+    return np.asarray(link_frames(robot, joints)[..., -1, :, :])
+
+
+def forward_with_errors(robot: Robot, joints: Array, scale: Array, da: Array, dd: Array, dalpha: Array) -> Array:
+    """T_base_flange (V, 4, 4) of an arm whose lengths are `scale` (V,) times too long and whose rows are off.
+
+    da, dd (n,) in length_unit and dalpha (n,) in rad are errors of the DH rows; for URDF they act behind
+    the joint in the frame that its axis makes: along x, along z, about x.
+    """
+    modified = robot.convention == "modified"
+    x_error, z_error = elementary("x", dalpha, da), elementary("z", 0, dd)
+    T = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
+    for i in range(robot.n_joints):
+        before, after = (np.tile(m[i], (len(joints), 1, 1)) for m in (robot.before, robot.after))
+        if modified:
+            before, after = before @ x_error[i], after @ z_error[i]
+        else:
+            after = z_error[i] @ after @ x_error[i]
+        before[:, :3, 3] *= scale[:, None]
+        after[:, :3, 3] *= scale[:, None]
+        T = T @ before @ elementary("z", joints[:, i] + robot.theta[i]) @ after
+    return np.asarray(T)
+
+
+def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
+    """A point on each joint axis and its direction, both (..., n, 3), in the base frame."""
+    axis_frame = link_frames(robot, joints)[..., :-1, :, :] @ robot.before
+    return axis_frame[..., :3, 3], axis_frame[..., :3, 2]
+
+
+def jacobian(robot: Robot, joints: Array) -> Array:
+    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
+
+    The columns are the joint screws seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    """
+    point, axis = joint_axes(robot, joints)
+    T = forward(robot, joints)
+    lever = T[..., None, :3, 3] - point
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)[..., None, :, :]
+    turned = [(Rt @ v[..., None])[..., 0] for v in (axis, np.cross(axis, lever))]
+    return np.swapaxes(np.concatenate(turned, axis=-1), -1, -2)
+
+
+def unit_torques(robot: Robot, joints: Array) -> Array:
+    """(..., n, n) N·m about joint i of 1 kg at the origin of link k's frame; 0 where joint i does not carry it."""
+    link = link_frames(robot, joints)
+    point, axis = joint_axes(robot, joints)
+    lever = link[..., None, 1:, :3, 3] - point[..., :, None, :]
+    torque = np.einsum("...ij,...ikj->...ik", axis, np.cross(lever, robot.gravity))
+    n = robot.n_joints
+    return np.asarray(torque * robot.metres_per_unit * (np.arange(n)[None, :] >= np.arange(n)[:, None]))
+
+
+def gravity_torques(robot: Robot, joints: Array) -> Array:
+    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
+
+    Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
+    """
+    link = link_frames(robot, joints)
+    point, axis = joint_axes(robot, joints)
+    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
+    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
+    centres = np.concatenate([centres, tool[..., None, :]], axis=-2)
+    mass = np.append(robot.mass, robot.payload_mass)
+    # Link k is moved by joint i if k ≥ i; the payload by all.
+    beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]
+    moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
+    moment -= (beyond @ mass)[:, None] * point
+    torque = np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity))
+    return np.asarray(torque * robot.metres_per_unit)

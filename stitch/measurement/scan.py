@@ -1,0 +1,110 @@
+"""A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.frames import Array, Indices
+from stitch.measurement.session import Session
+from stitch.system.threads import parallel
+
+# Neighbours of the local plane: enough to average the noise, few enough to follow a fillet.
+_PLANE_NEIGHBOURS = 16
+# The quadric of the noise estimate has six coefficients; 24 neighbours leave 18 degrees of freedom.
+_QUADRIC_NEIGHBOURS = 24
+_NOISE_SAMPLES = 1500
+# Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
+# radius, the centroid has left the point: the surface ends here.
+_GRAZING_COSINE = np.cos(np.radians(75.0))
+_EDGE_OFFSET = 0.35
+# Surface variation λ₀/(λ₀+λ₁+λ₂) of a crease (Pauly et al. 2002); a plane has 0.
+_CREASE_VARIATION = 0.05
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One view in the scanner frame, length_unit; arrays of N points, float64."""
+
+    name: str
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3) unit, towards the scanner
+    usable: Array  # (N,) bool: neither edge nor crease nor grazing
+    area: Array  # (N,) surface per point: the inverse of the local density
+    confidence: Array  # (N,) cosine of incidence
+    tree: Any  # pykdtree KDTree over `points`
+    spacing: float  # median distance between neighbours
+    noise: float  # 1-sigma across the surface, from the scan itself
+
+
+def prepare(session: Session) -> tuple[Scan, ...]:
+    """Scans of all views of a cloud session, in the order of views.csv."""
+    clouds = [(view.name, view.cloud.points) for view in session.views if view.cloud]
+    return tuple(parallel(lambda item: prepare_view(*item), clouds))
+
+
+def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Scan:
+    """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan.
+
+    Args:
+        picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
+    """
+    points = np.ascontiguousarray(points, float)
+    tree = KDTree(points, leafsize=16)
+    own = points if picked is None or len(picked) == len(points) else points[picked]
+    neighbours = min(_PLANE_NEIGHBOURS, len(points))
+    distance, index = tree.query(own, k=neighbours)
+    around = points[index]
+    centroid = around.mean(axis=1)
+    radius = distance[:, -1]
+    normals, variation = _planes(around - centroid[:, None])
+    ray = own / np.linalg.norm(own, axis=1, keepdims=True)
+    cosine = np.einsum("ij,ij->i", normals, ray)
+    normals *= -np.sign(cosine)[:, None]
+    confidence = np.abs(cosine)
+    offset = np.linalg.norm(centroid - own, axis=1)
+    usable = (confidence > _GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
+    usable &= variation < _CREASE_VARIATION
+    noise = _noise(points, own, normals, tree)
+    if len(own) < len(points):
+        tree = KDTree(own, leafsize=16)
+        distance, _ = tree.query(own, k=2)
+    area = np.pi * radius**2 / neighbours * (len(points) / len(own))
+    return Scan(name, own, normals, usable, area, confidence, tree, float(np.median(distance[:, 1])), noise)
+
+
+def _planes(centred: Array) -> tuple[Array, Array]:
+    """Normals (N, 3) and surface variation (N,) of neighbourhoods (N, k, 3) about their centroid."""
+    covariance = np.matmul(centred.transpose(0, 2, 1), centred)
+    values, vectors = np.linalg.eigh(covariance)
+    return np.ascontiguousarray(vectors[:, :, 0]), values[:, 0] / np.maximum(values.sum(axis=1), 1e-300)
+
+
+def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
+    """1-sigma of the points across a local quadric: median over neighbourhoods of some of `own` in `points`.
+
+    A plane would count curvature as noise. White noise only: an error that is smooth over the
+    neighbourhood moves the quadric with it and is not seen.
+    """
+    count = min(_QUADRIC_NEIGHBOURS, len(points))
+    if count <= 8:
+        return float("nan")
+    centre = np.linspace(0, len(own) - 1, min(_NOISE_SAMPLES, len(own))).astype(int)
+    _, index = tree.query(own[centre], k=count)
+    local = points[index] - own[centre][:, None]
+    n = normals[centre]
+    helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    a = np.cross(n, helper)
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b = np.cross(n, a)
+    x, y, z = (np.einsum("nki,ni->nk", local, axis) for axis in (a, b, n))
+    scale = np.maximum(np.abs(x).max(axis=1, keepdims=True), 1e-300)
+    x, y = x / scale, y / scale
+    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    q, _ = np.linalg.qr(design)
+    rest = z - np.einsum("nkc,nc->nk", q, np.einsum("nkc,nk->nc", q, z))
+    variance = (rest**2).sum(axis=1) / (count - 6)
+    # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
+    degrees = count - 6
+    return float(np.sqrt(np.median(variance) / (1 - 2 / (9 * degrees)) ** 3))

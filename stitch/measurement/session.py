@@ -1,0 +1,64 @@
+"""What was measured: a session, its views and its scanner."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from stitch.frames import Array
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.labelled_points import Nominal, Sighting
+from stitch.measurement.robot import Robot
+
+Mount = Literal["eye_to_hand", "eye_in_hand"]
+
+
+@dataclass(frozen=True)
+class View:
+    """One row of views.csv."""
+
+    name: str
+    cloud: Cloud | None
+    T_base_flange: Array  # (4, 4), reported, or from the joints where no pose is reported
+    joints: Array | None  # (n,) rad
+    approach: Array | None  # (n,) -1, 0, +1
+    time_s: float | None
+    covariates: dict[str, float]
+    sighting: Sighting | None = None  # labelled points or a measured probe
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """The scanner as session.toml describes it."""
+
+    T_mount: Array | None  # (4, 4) coarse hand-eye: T_base_scanner or T_flange_scanner
+    noise: float | None
+    standoff: float | None
+    optical_axis: Array  # (3,) unit vector in the scanner frame
+
+
+@dataclass(frozen=True)
+class Session:
+    """What was measured. Lengths in length_unit, angles in rad."""
+
+    path: Path
+    name: str
+    length_unit: str
+    mount: Mount
+    scanner: Scanner
+    robot: Robot | None
+    sphere_radius: float | None
+    cad: Path | None
+    cad_unit: str | None
+    views: tuple[View, ...]
+    warnings: tuple[str, ...] = field(default=())
+    nominal: Nominal | None = None  # targets in the part frame
+
+    @property
+    def has_clouds(self) -> bool:
+        """True if every view has a cloud."""
+        return all(view.cloud is not None for view in self.views)
+
+    @property
+    def has_sightings(self) -> bool:
+        """True if some view shows labelled points or a probe."""
+        return any(view.sighting is not None for view in self.views)

@@ -1,0 +1,171 @@
+"""What effects may know of the views: all of them at once (`Views`), or one with its points (`ScanView`)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stitch.frames import Array, Indices
+from stitch.measurement import robot as kinematics
+from stitch.measurement.robot import Robot
+from stitch.measurement.session import Session
+
+# Joint angles that show which torques of an arm differ.
+_ANYWHERE = 100
+
+
+@dataclass(frozen=True)
+class Torques:
+    """Gravity torques of which joints sag: with masses one a joint, without them one a joint and a link beyond."""
+
+    names: tuple[str, ...]
+    joint: tuple[int, ...]  # that the torque bends
+    values: Array  # (V, m) N·m about +z of that joint; of 1 kg at the link's frame where masses are unknown
+
+
+@dataclass(frozen=True)
+class Views:
+    """All V views of a session, in the order of time; rad, s, length_unit."""
+
+    count: int
+    time: Array  # (V,) since the first view; NaN where the session has no time
+    joints: Array  # (V, n); n = 0 without joints or robot
+    previous: Array  # (V, n) joints of the row before, its own for the first
+    approach: Array  # (V, n) −1, 0, +1
+    velocity: Array | None  # (V, n) from columns jN_velocity_deg_s
+    torques: Torques
+    covariates: dict[str, Array]  # (V,) each, without gaps
+    standoff: float
+    first: dict[str, float]  # the covariates at the session's first view
+    number: Indices  # (V,) of the view in its session, from 0
+
+    def sag(self, c: Array) -> Array:
+        """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
+        out = np.zeros_like(self.joints)
+        for k, joint in enumerate(self.torques.joint):
+            out[:, joint] += c[k] * self.torques.values[:, k]
+        return out
+
+    def since_first(self, covariate: str) -> Array:
+        """(V,) a covariate less its value at the first view."""
+        return np.asarray(self.covariates[covariate] - self.first[covariate])
+
+    @property
+    def hours(self) -> Array:
+        """(V,) since the first view."""
+        return self.time / 3600.0
+
+    def has(self, need: str) -> bool:
+        """True if joints, time, torque, velocity or a covariate is known for every view."""
+        known = {
+            "joints": self.joints.shape[1] > 0,
+            "torque": len(self.torques.names) > 0,
+            "velocity": self.velocity is not None,
+            "time": bool(np.isfinite(self.time).all()) and self.count > 1 and float(np.ptp(self.time)) > 0,
+        }
+        return bool(known.get(need, need in self.covariates))
+
+
+@dataclass(frozen=True)
+class ScanView:
+    """One view for the functions of points: N of them in the scanner frame, or the reference frame for `shape`."""
+
+    index: int
+    views: Views
+    cosine: Array  # (N,) of incidence, 0 … 1
+    intensity: Array | None  # (N,) standardised over the session
+    gravity: Array  # (3,) unit vector in the reference frame
+    size: float  # of the part: lengths of shape effects may be counted in it
+    origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
+
+    def along(self, points: Array) -> Array:
+        """(N, 3) unit rays."""
+        return np.asarray(points / np.sqrt(np.einsum("ij,ij->i", points, points))[:, None])
+
+    def rho2(self, points: Array) -> Array:
+        """(N,) ρ² = a² + b² of (a, b) = (x/z, y/z)."""
+        return np.asarray((points[:, 0] ** 2 + points[:, 1] ** 2) / points[:, 2] ** 2)
+
+    def since_first(self, covariate: str) -> float:
+        """A covariate of this view less its value at the first one."""
+        return float(self.views.since_first(covariate)[self.index])
+
+    @property
+    def hours(self) -> float:
+        """Since the first view."""
+        return float(self.views.hours[self.index])
+
+
+def views_of(session: Session) -> Views:
+    """Collect what effects may know; joints count only where the robot's kinematics are known too."""
+    rows = session.views
+    count = len(rows)
+    use = session.robot is not None and all(row.joints is not None for row in rows)
+    joints = np.array([row.joints for row in rows]) if use else np.zeros((count, 0))
+    approach = np.array([row.approach for row in rows]) if use else np.zeros((count, 0))
+    previous = np.vstack([joints[:1], joints[:-1]])
+    time = np.array([np.nan if row.time_s is None else row.time_s for row in rows])
+    names = {name for row in rows for name in row.covariates}
+    covariates = {
+        name: np.array([row.covariates[name] for row in rows])
+        for name in sorted(names)
+        if all(name in row.covariates for row in rows)
+    }
+    speeds = [f"j{i + 1}_velocity_deg_s" for i in range(joints.shape[1])]
+    moving = bool(speeds) and all(name in covariates for name in speeds)
+    velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds])) if moving else None
+    standoff = session.scanner.standoff or _median_range(session)
+    torques = torques_of(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
+    first = {name: float(course[0]) for name, course in covariates.items()}
+    return Views(
+        count,
+        time - time[0],
+        joints,
+        previous,
+        approach,
+        velocity,
+        torques,
+        covariates,
+        standoff,
+        first,
+        np.arange(count),
+    )
+
+
+def _median_range(session: Session) -> float:
+    ranges = [np.median(np.linalg.norm(v.cloud.points, axis=1)) for v in session.views if v.cloud]
+    ranges += [np.median(np.linalg.norm(v.sighting.points, axis=1)) for v in session.views if v.sighting]
+    return float(np.median(ranges)) if ranges else 1.0
+
+
+def torques_of(robot: Robot, joints: Array) -> Torques:
+    """Gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles."""
+    n = robot.n_joints
+    if robot.has_masses:
+        values = kinematics.gravity_torques(robot, joints)
+        return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
+    # Without masses the shape of every torque follows from the geometry: 1 kg at each link's frame. Angles from
+    # everywhere choose among them: a coefficient must mean the same in every session of an arm.
+    everywhere = np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, n))
+    shapes = kinematics.unit_torques(robot, everywhere)
+    keep = [(i, k) for i in range(n) for k in _different(shapes[:, i], range(i, n))]
+    unit = kinematics.unit_torques(robot, joints)
+    return Torques(
+        tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep),
+        np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep)),
+    )  # fmt: skip
+
+
+def _different(torques: Array, links: Sequence[int]) -> list[int]:
+    """The links whose unit torque (V, n) about one joint changes and is no combination of those before it.
+
+    Frames of a wrist share their origin: a second torque from the same place would only make both unknown.
+    """
+    chosen, basis = list[int](), np.zeros((len(torques), 0))
+    for k in links:
+        own = torques[:, k]
+        rest = own - basis @ (basis.T @ own)
+        if np.ptp(own) > 1e-3 and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
+            chosen.append(k)
+            basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+    return chosen

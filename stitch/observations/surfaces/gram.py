@@ -1,0 +1,137 @@
+"""Normal equations over view pairs, robust weights and generalised least squares on view poses.
+
+Every pair (v, w) sees e = e₀ + B(δ_v − δ_w) with B = [m × n, n], m the midpoint and n the mean
+normal: the symmetric point-to-plane distance under left twists δ of the two poses in the reference
+frame. Taking one midpoint for both sides keeps the common motion of all views exactly free. A
+correction of the hand-eye ξ (right perturbation, scanner frame) moves view v by Ad(T_v) ξ, so the
+hand-eye fit, the per-view fit and their statistics all read the same 6x6 Gram matrices: memory is
+O(pairs), never O(points x parameters).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array, Mask
+from stitch.observations.surfaces.match import Match
+
+_MAD_TO_SIGMA = 1.4826
+# Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).
+_TUKEY = 4.685
+# Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
+RMS_GATE = 4.0
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Sums over the correspondences of P pairs of V views, about `centre`."""
+
+    views: int
+    pairs: Array  # (P, 2) int
+    matrix: Array  # (P, 6, 6) Σ w BᵀB
+    vector: Array  # (P, 6) Σ w Bᵀe
+    square: Array  # (P,) Σ w e²
+    weight: Array  # (P,) Σ w; 0 for labelled points
+    count: Array  # (P,) correspondences inside the robust gate; 0 for labelled points
+    raw_square: Array  # (P,) Σ e² inside the robust gate
+    scale: float  # robust sigma of e
+    centre: Array  # (3,)
+    labelled: Mask  # (P,) pairs of labelled points (`target_pairs.py`), in the surfaces' unit of variance
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of e inside the robust gate."""
+        return float(np.sqrt(self.raw_square.sum() / max(self.count.sum(), 1)))
+
+    @property
+    def lever(self) -> float:
+        """Rms distance by which a radian about `centre` displaces the correspondences along their normals."""
+        total = self.matrix.sum(axis=0)
+        return float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
+
+    @property
+    def variance(self) -> float:
+        """Weighted mean of e² between surfaces."""
+        return float(self.square[~self.labelled].sum() / max(self.weight.sum(), 1e-300))
+
+
+def robust_scale(matches: Iterable[Match]) -> float:
+    """1.4826 × median |e| over all pairs: e is symmetric about zero, so no centring."""
+    residuals = [np.abs(m.residual) for m in matches]
+    return _MAD_TO_SIGMA * float(np.median(np.concatenate(residuals))) if residuals else float("nan")
+
+
+def tukey(e: Array, scale: float) -> Array:
+    """Biweight of residuals at a robust sigma."""
+    return np.asarray(np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2)
+
+
+def gram(
+    matches: Sequence[Match], views: int, centre: Array, scale: float, weights: Sequence[Array] | None = None
+) -> Gram:
+    """Accumulate the pairs; Tukey weights at `scale` unless `weights` gives them per match."""
+    rows = [_accumulate(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
+    matrix, vector, square, weight, count, raw = (np.array(column) for column in zip(*rows, strict=True))
+    pairs = np.array([(m.v, m.w) for m in matches])
+    return Gram(views, pairs, matrix, vector, square, weight, count, raw, scale, centre, np.zeros(len(pairs), bool))
+
+
+def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> tuple[Array | float, ...]:
+    e = m.residual
+    if weight is None:
+        weight = m.weight * tukey(e, scale)
+    B = np.concatenate([np.cross(m.middle - centre, m.normal), m.normal], axis=1)
+    weighted = B * weight[:, None]
+    inside = np.abs(e) < RMS_GATE * scale
+    return (
+        weighted.T @ B, weighted.T @ e, float(weight @ e**2), float(weight.sum()),
+        int(inside.sum()), float((e[inside] ** 2).sum()),
+    )  # fmt: skip
+
+
+def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
+    """H (6V, 6V) and b (6V,) of all pairs: the cost is ½ δᵀHδ + bᵀδ; `keep` masks pairs."""
+    H = np.zeros((g.views, 6, g.views, 6))
+    b = np.zeros((g.views, 6))
+    for i, (v, w) in enumerate(g.pairs):
+        if keep is not None and not keep[i]:
+            continue
+        H[v, :, v] += g.matrix[i]
+        H[w, :, w] += g.matrix[i]
+        H[v, :, w] -= g.matrix[i]
+        H[w, :, v] -= g.matrix[i]
+        b[v] += g.vector[i]
+        b[w] -= g.vector[i]
+    n = 6 * g.views
+    return H.reshape(n, n), b.reshape(n)
+
+
+def pair_squares(g: Gram, twists: Array) -> Array:
+    """Σ w e² of every pair (P,) after the views moved by `twists` (V, 6), without new matches."""
+    difference = twists[g.pairs[:, 0]] - twists[g.pairs[:, 1]]
+    linear = np.einsum("pi,pi->p", g.vector, difference)
+    quadratic = np.einsum("pi,pij,pj->p", difference, g.matrix, difference)
+    return np.asarray(g.square + 2 * linear + quadratic)
+
+
+def column_space(columns: Array, relative: float = 1e-9) -> Array:
+    """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(U[:, s > relative * s[0]])
+
+
+def fit_columns(columns: Array, values: Array) -> Array:
+    """(K,) least squares of columns (n, K), whatever their units, to values (n,)."""
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale)
+
+
+def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
+    """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale[None, :])
+    keep = values > relative * values[-1]
+    projected = vectors[:, keep].T @ (-vector * scale) / values[keep]
+    return np.asarray(scale * (vectors[:, keep] @ projected))

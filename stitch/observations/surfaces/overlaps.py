@@ -1,0 +1,60 @@
+"""Everything two views of one capture have in common, under one set of poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.errors import NoResultError
+from stitch.frames import Array, Indices
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.gram import Gram, gram, robust_scale
+from stitch.observations.surfaces.match import Match, match, overlapping_pairs
+from stitch.observations.surfaces.target_pairs import TargetPairs, joined, target_pairs
+
+# Queries per view for the final normal equations and statistics.
+FINE_SAMPLES = 3000
+# Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
+_GATE_SPACINGS = 1.5
+_GATE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both."""
+
+    pairs: list[tuple[int, int]]
+    matches: list[Match]
+    gram: Gram
+    gate: float
+    targets: TargetPairs | None = None
+
+
+def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> Overlaps:
+    """Match all overlapping pairs within `gate` and accumulate their normal equations.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    pairs = overlapping_pairs(capture.scans, poses, gate)
+    matches = list(match(capture.scans, poses, pairs, gate, samples))
+    if not matches:
+        raise NoResultError(
+            f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
+            "and scanner.pose, or leave scanner.pose out to have it searched"
+        )
+    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
+    surfaces = gram(matches, len(capture.scans), centre, robust_scale(matches))
+    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
+    return Overlaps(pairs, matches, joined(surfaces, targets, capture.noise_factor), gate, targets)
+
+
+def next_gate(overlaps: Overlaps, capture: Capture) -> float:
+    """The distance that partners may have, from the spacing and the residuals' robust sigma."""
+    return _GATE_SPACINGS * capture.spacing + _GATE_SIGMAS * overlaps.gram.scale
+
+
+def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
+    """Root mean square over the correspondences of all captures, inside the robust gate."""
+    square = sum(o.gram.raw_square.sum() for o in overlaps)
+    return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))

@@ -1,0 +1,92 @@
+"""How far the robot's poses scatter: restricted maximum likelihood on per-view pose estimates.
+
+The points of one view share that view's pose error, so evidence counts in views. The per-view
+twists δ̂ (`free_poses.py`) are reduced to the directions the overlaps can see, z, with covariance
+σ_r² T_r + σ_t² T_t + c σ² H⁺ (rotation and translation scatter of the flange, and a factor on the
+noise within overlaps, whose errors are correlated). Patterson & Thompson (1971), Harville (1977).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.observations.surfaces.free_poses import visible_directions
+from stitch.observations.surfaces.gram import Gram, column_space
+from stitch.statistics.variance_components import Evidence, fit_variances
+
+# Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
+_TOLD = 1e-6
+
+
+@dataclass(frozen=True)
+class PoseChannel:
+    """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
+
+    reduction: Array  # (n, 6V) from twists of the views to visible directions
+    z: Array  # (n,) observed twists, reduction @ twists
+    hand_eye: Array  # (n, 6) response to the hand-eye's ξ
+    rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
+    translation: Array  # (n, n) the same for translation
+    noise: Array  # (n, n) covariance of the sensor noise within overlaps
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """Standard deviations of the flange poses and the factor on the noise within overlaps."""
+
+    rotation: float  # rad
+    translation: float  # length_unit
+    noise_factor: float
+
+
+def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> PoseChannel:
+    """Reduce per-view twists to the directions that the overlaps see.
+
+    Args:
+        g: normal equations about the part's centre, at the freed poses.
+        twists: (V, 6) about that centre, from the model's poses to the freed ones.
+        hand_eye_frames: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
+        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
+            for eye_to_hand, T_base_flange for eye_in_hand.
+    """
+    values, vectors, scale = visible_directions(g)
+    left = vectors.T / scale[None, :]
+    to_centre = frames.make(np.eye(3), -g.centre)
+    response = left @ np.concatenate(list(frames.adjoint(to_centre @ hand_eye_frames)))
+    carried = frames.adjoint(to_centre @ T_reference_flange)
+    rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
+    return PoseChannel(left, left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
+
+
+def _scatter(left: Array, carried: Array) -> Array:
+    """Covariance of the visible directions for independent unit twists of every view."""
+    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
+    return np.asarray(np.einsum("vni,vmi->nm", blocks, blocks))
+
+
+def evidence_of(channel: PoseChannel, further: Array | None = None) -> Evidence:
+    """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
+    mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
+    components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
+    return Evidence(channel.z[None], column_space(mean, _TOLD)[None], components)
+
+
+def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:
+    """REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
+    return scatter_from(fit_variances(evidence_of(channel, further), both_starts=True).variances)
+
+
+def scatter_from(variances: Array) -> Repeatability:
+    """Standard deviations and noise factor from the three variances."""
+    return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
+
+
+def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
+    """(n, n) covariance of the channel's z."""
+    return np.asarray(
+        scatter.rotation**2 * channel.rotation
+        + scatter.translation**2 * channel.translation
+        + scatter.noise_factor * channel.noise
+    )

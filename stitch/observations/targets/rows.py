@@ -1,0 +1,145 @@
+"""Labelled points as linear rows about a model: what is left, and how it answers to views and landmarks.
+
+A view v with S slots has m = 3S rows x − P (reference frame), and three more for the turn of a probe. A left
+twist δ of the view about `centre` moves them by lever·δ, the landmarks by their own columns. Nominal targets
+are further blocks of three rows: the target less its place in the drawing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.frames import Array, Mask
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement, Term
+from stitch.model.jacobian import target_shifts, twists
+from stitch.observations.surfaces.point_effects import POINTS
+from stitch.observations.targets.landmarks import Landmarks
+from stitch.statistics.variance_components import Evidence
+
+
+@dataclass(frozen=True)
+class Rows:
+    """V views, B ≥ V blocks of m rows; U unknowns of the landmarks."""
+
+    capture: Capture  # without the effects in use
+    T_mount: Array  # (4, 4)
+    centre: Array  # (3,) of the targets, reference frame
+    residual: Array  # (B, m) where a view puts a target less where it is
+    lever: Array  # (V, m, 6) rows per left twist of the view about the centre
+    hand_eye: Array  # (B, m, 6) per right perturbation of the hand-eye
+    landmarks: Array  # (B, m, U)
+    noise: Array  # (B, m) variance of the sensor; 0 where a row is absent or none of the sensor's
+    fixed: Array  # (B, m) variance that is known: 1 in absent rows, that of the drawing in its own
+    positions: int  # the first 3S rows of a view are coordinates
+
+    @property
+    def used(self) -> Mask:
+        """(V, m) bool: rows of the views that were measured."""
+        return np.asarray(self.noise[: len(self.lever)] > 0)
+
+    @property
+    def reach(self) -> float:
+        """Distance of the targets from the flange: what a turn of it moves them by."""
+        away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
+        return float(max(np.median(away), 1e-9))
+
+    def by_twists(self, moved: Array) -> Array:
+        """(B, m, P) of left twists (6V, P) of the views about the centre."""
+        out = np.zeros((*self.residual.shape, moved.shape[1]))
+        out[: len(self.lever)] = self.lever @ moved.reshape(-1, 6, moved.shape[1])
+        return out
+
+    def distances(self, left: Array) -> Array:
+        """(V, S) 3D distances of rows (B, m) from zero; NaN where nothing was measured."""
+        views = len(self.lever)
+        d = np.linalg.norm(left[:views, : self.positions].reshape(views, -1, 3), axis=2)
+        return np.where(self.used[:, : self.positions : 3], d, np.nan)
+
+
+def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
+    """Linearise labelled points about hand-eye and landmarks.
+
+    Args:
+        own: without the effects in use.
+    """
+    s = own.sightings
+    assert s is not None
+    V, S = s.used.shape
+    turns = 3 * (s.rotation is not None)
+    drawn = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
+    B, m = V + drawn, 3 * S + turns
+    poses = own.poses(T_mount)
+    placed = frames.transform(poses, s.points)
+    centre = np.asarray(placed[s.used].mean(axis=0))
+    known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
+    left, noise = np.zeros((B, m)), np.zeros((B, m))
+    lever, columns = np.zeros((V, m, 6)), np.zeros((B, m, landmarks.size))
+    left[:V, : 3 * S] = (placed - known).reshape(V, -1)
+    noise[:V, : 3 * S] = np.repeat(np.where(s.used, s.sigma**2, 0.0), 3, axis=1)
+    # At the landmark, not where the view puts it: a turn of all views must look exactly as the same turn of the
+    # landmarks does, or what is left would lend itself to parameters that nothing shows. The normal equations agree.
+    lever[:, : 3 * S, :3] = -frames.skew(known - centre).reshape(V, -1, 3)
+    lever[:, : 3 * S, 3:] = np.tile(np.eye(3), (V, S, 1))
+    for axis in range(3):
+        v, slot = np.nonzero(s.used)
+        columns[v, 3 * slot + axis, 3 * s.target[v, slot] + axis] = -1.0
+    if s.rotation is not None and s.sigma_rotation is not None and landmarks.orientation is not None:
+        left[:V, 3 * S :] = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
+        noise[:V, 3 * S :] = np.where(s.used.any(axis=1), s.sigma_rotation**2, 0.0)[:, None]
+        lever[:, 3 * S :, :3] = np.eye(3)
+        at = landmarks.positions.size
+        columns[:V, 3 * S :, at : at + 3] = -np.eye(3)
+    absent = noise == 0
+    fixed = absent.astype(float)
+    _draw(landmarks, V, left, columns, fixed)
+    left[:V][absent[:V]], lever[absent[:V]], columns[:V][absent[:V]] = 0.0, 0.0, 0.0
+    hand_eye = np.zeros((B, m, 6))
+    hand_eye[:V] = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
+    return Rows(own, T_mount, centre, left, lever, hand_eye, columns, noise, fixed, 3 * S)
+
+
+def _draw(landmarks: Landmarks, views: int, left: Array, columns: Array, fixed: Array) -> None:
+    """Fill the blocks of nominal targets: the target less its place in the drawing."""
+    if landmarks.drawing is None or landmarks.T_reference_part is None:
+        return
+    placed = frames.transform(landmarks.T_reference_part, landmarks.drawing.points)
+    for t, (k, p) in enumerate(zip(landmarks.drawing.target, placed, strict=True)):
+        block = views + t
+        left[block, :3] = landmarks.positions[k] - p
+        columns[block, :3, 3 * k : 3 * k + 3] = np.eye(3)
+        columns[block, :3, -6:] = np.hstack([frames.skew(p), -np.eye(3)])
+        fixed[block, :3] = landmarks.drawing.sigma[t] ** 2
+
+
+def effect_rows(rows: Rows, measurement: Measurement, terms: Sequence[Term], term: Term) -> Array:
+    """(B, m, P) how the rows answer to the parameters of `term`, at `terms`."""
+    if term.effect.place not in POINTS:
+        moved = twists(measurement, terms, term, rows.T_mount, rows.centre)
+        return rows.by_twists(moved.reshape(len(moved), -1).T)
+    poses = rows.capture.poses(rows.T_mount)
+    slopes = frames.rotate(poses, target_shifts(measurement, terms, term, poses))  # (P, V, S, 3)
+    out = np.zeros((*rows.residual.shape, len(slopes)))
+    out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
+    out[: len(poses)][~rows.used] = 0.0
+    return out
+
+
+def evidence_of_rows(rows: Rows, A: Array) -> Evidence:
+    """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
+    V, (B, m) = len(rows.lever), rows.residual.shape
+    to_centre = frames.make(np.eye(3), -rows.centre)
+    carried = rows.lever @ frames.adjoint(to_centre @ rows.capture.T_reference_flange)
+    components = np.zeros((3, B, m, m))
+    for i, half in enumerate((slice(0, 3), slice(3, 6))):
+        components[i, :V] = carried[..., half] @ carried[..., half].transpose(0, 2, 1)
+    diagonal = np.arange(m)
+    components[2][:, diagonal, diagonal] = rows.noise
+    fixed = np.zeros((B, m, m))
+    fixed[:, diagonal, diagonal] = rows.fixed
+    # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
+    independent = int(np.minimum(rows.used.sum(axis=1), 6).sum()) + max(rows.landmarks.shape[2] - 6, 0)
+    return Evidence(-rows.residual, A, components, fixed, independent)

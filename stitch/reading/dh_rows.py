@@ -1,0 +1,92 @@
+"""DH rows, payload and gravity of the [robot] table, checked: a wrong number would move the arm without a word."""
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.measurement.robot import Robot, elementary
+from stitch.units import METRES
+
+_DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")
+
+
+def robot_from_dh(
+    name: str, convention: str, joints: Sequence[dict[str, Any]], payload: dict[str, Any] | None,
+    gravity: Array, length_unit: str,
+) -> Robot:  # fmt: skip
+    """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
+
+    Raises:
+        InputError: unknown convention or key, no row, or a value that is not a finite number.
+    """
+    if not joints:
+        raise InputError("robot.joints is empty; write one DH row a joint")
+    rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
+    for where, row in rows:
+        known_keys(where, row, _DH_KEYS)
+    a, alpha, d, theta = (
+        np.array([float(numbers(where, row, key, ())) for where, row in rows])
+        for key in ("a", "alpha_deg", "d", "theta_deg")
+    )
+    alpha, theta = np.radians(alpha), np.radians(theta)
+    still = np.broadcast_to(np.eye(4), (len(a), 4, 4))
+    if convention == "standard":
+        before, after = still, elementary("z", 0, d) @ elementary("x", alpha, a)
+    elif convention == "modified":
+        before, after = elementary("x", alpha, a), elementary("z", 0, d)
+    else:
+        raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
+    masses = [point_mass(where, row) for where, row in rows]
+    return Robot(
+        name, convention, before, after, theta, np.array([m for m, _ in masses]),
+        np.array([c for _, c in masses]), *payload_of(payload), gravity_of(gravity),
+        METRES[length_unit], a, alpha, d,
+    )  # fmt: skip
+
+
+def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
+    """Mass (kg) and centre of mass (3,) in the flange frame of [robot] payload; both 0 without one."""
+    if payload is None:
+        return 0.0, np.zeros(3)
+    known_keys("robot.payload", payload, ("mass", "com"))
+    return point_mass("robot.payload", payload)
+
+
+def gravity_of(gravity: Array) -> Array:
+    """Gravity (3,) in m/s² in the base frame, checked."""
+    return numbers("robot", {"gravity": gravity}, "gravity", (3,))
+
+
+def point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
+    """mass (kg, not negative) and com (3,) of a table; 0 where absent."""
+    mass = float(numbers(where, table, "mass", ()))
+    if mass < 0:
+        raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
+    return mass, numbers(where, table, "com", (3,))
+
+
+def known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
+    """Refuse other keys: a misspelt alpha_deg would silently count as 0, and the arm be another one."""
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: {table!r} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}")
+    for key in table:
+        if key not in known:
+            close = get_close_matches(str(key), known, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+            raise InputError(f"{where}: unknown key {key!r}; {hint}")
+
+
+def numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+    """The finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
+    try:
+        value = np.array(table.get(key, np.zeros(shape)), float)
+    except (TypeError, ValueError):
+        value = np.full(shape, np.nan)
+    if value.shape != shape or not np.isfinite(value).all():
+        kind = "three finite numbers" if shape else "a finite number"
+        raise InputError(f"{where}: {key} is {table[key]!r}; use {kind}")
+    return value

@@ -1,0 +1,33 @@
+"""What the stages show while they work; a viewer implements `Recorder`, the stages do not know it."""
+
+from typing import Protocol
+
+from stitch.frames import Array
+from stitch.runs.run import Run, StageResult
+from stitch.measurement.session import Session
+
+
+class Recorder(Protocol):
+    """Receives every stage and iteration. All poses are T_reference_scanner, (V, 4, 4)."""
+
+    def start(self, session: Session) -> None:
+        """Called once, before the first stage, with the scans and the robot's path."""
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Called after each iteration of a stage; `gate` is the largest distance paired."""
+
+    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+        """Called at the end of a stage; `residuals` holds, per view, (N,) signed distances of the
+        view's points to the other views (NaN where no other view sees the point)."""
+
+    def finish(self, run: Run) -> None:
+        """Called once, with the result."""
+
+
+class Silent:
+    """A recorder that shows nothing."""
+
+    def start(self, session: Session) -> None: ...
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
+    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None: ...
+    def finish(self, run: Run) -> None: ...

@@ -1,0 +1,102 @@
+"""Which parts of the hand-eye the motions of a session cannot show, in words.
+
+Moving the hand-eye by ξ moves every view by Ad(T_v) ξ. What is common to all views moves the whole
+part and cannot be seen; the rest is what overlaps can show. The rms of that rest per unit of ξ, both
+as displacements of the part, is a pure number: at 0.01 a millimetre of error moves the views apart
+by ten micrometres.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.measurement import robot as kinematics
+from stitch.measurement.capture import Capture
+from stitch.measurement.robot import Robot
+
+_VISIBLE = 0.01
+_PARALLEL = np.cos(np.radians(2.0))
+
+
+def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> tuple[Array, Array]:
+    """Gains (6,) ascending and the directions (6, 6) as columns, twists about the part's centre.
+
+    Args:
+        centre: (3,) of the part in the scanner frame; twists are taken about it, so that a rotation
+            of the scanner is not mistaken for the translation it causes at the part.
+    """
+    size = 2 * float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets])) / 2
+    # A probe is a point: a tenth of its distance stands in for its size.
+    size = size or 0.1 * float(np.linalg.norm(centre))
+    about = frames.make(np.eye(3), centre)
+    scale = np.diag([1 / size] * 3 + [1.0] * 3)
+    total, views = np.zeros((6, 6)), 0
+    for capture in captures:
+        poses = capture.poses(T_mount) @ about
+        to_part = frames.make(np.eye(3), -poses[:, :3, 3].mean(axis=0))
+        response = np.linalg.inv(scale) @ frames.adjoint(to_part @ poses) @ scale
+        response = response - response.mean(axis=0)
+        total += np.einsum("vij,vik->jk", response, response)
+        views += len(poses)
+    values, vectors = np.linalg.eigh(total / views)
+    return np.sqrt(np.maximum(values, 0)), scale @ vectors
+
+
+def unobservable(
+    captures: Sequence[Capture], T_mount: Array, robot: Robot | None = None, joints: Array | None = None
+) -> tuple[str, ...]:
+    """One phrase per direction of the hand-eye that these motions cannot show."""
+    centre = np.mean([p.mean(axis=0) for c in captures for p in c.point_sets], axis=0)
+    gains, directions = motion_gain(captures, T_mount, centre)
+    hidden = directions[:, gains < _VISIBLE]
+    axes = _named_axes(captures, robot, joints)
+    phrases = []
+    for kind, direction in _split(hidden):
+        in_mount = T_mount[:3, :3] @ direction
+        phrases.append(f"{kind} {_name(in_mount, axes)}")
+    return tuple(phrases)
+
+
+def _split(hidden: Array) -> list[tuple[str, Array]]:
+    """Unit directions (scanner frame): translations first, then rotations, of the hidden space."""
+    if hidden.shape[1] == 0:
+        return []
+    U, s, Vt = np.linalg.svd(hidden[:3])
+    rank = int((s > 1e-6 * np.linalg.norm(hidden[:3]) + 1e-12).sum()) if np.abs(hidden[:3]).max() > 1e-9 else 0
+    out = [("translation along", v) for v in (hidden[3:] @ Vt[rank:].T).T]
+    out += [("rotation about", U[:, i]) for i in range(rank)]
+    return [(kind, v / np.linalg.norm(v)) for kind, v in out]
+
+
+def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array | None) -> dict[str, Array]:
+    """Directions in the mount frame that people know by name."""
+    axes = {}
+    first = captures[0]
+    if robot is not None and joints is not None:
+        T_base_flange = kinematics.forward(robot, joints)
+        _, base_axes = kinematics.joint_axes(robot, joints)
+        scanner_rides = np.array_equal(first.T_reference_mount, first.T_reference_flange)
+        for i in range(base_axes.shape[1]):
+            seen = base_axes[:, i]
+            if scanner_rides:
+                seen = np.einsum("vji,vj->vi", T_base_flange[:, :3, :3], seen)
+            # A joint's axis has a place in the mount frame only while it does not move there.
+            if np.linalg.norm(seen.mean(axis=0)) > _PARALLEL:
+                axes[f"the axis of joint {i + 1}"] = seen.mean(axis=0)
+        moving = np.ptp(joints, axis=0) > np.radians(0.5)
+        axes = {name: axis for i, (name, axis) in enumerate(axes.items()) if moving[int(name.split()[-1]) - 1]}
+    motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
+    _U, s, Vt = np.linalg.svd(motions)
+    if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):
+        axes["the axis about which all views were turned"] = Vt[0]
+    return axes
+
+
+def _name(direction: Array, axes: dict[str, Array]) -> str:
+    for name, axis in axes.items():
+        if abs(float(direction @ axis)) / np.linalg.norm(axis) > _PARALLEL:
+            return name
+    rounded = ", ".join(f"{x:+.2f}" for x in direction * np.sign(direction[np.abs(direction).argmax()]))
+    return f"({rounded}) of the frame that carries the scanner"

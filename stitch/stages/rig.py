@@ -1,0 +1,56 @@
+"""What the sessions of one rig, and a model that is used for them, must have in common."""
+
+from collections.abc import Sequence
+
+from stitch.errors import InputError
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.model_toml import Model
+from stitch.model.terms import known, require
+
+
+def require_same_rig(sessions: Sequence[Session], model: Model | None) -> None:
+    """Refuse sessions that cannot share a hand-eye, or that show nothing.
+
+    Raises:
+        InputError: names the session and what is wrong.
+    """
+    first = sessions[0]
+    for other in sessions[1:]:
+        if (other.mount, other.length_unit) != (first.mount, first.length_unit):
+            raise InputError(
+                f"{other.path}: mount {other.mount} in {other.length_unit}, but {first.path} has {first.mount} "
+                f"in {first.length_unit}; only sessions of one rig share a hand-eye"
+            )
+    if model and model.mount != first.mount:
+        raise InputError(
+            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
+        )
+    for session in sessions:
+        if not session.has_clouds and not session.has_sightings:
+            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
+        if not session.has_clouds and len(sessions) > 1:
+            raise InputError(f"{session.path}: sessions without clouds run one by one; use --hand-eye for the next")
+        if len(session.views) < 2:
+            raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
+
+
+def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:
+    """Refuse effects that a session cannot have, or that have other parameters in another session of the rig.
+
+    Raises:
+        InputError: names the effect, the session and what is missing or different.
+    """
+    for effect in map(known, effects):
+        for measurement in measurements:
+            require(measurement, effect)
+        first, *others = (
+            {f"{p.name} ({p.unit})" for p in measurement.parameters(effect)} for measurement in measurements
+        )
+        for measurement, own in zip(measurements[1:], others, strict=True):
+            if own != first:
+                raise InputError(
+                    f"effect {effect.name}: sessions {measurements[0].capture.name} and {measurement.capture.name} "
+                    f"do not share {', '.join(sorted(first ^ own))}; give both the same arm, link masses and "
+                    "temperatures, or run them apart"
+                )

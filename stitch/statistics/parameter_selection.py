@@ -1,0 +1,82 @@
+"""Which parameters of the effects in use the views support, and how large the others may be.
+
+An effect with a number for every joint would lend each of them to the noise, and what the views hardly know
+they borrow from the hand-eye. A group of parameters is fitted where the evidence for it, the likelihood
+integrated over amplitudes of plausible size, exceeds that of leaving it at zero.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.special import expit
+
+from stitch.frames import Array
+from stitch.statistics.identifiability import project_out
+
+# Log evidence that a group must add: 12 to 1, as a name must in the diagnosis.
+_GAIN = 2.5
+
+
+def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequence[Sequence[int]],
+              effects: Sequence[int]) -> Array:  # fmt: skip
+    """(P,) bool: parameters that are fitted; of every effect at least its best group.
+
+    Args:
+        own: (N, a) whitened columns of the hand-eye, fitted in any case.
+        further: (N, P) whitened columns per unit of the parameters.
+        z: (N,) whitened observation without the effects.
+        sizes: (P,) plausible sizes.
+        groups: indices of parameters that stand or fall together; one may hold another.
+        effects: number of the effect that each group belongs to.
+    """
+    G, y = project_out(own, further * sizes), project_out(own, z[:, None])[:, 0]
+    M, v = G.T @ G, G.T @ y
+
+    def gain(chosen: Sequence[int]) -> float:
+        index = sorted({i for k in chosen for i in groups[k]})
+        information = np.eye(len(index)) + M[np.ix_(index, index)]
+        b = v[index]
+        return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
+
+    chosen = _forward_and_back(gain, len(groups))
+    for effect in dict.fromkeys(effects):
+        if not any(effects[k] == effect for k in chosen):
+            own_groups = [k for k, e in enumerate(effects) if e == effect]
+            chosen.append(max(own_groups, key=lambda k: gain([*chosen, k])))
+    out = np.zeros(len(sizes), bool)
+    out[[i for k in chosen for i in groups[k]]] = True
+    return out
+
+
+def omitted_rms(own: Array, further: Array, z: Array, sizes: Array, fitted: Array) -> Array:
+    """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
+
+    Each may be there or not, even odds before the views were asked: with probability π it has the mean μ and the
+    sigma σ that they give it, so that its mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999).
+
+    Args:
+        own, further, z, sizes: as in `supported`.
+        fitted: (P,) bool.
+    """
+    base = np.hstack([own, further[:, fitted]])
+    G, y = project_out(base, further * sizes), project_out(base, z[:, None])[:, 0]
+    told, pull = np.einsum("np,np->p", G, G), G.T @ y
+    mean, variance = pull / (1 + told), 1 / (1 + told)
+    gain = 0.5 * pull * mean - 0.5 * np.log1p(told)
+    rms = sizes * np.sqrt(expit(gain) * (mean**2 + variance))
+    return np.where(fitted, 0.0, rms)
+
+
+def _forward_and_back(gain: Callable[[Sequence[int]], float], count: int) -> list[int]:
+    """Add the group that gains most until none gains enough; then take out what others have made idle."""
+    chosen: list[int] = []
+    while len(chosen) < count:
+        best = max((k for k in range(count) if k not in chosen), key=lambda k: gain([*chosen, k]))
+        if gain([*chosen, best]) - gain(chosen) < _GAIN:
+            break
+        chosen.append(best)
+    for k in list(chosen):
+        rest = [other for other in chosen if other != k]
+        if gain(chosen) - gain(rest) < _GAIN:
+            chosen = rest
+    return chosen

@@ -1,0 +1,57 @@
+"""Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle."""
+
+from stitch.diagnosis.diagnose import diagnose
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.selection.backward_elimination import eliminated_effect
+from stitch.diagnosis.selection.select import MANY
+from stitch.pipeline import change
+from stitch.runs.run import Run
+from stitch.stored.load_state import State, state_of
+
+# New matches alone change a residual by a few per cent.
+_RISE = 1.05
+
+
+def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
+    """The run with everything that the diagnosis names, the way in lines, and the last diagnosis.
+
+    The run is None where nothing is named.
+
+    An effect stays unless the held-out residual rises: the diagnosis has asked already whether it predicts the poses
+    of views left out, and a small effect moves them by less than the sensor's noise shows in a residual. At the end
+    effects that came early go, if those that came later explain the same; what was in the model before stays.
+    """
+    lines: list[str] = []
+    result: Run | None = None
+    given = {t.effect.name for t in state.terms}
+    found = diagnose(state)
+    for _ in range(at_most):
+        lines += [found.sentence, *(f"{note}." for note in found.notes if note not in found.sentence)]
+        if found.verdict != "missing_effect":
+            break
+        tried = change(state, [*(t.effect.name for t in state.terms), found.effects[0]])
+        if not _earned(state, tried):
+            lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
+            break
+        result, state = tried, state_of(tried)
+        found = diagnose(state)
+    else:
+        lines.append(f"Stopped after {at_most} effects; run it again to go on.")
+    if result is None or state.session.has_clouds or state.measurement.views.count < MANY:
+        return result, lines, found
+    kept, dropped = _without_idle(result, given)
+    return (result, lines, found) if not dropped else (kept, [*lines, *dropped], diagnose(state_of(kept)))
+
+
+def _without_idle(result: Run, given: set[str]) -> tuple[Run, list[str]]:
+    """The run without added effects that do not hold their place beside the others, and why each went."""
+    lines: list[str] = []
+    while (idle := eliminated_effect(state_of(result), set(result.effects) - given)) is not None:
+        name, reason = idle
+        lines.append(f"{reason}; it was dropped.")
+        result = change(state_of(result), [other for other in result.effects if other != name])
+    return result, lines
+
+
+def _earned(state: State, tried: Run) -> bool:
+    return not state.ledger or tried.heldout_rms < _RISE * state.ledger[-1].heldout_rms
