@@ -2,12 +2,10 @@
 
 import json
 import os
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -23,7 +21,9 @@ from blind_cells import (
     smallest,
     user_effect,
 )
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
+from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
@@ -33,15 +33,11 @@ from stitch.diagnosis.initial_values import evidence_of_state
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 from stitch.pipeline import change, run
 from stitch.runs.run import Run
 from stitch.stepwise import suggest
 from stitch.stored.load_state import State, state_of
 from stitch.system.threads import library_threads_off
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from in_memory import session_of
 
 Row = dict[str, Any]
 CLIMATE = ("part_growth", "robot_thermal_growth", "scanner_thermal_scale")
@@ -114,7 +110,7 @@ def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measu
         "p": min((s.ranked.adjusted for s in found.candidates if s.name in found.effects), default=1.0),
         "follows": [d.covariate for d in found.depends_on[:3] if d.p_value < 0.05], "notes": list(found.notes),
         "scatter": [found.rotation * 1e6, found.translation * 1e3],
-        "top": [(s.name, round(float(s.ranked.score.gain), 2), float(s.ranked.adjusted)) for s in found.candidates[:3]],
+        "top": [(s.name, round(float(s.ranked.score.log_bayes_factor), 2), float(s.ranked.adjusted)) for s in found.candidates[:3]],
         "left": [_left(s.cross_validation) for s in found.candidates[:3]],
         "hand_eye_chi_square": hand_eye_chi_square(measured, first),
     }  # fmt: skip

@@ -41,9 +41,17 @@ def _arm(name: str, rows: str, home: str) -> Arm:
     table = np.array([[float(x) for x in line.replace("|", " ").split()] for line in rows.strip().splitlines()])
     a, alpha, d, theta, mass, cx, cy, cz, lower, upper = table.T
     return Arm(
-        name, a, np.radians(alpha), d, np.radians(theta), mass, np.column_stack([cx, cy, cz]),
-        np.radians(lower), np.radians(upper), np.radians([float(x) for x in home.split()]),
-    )  # fmt: skip
+        name=name,
+        a=a,
+        alpha=np.radians(alpha),
+        d=d,
+        theta=np.radians(theta),
+        mass=mass,
+        com=np.column_stack([cx, cy, cz]),
+        lower=np.radians(lower),
+        upper=np.radians(upper),
+        home=np.radians([float(x) for x in home.split()]),
+    )
 
 
 ARMS: dict[str, Arm] = {

@@ -45,10 +45,9 @@ def synth(
     write_session(scratch, measured, out.name)
     scratch.rename(out)
     write_truth(target, measured, seed)
-    Console(stderr=True).print(
-        f"{len(measured.clouds)} views, {sum(len(c.points) for c in measured.clouds):,} points → {out}\n"
-        f"truth → {target}", soft_wrap=True, highlight=False,
-    )  # fmt: skip
+    points = sum(len(cloud.points) for cloud in measured.clouds)
+    summary = f"{len(measured.clouds)} views, {points:,} points → {out}\ntruth → {target}"
+    Console(stderr=True).print(summary, soft_wrap=True, highlight=False)
 
 
 def make(scene: str | Path, hidden: dict[str, float], seed: int, views: int | None = None) -> Measured:

@@ -87,10 +87,8 @@ def velocity(arm: Arm, q: Array, v: Array) -> Array:
 def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
     """(6, n) change of `_off` a radian of every joint; central differences."""
     step = 1e-6
-    columns = [
-        (_off(q + e, arm, wanted) - _off(q - e, arm, wanted)) / (2 * step) for e in np.eye(arm.joints) * step
-    ]  # fmt: skip
-    return np.column_stack(columns)
+    steps = np.eye(arm.joints) * step
+    return np.column_stack([(_off(q + e, arm, wanted) - _off(q - e, arm, wanted)) / (2 * step) for e in steps])
 
 
 def _off(q: Array, arm: Arm, wanted: Array) -> Array:

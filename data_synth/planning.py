@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from data_synth import kinematics
 from data_synth.moment import Plan
-from data_synth.scanner import Scanner, cast, rays
+from data_synth.scanner import Scanner, rays
+from data_synth.scanning import cast
 from data_synth.scene import Scene, ViewPlan
 from stitch import frames
 from stitch.errors import NoResultError

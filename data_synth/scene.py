@@ -1,7 +1,7 @@
 """A scene file: which part, arm and scanner, where they stand, how the views are planned, what is always there."""
 
 import tomllib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.arms import ARMS, Arm, with_payload
 from data_synth.scanner import Scanner
+from data_synth.scene_tables import read_dataclass, take_vector
 from stitch import frames
 from stitch.errors import InputError
 
@@ -124,20 +125,25 @@ def _scene(path: Path, document: dict[str, Any]) -> Scene:
     if not isinstance(payload, dict) or set(payload) != {"mass", "com"}:
         raise ValueError("robot.payload is { mass = kg, com = [x, y, z] }")
     arm = with_payload(ARMS[robot.pop("arm")], payload["mass"], tuple(payload["com"]))
-    T_mount = _mount(*(_vector(scanner, key) for key in ("xyz", "looks", "x_axis")))
+    T_mount = _mount(*(take_vector(scanner, key) for key in ("xyz", "looks", "x_axis")))
     table = {
-        "part": _read(PartPlace, "part", document.pop("part", {})),
-        "plan": _read(ViewPlan, "plan", document.pop("plan", {})),
-        "climate": _read(Climate, "climate", document.pop("climate", {})),
-        "scanner": _read(Scanner, "scanner", scanner),
+        "part": read_dataclass(PartPlace, "part", document.pop("part", {})),
+        "plan": read_dataclass(ViewPlan, "plan", document.pop("plan", {})),
+        "climate": read_dataclass(Climate, "climate", document.pop("climate", {})),
+        "scanner": read_dataclass(Scanner, "scanner", scanner),
     }
     for key in ("useful", "rail"):
         if key in robot:
             document[key] = tuple(j - 1 for j in robot.pop(key)) if key == "useful" else float(robot.pop(key))
     if robot:
         raise ValueError(f"unknown key robot.{next(iter(robot))}")
-    scene = _read(Scene, "", {"name": path.stem, **document, **table, "arm": arm, "T_mount": T_mount,
-                              "folder": path.parent})  # fmt: skip
+    built = {"arm": arm, "T_mount": T_mount, "folder": path.parent}
+    scene: Scene = read_dataclass(Scene, "", {"name": path.stem, **document, **table, **built})
+    _check(scene)
+    return scene
+
+
+def _check(scene: Scene) -> None:
     if scene.mount not in ("eye_to_hand", "eye_in_hand"):
         raise ValueError(f"mount is {scene.mount!r}; use 'eye_to_hand' or 'eye_in_hand'")
     for where, kinds in _KINDS.items():
@@ -145,43 +151,8 @@ def _scene(path: Path, document: dict[str, Any]) -> Scene:
             raise ValueError(f"{where}.kind is {kind!r}; use {', '.join(kinds)}")
     if scene.plan.views < 2:
         raise ValueError(f"plan.views is {scene.plan.views}; stitching needs at least 2")
-    if not scene.useful or not set(scene.useful) <= set(range(arm.joints)):
-        raise ValueError(f"robot.useful names joints from 1 to {arm.joints}")
-    return scene  # type: ignore[no-any-return]
-
-
-def _read(kind: type[Any], where: str, table: dict[str, Any]) -> Any:
-    """A dataclass from a table; lists become tuples, unknown keys and values of another kind are refused."""
-    known = {f.name: f.default for f in fields(kind)}
-    for key, value in table.items():
-        name = f"{where}.{key}" if where else key
-        if key not in known:
-            raise ValueError(f"unknown key {name}; known are {', '.join(sorted(known))}")
-        if not _like(value, known[key]):
-            raise ValueError(f"{name} is {value!r}; write something like {known[key]!r}")
-    return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
-
-
-def _like(value: Any, default: Any) -> bool:
-    """True if the value may stand where the default does."""
-    if isinstance(default, tuple):
-        return isinstance(value, (list, tuple)) and all(_like(x, default[0]) for x in value) and (
-            len(value) == len(default) or isinstance(default[0], int)
-        )  # fmt: skip
-    if isinstance(default, (bool, str)):
-        return isinstance(value, type(default))
-    if isinstance(default, int):
-        return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-    if isinstance(default, float):
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
-    return True
-
-
-def _vector(table: dict[str, Any], key: str) -> list[float]:
-    value = table.pop(key, None)
-    if not isinstance(value, list) or len(value) != 3 or not all(_like(x, 0.0) for x in value):
-        raise ValueError(f"scanner.{key} is {value!r}; write three numbers")
-    return value
+    if not scene.useful or not set(scene.useful) <= set(range(scene.arm.joints)):
+        raise ValueError(f"robot.useful names joints from 1 to {scene.arm.joints}")
 
 
 def _mount(xyz: list[float], looks: list[float], x_axis: list[float]) -> Array:

@@ -48,8 +48,14 @@ class Shell:
         """Values and derivatives of a scalar field at the quadrature points, as matrices over its unknowns."""
         fields = [function[0] for function in self._basis.basis]
         rows = np.arange(self._area.size).reshape(self._basis.dx.shape)
-        picks = {"1": lambda f: f.value, "x": lambda f: f.grad[0], "s": lambda f: f.grad[1],
-                 "xx": lambda f: f.hess[0, 0], "ss": lambda f: f.hess[1, 1], "xs": lambda f: f.hess[0, 1]}  # fmt: skip
+        picks = {
+            "1": lambda f: f.value,
+            "x": lambda f: f.grad[0],
+            "s": lambda f: f.grad[1],
+            "xx": lambda f: f.hess[0, 0],
+            "ss": lambda f: f.hess[1, 1],
+            "xs": lambda f: f.hess[0, 1],
+        }
         out = {}
         for name, pick in picks.items():
             values = np.stack([np.broadcast_to(pick(f), rows.shape) for f in fields])

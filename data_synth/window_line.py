@@ -12,7 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.scanner import Cloud, Scanner, scan
+from data_synth.scanner import Cloud, Scanner
+from data_synth.scanning import scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window import NO_FIELD, Weld, warp

@@ -54,12 +54,17 @@ def write_truth(path: Path, measured: Measured, seed: int) -> None:
 def _document(name: str, measured: Measured) -> dict[str, object]:
     scene = measured.scene
     document: dict[str, object] = {
-        "format": "stitch-session/1", "name": name, "length_unit": "mm", "mount": scene.mount,
+        "format": "stitch-session/1",
+        "name": name,
+        "length_unit": "mm",
+        "mount": scene.mount,
         "scanner": {
-            "pose": measured.T_coarse.tolist(), "noise": scene.scanner.noise, "standoff": scene.scanner.standoff,
+            "pose": measured.T_coarse.tolist(),
+            "noise": scene.scanner.noise,
+            "standoff": scene.scanner.standoff,
             "optical_axis": "+z",
         },
-    }  # fmt: skip
+    }
     if not scene.rail:
         document["robot"] = robot_table(scene.arm)
     if scene.part.shape == "sphere":
@@ -71,11 +76,15 @@ def robot_table(arm: Arm) -> dict[str, Any]:
     """The [robot] table of an arm."""
     rows = [
         {
-            "a": float(arm.a[i]), "alpha_deg": float(np.degrees(arm.alpha[i])), "d": float(arm.d[i]),
-            "theta_deg": float(np.degrees(arm.theta[i])), "mass": float(arm.mass[i]), "com": arm.com[i].tolist(),
+            "a": float(arm.a[i]),
+            "alpha_deg": float(np.degrees(arm.alpha[i])),
+            "d": float(arm.d[i]),
+            "theta_deg": float(np.degrees(arm.theta[i])),
+            "mass": float(arm.mass[i]),
+            "com": arm.com[i].tolist(),
         }
         for i in range(arm.joints)
-    ]  # fmt: skip
+    ]
     robot: dict[str, Any] = {"name": arm.name, "dh": "standard", "gravity": GRAVITY.tolist(), "joints": rows}
     if arm.payload_mass:
         robot["payload"] = {"mass": float(arm.payload_mass), "com": [float(x) for x in arm.payload_com]}
@@ -116,11 +125,12 @@ def _points(measured: Measured) -> str:
 
 def write_ply(path: Path, cloud: Cloud) -> None:
     """One scan with its intensity and, where it has them, times."""
-    names = ["x", "y", "z"]
     # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
-    vertex = np.empty(len(cloud.points), [(n, "<f8") for n in names] + [("intensity", "<f4")]
-                      + ([("time", "<f4")] if cloud.time is not None else []))  # fmt: skip
-    for axis, column in zip(names, cloud.points.T, strict=True):
+    kinds = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")]
+    if cloud.time is not None:
+        kinds.append(("time", "<f4"))
+    vertex = np.empty(len(cloud.points), kinds)
+    for axis, column in zip("xyz", cloud.points.T, strict=True):
         vertex[axis] = column
     vertex["intensity"] = cloud.intensity
     if cloud.time is not None:

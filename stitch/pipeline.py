@@ -1,38 +1,36 @@
-"""The run: coarse → correct → register → fuse, for one session or several of one rig."""
+"""The run: coarse → correct → register → fuse, for one session or several of one rig; and what changes its model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
-from stitch.diagnosis.initial_values import evidence_at, evidence_of_state, start_values
+from stitch.diagnosis.diagnose import diagnose_state
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.initial_values import initial_terms
+from stitch.effects.in_session import known
 from stitch.frames import Array
-from stitch.measurement.capture import Capture, capture
+from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
+from stitch.model.bound import in_unit
 from stitch.model.forward import corrected
-from stitch.model.model_toml import Model, in_unit
-from stitch.model.terms import known, sigmas_of, terms_of
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
-from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.model.model import Model
+from stitch.model.model_toml import ModelFile
+from stitch.model.term import Term
+from stitch.observations.linearise import linearise
 from stitch.runs.recorder import Recorder, Silent
-from stitch.runs.run import Run, StageResult, Step
-from stitch.runs.sentences import coarse_note
-from stitch.runs.target_sentences import beside_notes
-from stitch.stages.coarse import COARSE_GATE, REUSED, STATED, Coarse, coarse, given, part_size
-from stitch.stages.correct import COARSE_SAMPLES, Correction, correct
-from stitch.stages.finish import finish, show
-from stitch.stages.joint_fit import refine
-from stitch.stages.mixed_fit import Beside, fitted_beside, weighed
-from stitch.stages.reuse import reuse
+from stitch.runs.run import LedgerStep, Run, StageResult
+from stitch.runs.state import State, state_of
+from stitch.stages import from_surfaces, from_targets
+from stitch.stages.coarse import COARSE_GATE, Coarse
+from stitch.stages.fitted import Course, Fitted
+from stitch.stages.observability import unobservable
 from stitch.stages.rig import require_effects, require_same_rig
-from stitch.stages.target_run import change_labelled, run_labelled
-from stitch.stored.load_state import State
 from stitch.system.threads import Clock, library_threads_off
 
 
 def run(
-    session: Session, model: Model | None = None, recorder: Recorder | None = None, effects: Sequence[str] = ()
+    session: Session, model: ModelFile | None = None, recorder: Recorder | None = None, effects: Sequence[str] = ()
 ) -> Run:
     """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
 
@@ -47,35 +45,63 @@ def run(
 
 
 def run_rig(
-    sessions: Sequence[Session], model: Model | None = None, recorders: Sequence[Recorder] | None = None,
+    sessions: Sequence[Session],
+    model: ModelFile | None = None,
+    recorders: Sequence[Recorder] | None = None,
     effects: Sequence[str] = (),
-) -> list[Run]:  # fmt: skip
+) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
     require_same_rig(sessions, model)
     recorders = recorders or [Silent() for _ in sessions]
     with library_threads_off():
-        clock = Clock()
+        clock, kind = Clock(), _observed(sessions[0])
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
         measurements = [measurement_of(session, capture(session)) for session in sessions]
         effects = list(dict.fromkeys(effects))
         model = in_unit(model, sessions[0].length_unit) if model else None
         require_effects(measurements, [*effects, *(model.effects if model else ())])
-        if not sessions[0].has_clouds:
-            found = run_labelled(sessions[0], measurements[0], model, effects, recorders[0])
-            return [_in_ledger(found, (), model.effects_file if model else None, recorders[0])]
-        start = _start(sessions, measurements, model)
-        measurements = [about_part(measurement, start.T_mount) for measurement in measurements]
+        begun = kind.start(sessions, measurements, model)
+        measurements = [about_part(m, begun.T_mount) for m in measurements]
         seconds = clock.lap()
-        before = [_begin(c, start, seconds, r) for c, r in zip(measurements, recorders, strict=True)]
+        before = [kind.begin(m, begun, seconds, r) for m, r in zip(measurements, recorders, strict=True)]
         clock.lap()
-        correction, both = fitted_beside(measurements, lambda own: _correct(own, start, model, effects, recorders[0]))
-        seconds = clock.lap()
-        place = _Place(start, correction, (), model.effects_file if model else None)
+        if model:
+            fitted = kind.apply(sessions, measurements, model)
+        else:
+            terms_at = partial(_terms_at, sessions[0], effects) if effects else None
+            fitted = kind.fit(sessions, measurements, begun, terms_at, recorders[0])
+        end = _End(begun, fitted, clock.lap(), model.effects_file if model else None)
         return [
-            _finish(session, own, i, place, before[i], recorders[i], seconds)
-            for i, (session, own) in enumerate(zip(sessions, both, strict=True))
+            _collected(session, i, end, before[i], recorder)
+            for i, (session, recorder) in enumerate(zip(sessions, recorders, strict=True))
         ]
+
+
+def add(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+    """The run with further effects in its model, hand-eye and all effects fitted anew.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    state = state_of(run) if isinstance(run, Run) else run
+    return change(state, [*state.model.effects, *effects], recorder)
+
+
+def drop(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+    """The run without some effects, the rest fitted anew."""
+    state = state_of(run) if isinstance(run, Run) else run
+    return change(state, [name for name in state.model.effects if name not in effects], recorder)
+
+
+def diagnose(run: Run | State) -> Diagnosis:
+    """Which effect is missing in the model of a run.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    return diagnose_state(state_of(run) if isinstance(run, Run) else run)
 
 
 def change(state: State, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
@@ -87,94 +113,86 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
     """
     recorder = recorder or Silent()
     with library_threads_off():
-        clock = Clock()
-        measurement = state.measurement
-        recorder.start(state.session)
-        effects = list(dict.fromkeys(effects))
+        clock, kind = Clock(), _observed(state.session)
+        session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
+        recorder.start(session)
         require_effects([measurement], effects)
-        kept = [t for t in state.terms if t.effect.name in effects]
-        used = [t.effect.name for t in kept]
-        new = [known(name) for name in effects if name not in used]
-        terms = [*kept, *start_values(measurement, new, partial(evidence_of_state, state))]
-        if not state.session.has_clouds:
-            found = change_labelled(state.session, measurement, terms, state.T_mount, state.T_mount_coarse, recorder)
-            found = replace(found, poses_before=corrected(measurement, state.terms, state.T_mount).poses(state.T_mount))
-            return _in_ledger(found, state.ledger, state.effects_file, recorder)
-        start = Coarse(state.T_mount_coarse, part_size([measurement.capture]) * COARSE_GATE, "of the first run", ())
-        before = _begin(measurement, start, clock.lap(), recorder)
+        kept = [term for term in state.model.terms if term.name in effects]
+        new = [name for name in effects if name not in state.model.effects]
+        model = Model(state.model.T_mount, (*kept, *_terms_at(session, new, measurement, state.model, state.gate)))
+        gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
+        begun = Coarse(state.T_mount_coarse, gate, "of the first run", ())
+        before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
-        correction, both = fitted_beside(
-            [measurement], lambda own: refine(own, terms, state.T_mount, [state.gate]).as_correction()
-        )
-        place = _Place(start, correction, state.ledger, state.effects_file)
-        poses_before = corrected(measurement, state.terms, state.T_mount).poses(state.T_mount)
-        return _finish(state.session, both[0], 0, place, before, recorder, clock.lap(), poses_before)
+        fitted = kind.refit([session], [measurement], model, [state.gate])
+        poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
+        end = _End(begun, fitted, clock.lap(), state.effects_file, state.ledger, poses_before)
+        return _collected(session, 0, end, before, recorder)
+
+
+def _observed(session: Session) -> Course:
+    """How a run goes with what was observed."""
+    return from_surfaces if session.has_clouds else from_targets
+
+
+def _terms_at(
+    session: Session, effects: Sequence[str], measurement: Measurement, model: Model, gate: float
+) -> list[Term]:
+    """Terms for further effects, begun where the views suggest them."""
+    linear = partial(linearise, measurement, model, gate, session.nominal)
+    return initial_terms(measurement, [known(name) for name in effects], linear)
 
 
 @dataclass(frozen=True)
-class _Place:
-    """What all sessions of a rig have in common at the end of the correction."""
+class _End:
+    """What all sessions of a rig have in common at the end of the fit."""
 
-    start: Coarse
-    correction: Correction
-    ledger: tuple[Step, ...]
+    begun: Coarse
+    fitted: Fitted
+    seconds: float
     effects_file: str | None
+    ledger: tuple[LedgerStep, ...] = ()
+    poses_before: Array | None = None
 
 
-def _start(sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model | None) -> Coarse:
-    captures = [measurement.capture for measurement in measurements]
-    if model:
-        return given(captures, model.T_mount, REUSED)
-    stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
-    return coarse(captures) if stated is None else given(captures, stated, STATED)
-
-
-def _correct(
-    measurements: Sequence[Measurement], start: Coarse, model: Model | None, effects: Sequence[str], recorder: Recorder
-) -> Correction:
-    """The hand-eye from the scans; with effects, both; with a model, neither is changed."""
-    captures: list[Capture] = [measurement.capture for measurement in measurements]
-    if model:
-        terms = terms_of(model, measurements[0])
-        captures = [corrected(measurement, terms, model.T_mount) for measurement in measurements]
-        return reuse(captures, model, terms, sigmas_of(model, measurements[0]))
-    repeating = partial(field_scatters, measurements)
-    first = correct(captures, start.T_mount, start.gate, recorder, repeating)
-    if not effects:
-        return first
-    T_mount, gates = first.hand_eye.T_mount, [overlaps.gate for overlaps in first.overlaps]
-    measurements = [
-        weighed(measurement, own.noise_factor) for measurement, own in zip(measurements, first.captures, strict=True)
-    ]
-    # An event or a time constant is one for the whole rig: the first session says where it begins.
-    evidence = partial(evidence_at, measurements[0], (), T_mount, gates[0])
-    terms = start_values(measurements[0], [known(name) for name in effects], evidence)
-    return refine(measurements, terms, T_mount, gates).as_correction()
-
-
-def _begin(measurement: Measurement, start: Coarse, seconds: float, recorder: Recorder) -> StageResult:
-    """How well the views of one session meet under the coarse hand-eye."""
-    own, poses = measurement.capture, measurement.capture.poses(start.T_mount)
-    g = collect(own, poses, start.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
-    stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
-    show(recorder, stage, own, poses, g.rms)
-    return stage
-
-
-def _finish(
-    session: Session, both: Beside, index: int, place: _Place, before: StageResult, recorder: Recorder, seconds: float,
-    poses_before: Array | None = None,
-) -> Run:  # fmt: skip
-    result = finish(session, both.measurement, index, place.start, place.correction, before, recorder, seconds)
-    if both.found is not None:
-        notes = (*result.notes, *beside_notes(both.found, both.outliers, session))
-        result = replace(result, labelled=both.found, outliers=both.outliers, notes=notes)
-    return _in_ledger(replace(result, poses_before=poses_before), place.ledger, place.effects_file, recorder)
-
-
-def _in_ledger(result: Run, ledger: Sequence[Step], effects_file: str | None, recorder: Recorder) -> Run:
-    """The result with its own line in the history, shown to the recorder."""
-    step = Step(tuple(result.effects), result.residual_rms, result.heldout_rms, result.noise_floor, result.T_mount)
-    result = replace(result, ledger=(*ledger, step), effects_file=effects_file)
+def _collected(session: Session, index: int, end: _End, before: StageResult, recorder: Recorder) -> Run:
+    """Register and fuse one session, collect its result with its line in the history, and show it."""
+    kind, fitted = _observed(session), end.fitted
+    finished = kind.finish(session, fitted, index, before, recorder, end.seconds)
+    own, model = fitted.sessions[index], fitted.model
+    joints = session.joints if len(fitted.captures) == 1 else None
+    step = LedgerStep(
+        effects=tuple(model.effects),
+        residual_rms=finished.residual_rms,
+        heldout_rms=finished.heldout_rms,
+        noise_floor=finished.noise_floor,
+        T_mount=model.T_mount,
+    )
+    result = Run(
+        session=session,
+        measurement=own.measurement,
+        model=model,
+        T_mount_coarse=end.begun.T_mount,
+        unobservable=unobservable(fitted.captures, model.T_mount, session.robot, joints),
+        stages=finished.stages,
+        poses_model=finished.poses_model,
+        poses=finished.poses,
+        corrections=finished.corrections,
+        view_rms=finished.view_rms,
+        residual_rms=finished.residual_rms,
+        heldout_rms=finished.heldout_rms,
+        noise_floor=finished.noise_floor,
+        fused=finished.fused,
+        repeatability=finished.repeatability,
+        overlaps=finished.overlaps,
+        verdict=finished.verdict,
+        ledger=(*end.ledger, step),
+        effects_file=end.effects_file,
+        poses_before=end.poses_before,
+        convergence=finished.convergence,
+        notes=kind.notes(session, fitted, index, end.begun),
+        targets=own.targets,
+        outliers=own.outliers,
+    )
     recorder.finish(result)
     return result

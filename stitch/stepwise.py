@@ -1,15 +1,11 @@
 """Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle."""
 
-from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
-from stitch.diagnosis.selection.select import MANY
-from stitch.pipeline import change
+from stitch.diagnosis.thresholds import MANY_VIEWS, RISE
+from stitch.pipeline import change, diagnose
 from stitch.runs.run import Run
-from stitch.stored.load_state import State, state_of
-
-# New matches alone change a residual by a few per cent.
-_RISE = 1.05
+from stitch.runs.state import State, state_of
 
 
 def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
@@ -23,13 +19,13 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
     """
     lines: list[str] = []
     result: Run | None = None
-    given = {t.effect.name for t in state.terms}
+    given = set(state.model.effects)
     found = diagnose(state)
     for _ in range(at_most):
         lines += [found.sentence, *(f"{note}." for note in found.notes if note not in found.sentence)]
         if found.verdict != "missing_effect":
             break
-        tried = change(state, [*(t.effect.name for t in state.terms), found.effects[0]])
+        tried = change(state, [*state.model.effects, found.effects[0]])
         if not _earned(state, tried):
             lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
             break
@@ -37,7 +33,7 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
         found = diagnose(state)
     else:
         lines.append(f"Stopped after {at_most} effects; run it again to go on.")
-    if result is None or state.session.has_clouds or state.measurement.views.count < MANY:
+    if result is None or state.session.has_clouds or state.measurement.views.count < MANY_VIEWS:
         return result, lines, found
     kept, dropped = _without_idle(result, given)
     return (result, lines, found) if not dropped else (kept, [*lines, *dropped], diagnose(state_of(kept)))
@@ -54,4 +50,4 @@ def _without_idle(result: Run, given: set[str]) -> tuple[Run, list[str]]:
 
 
 def _earned(state: State, tried: Run) -> bool:
-    return not state.ledger or tried.heldout_rms < _RISE * state.ledger[-1].heldout_rms
+    return not state.ledger or tried.heldout_rms < RISE * state.ledger[-1].heldout_rms

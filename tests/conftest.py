@@ -1,18 +1,19 @@
-"""Fixtures: the measured data beside the project, and small synthetic cells."""
+"""Fixtures: the measured data beside the project, small synthetic cells, the command line."""
 
+import io
 import os
+import shutil
+from contextlib import redirect_stdout
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from data_synth.scene import load_scene
-from data_synth.simulate import Measured, part_mesh, simulate
-from stitch import frames
-from stitch.measurement.capture import Capture, place
-from stitch.measurement.scan import prepare_view
+from data_synth.fixtures.blade_cells import captured_blade, measured_blade
+from data_synth.write import write_session
+from stitch.cli.main import main
+from stitch.diagnosis import candidates
+from stitch.effects import EFFECTS
 from stitch.system.threads import library_threads_off
 
 # Two test processes that each use all cores would fight for them.
@@ -39,41 +40,54 @@ def reghec(shared_data):
     return lambda name: shared_data / "reghec" / name
 
 
-SCENE_OF_MOUNT = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
+@pytest.fixture(scope="session")
+def stitch_command():
+    """The command line, which ends with exit code 0: its arguments to what it prints on stdout."""
+
+    def call(*arguments: object) -> str:
+        out = io.StringIO()
+        with redirect_stdout(out), pytest.raises(SystemExit) as ended:
+            main([str(a) for a in arguments])
+        assert not ended.value.code
+        return out.getvalue()
+
+    return call
 
 
-@lru_cache(maxsize=1)
-def blade_mesh():
-    return part_mesh(load_scene("blade"))
+@pytest.fixture(scope="session")
+def blade_capture():
+    """What a cell with a blade measured in five views, and its scans made ready."""
+    return captured_blade(0, views=5)
 
 
-def measured_blade(
-    seed: int, views: int = 12, mount: str = "eye_to_hand", repeatability: tuple[float, float] = (20e-6, 0.02),
-    small: float = 0.0, pixels: int = 150, hidden: dict[str, float] | None = None,
-    spread: tuple[float, float] = (0.003, 1.0), noise: float | None = None, **plan,
-) -> Measured:  # fmt: skip
-    """A blade scanned in a cell of known truth, with a scanner that has noise and nothing else."""
-    scene = load_scene(SCENE_OF_MOUNT[mount])
-    scanner = replace(
-        scene.scanner, columns=pixels, rows=pixels, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0,
-        noise=scene.scanner.noise if noise is None else noise,
-    )  # fmt: skip
-    scene = replace(
-        scene, repeatability=repeatability, small=small, mount_spread=spread, scanner=scanner,
-        plan=replace(scene.plan, **plan),
-    )  # fmt: skip
-    return simulate(scene, hidden or {}, seed, views)
+@pytest.fixture(scope="session")
+def still_cells():
+    """Per mount what a cell with nothing wrong and perfect poses measured."""
+    common = {"views": 4, "repeatability": (0.0, 0.0), "pixels": 40}
+    return {mount: measured_blade(0, mount=mount, **common) for mount in ("eye_to_hand", "eye_in_hand")}
 
 
-def synthetic(seed: int, **cell) -> tuple[Measured, Capture]:
-    """`measured_blade` made ready for the stages."""
-    measured = measured_blade(seed, **cell)
-    scans = [prepare_view(f"v{i}", cloud.points) for i, cloud in enumerate(measured.clouds)]
-    return measured, place("blade", scans, measured.T_base_flange, measured.scene.mount)
+@pytest.fixture(scope="session")
+def _blade_on_disk(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("blade") / "s"
+    measured = measured_blade(0, views=3, pixels=50)
+    # A rail leaves joints and robot out: each test adds what it is about.
+    write_session(folder, replace(measured, scene=replace(measured.scene, rail=1.0), covariates={}), "s")
+    file = folder / "views.csv"
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_text("\n".join(",".join(row[:2] + row[3:-1]) for row in rows) + "\n")
+    return folder
 
 
-def disturbed(T: np.ndarray, seed: int, degrees: float = 5.0, shift: float = 30.0) -> np.ndarray:
-    """A hand-eye off by the given angle and distance in a random direction."""
-    direction = np.random.default_rng(seed).normal(size=(2, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return T @ frames.exp(np.concatenate([direction[0] * np.radians(degrees), direction[1] * shift]))
+@pytest.fixture
+def session(_blade_on_disk, tmp_path):
+    """A small blade session on disk, of one's own: clouds and poses alone."""
+    return Path(shutil.copytree(_blade_on_disk, tmp_path / "s"))
+
+
+@pytest.fixture
+def few_effects(monkeypatch):
+    """A small library: what is tested is the choice, not how long all of it takes."""
+    for name in set(EFFECTS) - {"joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash"}:
+        monkeypatch.delitem(EFFECTS, name)
+    monkeypatch.setattr(candidates, "empirical_effects", lambda views: [])

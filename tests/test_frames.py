@@ -1,4 +1,4 @@
-"""SE(3) against scipy's matrix exponential and its own identities."""
+"""SE(3) against scipy's matrix exponential and its rotations."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -16,6 +16,8 @@ from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
+
+
 OBJECTS = (*IN_HAND, "gripperopen")
 
 

@@ -4,9 +4,9 @@ MAPS = (
     "Rms distance between neighbouring views on the part, looked at along its thinnest axis; one colour scale for "
     "both. What register takes away was an error of single poses; what stays is noise or shape."
 )
-CONVERGENCE = "Near the dashed line the scanner's own noise is all that is left; further iterations bring nothing."
+CONVERGENCE = "Near the dashed line only the scanner's own noise remains; further iterations bring nothing."
 PER_VIEW = (
-    "Left: how far each view had to move beyond what the model says. Right: what is left afterwards. "
+    "Left: how far each view had to move beyond what the model says. Right: the rms that remains. "
     "One bar that stands out is a view to look at; bars that rise together are a missing effect."
 )
 WATERFALL = (
@@ -14,13 +14,13 @@ WATERFALL = (
     "noise alone would leave."
 )
 CHANGE = "The same correspondences with one colour scale: where the right map is darker, the change has helped."
-BUDGET = "Shares of the mean square: what noise explains, what the named effect would take away, what is left."
-SUSPECTS = (
-    "To the right of zero an effect explains more than its parameters cost; a step of 3 is odds of 20 to 1. "
+BUDGET = "Shares of the mean square: what noise explains, what the named effects explain, and the rest."
+CANDIDATES = (
+    "Log Bayes factor: to the right of zero an effect explains more than its parameters cost; 3 is odds of 20 to 1. "
     "Orange: named."
 )
-ADDED = (
-    "A dot is one number of the evidence. A suspect that is there as fitted puts the dots along the line; "
+ADDED_VARIABLE = (
+    "A dot is one number of the evidence. A candidate effect that is there as fitted puts the dots along the line; "
     "a cloud that is narrow sideways explains nothing."
 )
 SHAPE = "Mean displacement in bins with two sigmas. Bars that all reach zero follow nothing."

@@ -6,8 +6,10 @@ from matplotlib.figure import Figure
 from stitch.frames import Array, transform
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.runs.run import Run
+from stitch.statistics.robust import mad_sigma
+from stitch.units import MICROMETRES
 from viz.colours import UNSIGNED
-from viz.units import to_micrometres
+from viz.drawing import plain
 
 _CELLS = 70  # along the part's longest axis
 _ENOUGH = 5  # correspondences that make a cell
@@ -38,7 +40,7 @@ def steps(run: Run, poses: Array) -> tuple[Array, Array]:
 
 def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figure:
     """Two maps side by side, seen along the part's thinnest axis; edges beyond the robust gate do not count."""
-    um = to_micrometres(run.session.length_unit)
+    um = MICROMETRES[run.session.length_unit]
     states = [steps(run, p) for p in poses]
     points = states[0][0]
     centre = points.mean(axis=0)
@@ -55,14 +57,14 @@ def _maps(run: Run, poses: tuple[Array, Array], titles: tuple[str, str]) -> Figu
         drawn = axes.imshow(values.T, origin="lower", extent=extent, cmap=UNSIGNED, vmin=0, vmax=limit)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(run.session.length_unit)
-        axes.spines[["top", "right"]].set_visible(False)
+    plain(figure)
     figure.colorbar(drawn, ax=panels, label="rms between views (µm)", extend="max")
     return figure
 
 
 def _cells(flat: Array, values: Array, size: float) -> Array:
     """(X, Y) rms in square cells, NaN where hardly anything lies."""
-    inside = np.abs(values) < RMS_GATE * 1.4826 * np.median(np.abs(values))
+    inside = np.abs(values) < RMS_GATE * mad_sigma(values)
     index = ((flat - flat.min(axis=0)) / size).astype(int)
     shape = tuple(index.max(axis=0) + 1)
     key = np.ravel_multi_index(tuple(index[inside].T), shape)

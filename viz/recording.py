@@ -1,6 +1,5 @@
 """The Rerun recording of a run: every stage and iteration, on one timeline `step`."""
 
-import io
 import os
 from pathlib import Path
 
@@ -8,15 +7,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.frames import Array
-from stitch.measurement.session import Session, View
+from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult
+from stitch.units import MICROMETRES
 from viz.blueprint import blueprint
 from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
-from viz.diagnosis_figures import waterfall
+from viz.history_figures import waterfall
 from viz.maps import change_maps, residual_maps
+from viz.page_parts import png_bytes
+from viz.run_figures import shown_points, view_shifts
+from viz.run_markdown import run_markdown
 from viz.target_figures import residual_vectors
-from viz.units import to_micrometres
-from viz.words import run_markdown
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
@@ -43,7 +44,7 @@ class RerunRecorder:
 
     def start(self, session: Session) -> None:
         """Log the scans and the robot's path."""
-        self.to_um = to_micrometres(session.length_unit)
+        self.to_um = MICROMETRES[session.length_unit]
         self.names = [view.name for view in session.views]
         rec = self.recording
         rec.log("scans", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -90,7 +91,7 @@ class RerunRecorder:
         colours = unsigned_colours(fused.residual[pick], robust_limit(fused.residual))
         points = rr.Points3D(fused.points[pick].astype(np.float32), colors=colours)
         rec.log("fused", points, static=True)
-        if run.labelled is not None:
+        if run.targets is not None:
             self._sticks(run)
         rec.log("views/rms_um", rr.BarChart(run.view_rms * self.to_um), static=True)
         shift = np.linalg.norm(view_shifts(run), axis=1) * self.to_um
@@ -102,9 +103,9 @@ class RerunRecorder:
 
     def _sticks(self, run: Run) -> None:
         """Offsets of the targets under the model, magnified, beside the targets."""
-        assert run.labelled is not None
+        assert run.targets is not None
         target, left = residual_vectors(run)
-        start = run.labelled.landmarks.positions[target]
+        start = run.targets.landmarks.positions[target]
         longest = max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
         factor = 0.25 * (float(np.ptp(start, axis=0).max()) or 1.0) / longest
         strips = np.stack([start, start + factor * left], axis=1).astype(np.float32)
@@ -144,25 +145,6 @@ class RerunRecorder:
         self.recording.set_time("step", sequence=self.step)
 
 
-def shown_points(view: View) -> Array:
-    """(N, 3) of the view's cloud, or its labelled points, scanner frame."""
-    if view.cloud is not None:
-        return view.cloud.points
-    return np.zeros((0, 3)) if view.sighting is None else view.sighting.points
-
-
 def encoded(figure: Figure) -> rr.EncodedImage:
     """A figure as a picture that stays small in the file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=140)
-    return rr.EncodedImage(contents=buffer.getvalue(), media_type="image/png")
-
-
-def view_shifts(run: Run) -> Array:
-    """(V, 3) how far register moved the middle of each view, reference frame, length_unit."""
-    out = []
-    for view, T_before, T_after in zip(run.session.views, run.poses_model, run.poses, strict=True):
-        points = shown_points(view)
-        middle = points.mean(axis=0) if len(points) else np.zeros(3)
-        out.append((T_after - T_before)[:3, :3] @ middle + (T_after - T_before)[:3, 3])
-    return np.array(out)
+    return rr.EncodedImage(contents=png_bytes(figure, 140), media_type="image/png")

@@ -2,67 +2,94 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import rerun as rr
-from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
 from stitch.comparison.tables import Comparison
-from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
+from stitch.units import MICROMETRES
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.blueprint import diagnosis_blueprint
-from viz.report import svg_text, uri
-from viz.units import to_micrometres
+from viz.comparison_figures import comparison
+from viz.page_parts import render, svg_address, svg_text
+
+# Candidate effects in the table of the page.
+_SHOWN = 8
 
 
 def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     """Section of report.html, pictures/*.svg and *.png, diagnosis.rrd."""
-    unit = state.session.length_unit
-    now = found.residual_rms * to_micrometres(unit)
-    pictures = {
-        "budget": ("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
-        "suspects": ("How likely each suspect is", draw.candidates(found), captions.SUSPECTS),
-        "added_variable": ("What the views show against what the first suspects predict", draw.added_variable(found),
-                           captions.ADDED),
-        "shape": ("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
-        "aliases": ("Which suspects look alike in these views", draw.alias_picture(found), captions.ALIASES),
-        "views": ("Displacement of every view from the model", draw.view_arrows(found, unit), captions.VIEWS),
-    }  # fmt: skip
-    rows = [
-        {"name": s.name, "p": f"{s.ranked.adjusted:.1g}", "posterior": f"{s.ranked.posterior:.2f}",
-         "amounts": amounts_of(s.ranked),
-         "left": "–" if s.cross_validation is None else f"{now * s.cross_validation.inside**0.5:.1f}",
-         "heldout": "–" if s.cross_validation is None else f"{now * s.cross_validation.heldout**0.5:.1f}",
-         "alike": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])}
-        for s in found.candidates if s.ranked.score.observable
-    ][:8]  # fmt: skip
-    unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
-    addresses = _save(folder / "pictures", {name: figure for name, (_, figure, _) in pictures.items()})
-    shown = [(title, addresses[name], caption) for name, (title, _, caption) in pictures.items()]
-    _insert(folder / "report.html", "diagnosis", _render("diagnosis.html.j2", found=found, rows=rows, unseen=unseen,
-                                                         pictures=shown))  # fmt: skip
+    pictures = _pictures(found, state.session.length_unit)
+    addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
+    html = render(
+        "diagnosis.html.j2",
+        found=found,
+        rows=_rows(found, MICROMETRES[state.session.length_unit]),
+        unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
+        pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
+    )
+    _insert(folder / "report.html", "diagnosis", html)
     _record(found, folder)
+
+
+class _Picture(NamedTuple):
+    title: str
+    figure: Figure
+    caption: str
+
+
+def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
+    """File name → picture, in the order of the page."""
+    predicted = "What the views show against what the first candidate effects predict"
+    return {
+        "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
+        "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
+        "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),
+        "shape": _Picture("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
+        "aliases": _Picture("Aliases in these views", draw.alias_picture(found), captions.ALIASES),
+        "views": _Picture("Displacement of every view from the model", draw.view_arrows(found, unit), captions.VIEWS),
+    }
+
+
+def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
+    """The best candidate effects that these views can show."""
+    shown = [s for s in found.candidates if s.ranked.score.observable][:_SHOWN]
+    return [
+        {
+            "name": s.name,
+            "p": f"{s.ranked.adjusted:.1g}",
+            "posterior": f"{s.ranked.posterior:.2f}",
+            "amounts": amounts_of(s.ranked),
+            "rms_if_added": _rms(found, s, "inside", um),
+            "heldout": _rms(found, s, "heldout", um),
+            "aliases": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2]),
+        }
+        for s in shown
+    ]
+
+
+def _rms(found: Diagnosis, candidate: CandidateEffect, which: str, um: float) -> str:
+    """Rms (µm) with the effect added, in the fit or on views left out; a dash where it was not validated."""
+    validation = candidate.cross_validation
+    return "–" if validation is None else f"{found.residual_rms * um * getattr(validation, which) ** 0.5:.1f}"
 
 
 def write_comparison(found: Comparison, state: State, folder: Path) -> None:
     """Section of report.html and pictures/compare.*."""
-    figure = draw.comparison(found, state.session.length_unit)
+    figure = comparison(found, state.session.length_unit)
     picture = _save(folder / "pictures", {"compare": figure})["compare"]
-    um = to_micrometres(state.session.length_unit)
+    um = MICROMETRES[state.session.length_unit]
     worst = []
     for table in found.labelled:
         worst.append((table.name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in table.worst(5))))
-    html = _render("comparison.html.j2", picture=picture, caption=captions.COMPARISON, worst=worst, rms=found.rms * um)
+    html = render("comparison.html.j2", picture=picture, caption=captions.COMPARISON, worst=worst, rms=found.rms * um)
     _insert(folder / "report.html", "comparison", html)
-
-
-def _render(name: str, **content: object) -> str:
-    environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
-    return environment.get_template(name).render(**content)
 
 
 def _insert(page: Path, name: str, html: str) -> None:
@@ -86,7 +113,7 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
             figure.savefig(file, format="png", dpi=120)
         with whole(folder / f"{name}.svg") as file:
             file.write_text(text, encoding="utf-8")
-        addresses[name] = uri("svg+xml", text.encode())
+        addresses[name] = svg_address(text)
     return addresses
 
 

@@ -5,9 +5,10 @@ from matplotlib.figure import Figure
 
 from stitch.frames import Array
 from stitch.runs.run import Run
-from viz.units import to_micrometres
+from stitch.units import MICROMETRES
+from viz.colours import BLUE, DARK, ORANGE
+from viz.drawing import plain
 
-_BLUE, _RED, _GREY = "#4878a8", "#b5532a", "grey"
 # The longest stick covers this share of the targets' spread.
 _SHARE = 0.25
 _PLANES = ((0, 1), (0, 2), (1, 2))
@@ -15,49 +16,42 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 def sticks(run: Run) -> Figure:
     """Where every view puts each target, as magnified sticks from the target's place, in three planes."""
-    assert run.labelled is not None
-    target, left = residual_vectors(run)
-    place = run.labelled.landmarks.positions
+    assert run.targets is not None
+    target, residual = residual_vectors(run)
+    place = run.targets.landmarks.positions
     size = float(np.nanmax(np.ptp(place[target], axis=0))) or 1.0
-    magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(left, axis=1), 0.99)), 1e-300)
+    magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(residual, axis=1), 0.99)), 1e-300)
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):
-        start, end = place[target], place[target] + magnified * left
-        axes.plot([start[:, a], end[:, a]], [start[:, b], end[:, b]], color=_BLUE, lw=0.4, alpha=0.35)
-        axes.plot(place[:, a], place[:, b], "o", ms=4, color=_RED)
+        start, end = place[target], place[target] + magnified * residual
+        axes.plot([start[:, a], end[:, a]], [start[:, b], end[:, b]], color=BLUE, lw=0.4, alpha=0.35)
+        axes.plot(place[:, a], place[:, b], "o", ms=4, color=ORANGE)
         axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({run.session.length_unit})", ylabel="xyz"[b])
     figure.suptitle(f"sticks {magnified:.0f} times longer than they are", fontsize=9)
-    return _plain(figure)
+    return plain(figure)
 
 
 def errors(run: Run) -> Figure:
     """3D distance of the targets under the model, in the order of views and as a distribution."""
-    assert run.labelled is not None
-    um, rows = to_micrometres(run.session.length_unit), run.labelled.rows
+    assert run.targets is not None
+    um, rows = MICROMETRES[run.session.length_unit], run.targets.rows
     distances = rows.distances(rows.residual) * um
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     course, share = figure.subplots(1, 2, width_ratios=[2, 1])
-    course.plot(np.nanmax(distances, axis=1), ".", ms=2, color=_BLUE)
+    course.plot(np.nanmax(distances, axis=1), ".", ms=2, color=BLUE)
     course.set(xlabel="view", ylabel="farthest target (µm)", ylim=(0, None))
-    for values, colour, name in ((distances, _BLUE, "in the fit"), (run.labelled.heldout * um, _RED, "left out")):
+    for values, colour, name in ((distances, BLUE, "in the fit"), (run.targets.heldout * um, ORANGE, "left out")):
         ordered = np.sort(values[np.isfinite(values)])
         share.plot(ordered, np.linspace(0, 100, len(ordered)), color=colour, label=name)
-    share.axvline(run.labelled.noise_floor * um, color=_GREY, lw=1, ls="--", label="noise floor")
+    share.axvline(run.targets.noise_floor * um, color=DARK, lw=1, ls="--", label="noise floor")
     share.set(xlabel="3D distance (µm)", ylabel="share of targets (%)", xlim=(0, None))
     share.legend(frameon=False, fontsize=8)
-    return _plain(figure)
+    return plain(figure)
 
 
 def residual_vectors(run: Run) -> tuple[Array, Array]:
     """Number of the target (N,) and its offset (N, 3) under the model, reference frame, for all in use."""
-    assert run.labelled is not None
-    rows, s = run.labelled.rows, run.labelled.rows.capture.sightings
-    assert s is not None
-    left = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)
-    return s.target[s.used], left[s.used]
-
-
-def _plain(figure: Figure) -> Figure:
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure
+    assert run.targets is not None
+    rows, s = run.targets.rows, run.targets.rows.sightings
+    residual = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)
+    return s.target[s.used], residual[s.used]

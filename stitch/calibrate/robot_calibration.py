@@ -10,8 +10,8 @@ from stitch.diagnosis.design.candidate_targets import candidate_rows
 from stitch.diagnosis.design.candidate_views import candidate_measurement, nearby
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.measurement import Term
 from stitch.measurement.robot import Robot, elementary
+from stitch.model.term import Term, stacked
 from stitch.runs.run import Run
 
 # The effects that DH rows can express.
@@ -36,18 +36,13 @@ def calibrated(run: Run) -> CalibratedRobot:
     robot = run.session.robot
     if robot is None or not run.measurement.views.joints.shape[1]:
         raise InputError(f"{run.session.path}: no joint angles or no [robot]; a kinematic calibration needs both")
-    beyond = tuple(t.effect.name for t in run.terms if t.effect.place in ("robot", "links") and
-                   t.effect.name not in GEOMETRY)  # fmt: skip
-    return CalibratedRobot(with_geometry(robot, run.measurement.arguments, run.terms), beyond)
+    of_the_arm = [term.name for term in run.terms if term.effect.place in ("robot", "links")]
+    return CalibratedRobot(with_geometry(robot, run.terms), tuple(name for name in of_the_arm if name not in GEOMETRY))
 
 
-def with_geometry(robot: Robot, arguments: Any, terms: Sequence[Term]) -> Robot:
-    """The arm with offsets on its joints and errors in its rows, exactly as the effects put them into the chain.
-
-    Args:
-        arguments: from an effect and its values to keyword arguments, `Measurement.arguments`.
-    """
-    values = {t.effect.name: arguments(t.effect, t.values) for t in terms if t.effect.name in GEOMETRY}
+def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:
+    """The arm with offsets on its joints and errors in its rows, exactly as the effects put them into the chain."""
+    values = {term.name: term.arguments for term in terms if term.name in GEOMETRY}
     n = np.zeros(robot.n_joints)
     offset = values.get("joint_offset", {"d": n})["d"]
     links = values.get("link_geometry", {"da": n, "dd": n, "dalpha": n})
@@ -59,9 +54,8 @@ def with_geometry(robot: Robot, arguments: Any, terms: Sequence[Term]) -> Robot:
     robot = replace(robot, before=before, after=after, theta=robot.theta + offset)
     if robot.a is None or robot.alpha is None or robot.d is None:
         return robot
-    return replace(
-        robot, a=robot.a + links["da"], alpha=robot.alpha + links["dalpha"], d=robot.d + links["dd"]
-    )  # fmt: skip
+    errors = {"a": robot.a + links["da"], "alpha": robot.alpha + links["dalpha"], "d": robot.d + links["dd"]}
+    return replace(robot, **errors)
 
 
 def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
@@ -71,9 +65,11 @@ def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
     rows = []
     for i in range(robot.n_joints):
         row: dict[str, Any] = {
-            "a": float(robot.a[i]), "alpha_deg": float(np.degrees(robot.alpha[i])), "d": float(robot.d[i]),
+            "a": float(robot.a[i]),
+            "alpha_deg": float(np.degrees(robot.alpha[i])),
+            "d": float(robot.d[i]),
             "theta_deg": float(np.degrees(robot.theta[i])),
-        }  # fmt: skip
+        }
         if robot.mass[i]:
             row |= {"mass": float(robot.mass[i]), "com": robot.com[i].tolist()}
         rows.append(row)
@@ -86,18 +82,18 @@ def poses_to_add(run: Run) -> Array:
     The determinant of the parameters' covariance falls most (D-optimal design, Fedorov 1972), one pose after
     the other, each seen beside those before it.
     """
-    found = run.labelled
+    found = run.targets
     if found is None or not run.terms:
         return np.zeros((0, run.measurement.views.joints.shape[1]))
     joints = nearby(run.measurement)[:_TRIED]
     _, columns, covariance = candidate_rows(
         candidate_measurement(run.measurement, joints), found.rows, found.landmarks, found.variances, run.terms
     )
-    keep = np.concatenate([np.isfinite(s) for s in run.sigmas])
-    spread = np.concatenate(run.sigmas)[keep]
+    sigmas = np.array([p.sigma for p in stacked(run.terms)])
+    keep = np.isfinite(sigmas)
     half = np.linalg.inv(np.linalg.cholesky(covariance))
     # In units of what is known now: an information of one doubles it.
-    white = half @ np.concatenate(columns, axis=2)[..., keep] * spread
+    white = half @ np.concatenate(columns, axis=2)[..., keep] * sigmas[keep]
     known, chosen = np.eye(int(keep.sum())), list[int]()
     for _ in range(min(_PROPOSED, len(joints))):
         gains = [np.linalg.slogdet(known + w.T @ w)[1] if k not in chosen else -np.inf for k, w in enumerate(white)]

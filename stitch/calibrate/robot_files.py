@@ -23,8 +23,11 @@ def write_robot(run: Run, found: CalibratedRobot, folder: Path) -> None:
     if rows is None:
         return
     table: dict[str, Any] = {
-        "name": found.robot.name, "dh": found.robot.convention, "gravity": found.robot.gravity.tolist(), "joints": rows,
-    }  # fmt: skip
+        "name": found.robot.name,
+        "dh": found.robot.convention,
+        "gravity": found.robot.gravity.tolist(),
+        "joints": rows,
+    }
     if found.robot.payload_mass:
         table["payload"] = {"mass": found.robot.payload_mass, "com": found.robot.payload_com.tolist()}
     header = _HEADER.format(beyond=beyond_sentence(found))
@@ -41,15 +44,20 @@ def beyond_sentence(found: CalibratedRobot) -> str:
 def document_of(run: Run, ways: list[str], sentence: str) -> dict[str, Any]:
     """The JSON document."""
     found, result = calibrated(run), result_document(run)
+    steps = [
+        {"effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms} for s in run.ledger
+    ]
     return {
-        "format": "stitch-calibrate/1", "kind": "robot", "session": run.session.name,
+        "format": "stitch-calibrate/1",
+        "kind": "robot",
+        "session": run.session.name,
         "length_unit": run.session.length_unit,
-        "steps": [
-            {"effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms}
-            for s in run.ledger
-        ],
+        "steps": steps,
         **{key: result[key] for key in ("residual_rms", "heldout_rms", "noise_floor", "effects", "targets", "notes")},
         "outliers": result.get("outliers", []),
-        "robot": dh_rows(found.robot), "beyond_dh": list(found.beyond), "way": ways, "left": sentence,
+        "robot": dh_rows(found.robot),
+        "beyond_dh": list(found.beyond),
+        "way": ways,
+        "left": sentence,
         "next": np.round(poses_to_add(run), 2).tolist(),
-    }  # fmt: skip
+    }

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from stitch import frames
-from stitch.calibrate.motions import axis_spread
-from stitch.calibrate.sphere import SphereCalibration
-from stitch.calibrate.weak import hardly_turned, turned, weak_components
+from stitch.calibrate.hand_eye_report import hand_eye_document, weak_components, weak_notes
+from stitch.calibrate.sphere_calibration import SphereCalibration
+from stitch.calibrate.sphere_views import SphereView
 from stitch.measurement.session import Session
 
 # A view's points are off by more than their noise beyond this ratio.
@@ -26,7 +26,7 @@ def weak_of(result: SphereCalibration, unit: str) -> list[str]:
 
 def notes_of(result: SphereCalibration, unit: str) -> list[str]:
     """Sentences: sides, wrist, weak components, noise against poses, the free radius, odd views."""
-    fit, notes = result.fit, []
+    fit, notes = result.fit, list[str]()
     if result.sides_found:
         plus = int((result.signs > 0).sum())
         notes.append(
@@ -34,20 +34,22 @@ def notes_of(result: SphereCalibration, unit: str) -> list[str]:
             f"decided: {plus} views along the arc's normal, {len(result.signs) - plus} against it; the next best "
             f"answer fits {_times(result.runner_up)} worse"
         )
-    weak, little = weak_of(result, unit), hardly_turned(result.G)
-    if little:
-        notes.append(little + (f". Weak: {'; '.join(weak)}" if weak else ""))
-    elif weak:
-        notes.append(f"Weak: {'; '.join(weak)}")
+    notes += weak_notes(result.G, weak_of(result, unit))
     if np.median(fit.view_rms) > _BEYOND_NOISE * fit.point_sigma:
         low, high = np.percentile(fit.view_rms, [10, 90])
-        noise = "profile noise" if any(v.normal.any() for v in result.views) else "the scanner's noise"
+        noise = "profile noise" if any(v.is_line for v in result.views) else "the scanner's noise"
         notes.append(
             f"{low:#.2g} to {high:#.2g} {unit} per pose (at most {fit.view_rms.max():#.2g}) cannot be {noise} "
             f"({fit.point_sigma:#.2g} {unit}): it comes once per pose, from the robot's poses or the scanner's "
             "calibration, and more points per scan will not reduce it"
         )
     notes += _radius_note(result, unit)
+    return notes + _view_notes(result, unit)
+
+
+def _view_notes(result: SphereCalibration, unit: str) -> list[str]:
+    """Views that contradict the others or carry the answer alone."""
+    fit, notes = result.fit, []
     sigma = np.sqrt(np.diag(fit.covariance))
     for view, step, share, rms in zip(result.views, fit.left_out, fit.shares, fit.view_rms, strict=True):
         if share < _DOUBTED:
@@ -81,38 +83,40 @@ def _radius_note(result: SphereCalibration, unit: str) -> list[str]:
 
 def document_of(result: SphereCalibration, session: Session) -> dict[str, Any]:
     """The JSON document."""
-    fit, unit = result.fit, session.length_unit
-    sigma, R = np.sqrt(np.diag(fit.covariance)), fit.T_mount[:3, :3]
-    free = result.free
+    fit, unit, free = result.fit, session.length_unit, result.free
     return {
-        "format": "stitch-calibrate/1", "kind": "sphere", "session": session.name, "mount": session.mount,
-        "length_unit": unit, "hand_eye": fit.T_mount.tolist(), "hand_eye_sigma": sigma[:6].tolist(),
-        "hand_eye_covariance": fit.covariance[:6, :6].tolist(),
-        "translation_sigma_mount": np.sqrt(np.diag(R @ fit.covariance[3:6, 3:6] @ R.T)).tolist(),
-        "covariance_inflation": fit.inflation, "centre": fit.centre.tolist(), "centre_sigma": sigma[6:9].tolist(),
-        "radius": {"given": result.nominal, "used": fit.radius, "free": free.radius if free else None,
-                   "free_sigma": float(np.sqrt(free.covariance[9, 9])) if free else None},
-        "rms": fit.rms, "point_sigma": fit.point_sigma,
+        **hand_eye_document("sphere", session, fit.T_mount, fit.covariance[:6, :6], fit.inflation, result.G),
+        "centre": fit.centre.tolist(),
+        "centre_sigma": np.sqrt(np.diag(fit.covariance))[6:9].tolist(),
+        "radius": {
+            "given": result.nominal,
+            "used": fit.radius,
+            "free": free.radius if free else None,
+            "free_sigma": float(np.sqrt(free.covariance[9, 9])) if free else None,
+        },
+        "rms": fit.rms,
+        "point_sigma": fit.point_sigma,
         "scatter_of_views": dict(zip(("shift", "apparent_radius", "common"), fit.scatter.tolist(), strict=True)),
-        "start": result.start, "turned_deg": float(np.degrees(turned(result.G))),
-        "axis_spread": axis_spread(frames.inverse(result.G[:1]) @ result.G[1:]).tolist(),
+        "start": result.start,
         "sides_from_consistency": result.sides_found,
         "runner_up_ratio": result.runner_up if np.isfinite(result.runner_up) else None,
         "decoupled": None if result.T_decoupled is None else result.T_decoupled.tolist(),
-        "weighed_by_views": {"hand_eye": result.by_views.T_mount.tolist(),
-                             "hand_eye_sigma": np.sqrt(np.diag(result.by_views.covariance))[:6].tolist(),
-                             "rms": result.by_views.rms},
-        "weak": weak_of(result, unit), "notes": notes_of(result, unit),
-        "views": _views(result),
-    }  # fmt: skip
+        "weighed_by_views": {
+            "hand_eye": result.by_views.T_mount.tolist(),
+            "hand_eye_sigma": np.sqrt(np.diag(result.by_views.covariance))[:6].tolist(),
+            "rms": result.by_views.rms,
+        },
+        "weak": weak_of(result, unit),
+        "notes": notes_of(result, unit),
+        "views": [_row(*row) for row in zip(result.views, fit.view_rms, result.signs, strict=True)],
+    }
 
 
-def _views(result: SphereCalibration) -> list[dict[str, Any]]:
-    rows = zip(result.views, result.fit.view_rms, result.signs, strict=True)
-    return [
-        {
-            "view": view.name, "points": len(view.points), "dropped": view.dropped, "rms": float(rms),
-            "side": int(sign) if view.normal.any() else None,
-        }
-        for view, rms, sign in rows
-    ]  # fmt: skip
+def _row(view: SphereView, rms: float, sign: float) -> dict[str, Any]:
+    return {
+        "view": view.name,
+        "points": len(view.points),
+        "dropped": view.dropped,
+        "rms": float(rms),
+        "side": int(sign) if view.is_line else None,
+    }

@@ -37,9 +37,14 @@ def find_shares(e: Sequence[Array], whole: Sequence[Array]) -> Array:
 
 
 def find_scatter(
-    views: Sequence[SphereView], e: Sequence[Array], jacobian: Sequence[Array], response: Sequence[Array],
-    last: Array, shares: Array,
-) -> Array:  # fmt: skip
+    views: Sequence[SphereView],
+    e: Sequence[Array],
+    jacobian: Sequence[Array],
+    response: Sequence[Array],
+    *,
+    last: Array,
+    shares: Array,
+) -> Array:
     """(σ_p, σ_ρ, σ_c) of the largest restricted likelihood of the linear model."""
 
     def cost(log_scatter: Array) -> float:

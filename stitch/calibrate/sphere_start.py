@@ -144,7 +144,7 @@ def refine_start(G: Array, views: Sequence[SphereView], start: Start) -> Start:
 
 def _trust(view: SphereView) -> float:
     """Weight of the offset √(R² − ρ²): its sigma is ρ/√(R² − ρ²) times that of the radius ρ found."""
-    if not view.normal.any():
+    if not view.is_line:
         return 1.0
     radius = float(np.linalg.norm(view.points - view.foot, axis=1).mean())
     return min(1.0, view.offset / radius)

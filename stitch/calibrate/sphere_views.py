@@ -40,6 +40,11 @@ class SphereView:
     measured: Array  # (k + 1,) centre along these directions, and radius of the circle or sphere, all free
     covariance: Array  # (k + 1, k + 1) of `measured` from the points' sigma
 
+    @property
+    def is_line(self) -> bool:
+        """True for a laser line, False for an area scan."""
+        return bool(self.normal.any())
+
 
 def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> SphereView:
     """Fit one scan (N, 3).
@@ -60,12 +65,19 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
             "check sphere.radius in session.toml and cloud_unit"
         )
     kept = points[circle.keep]
-    offset = float(np.sqrt(max(radius**2 - circle.radius**2, 0.0)))
-    measured = np.append(circle.centre + Vt[:2] @ middle, circle.radius)
     return SphereView(
-        name, kept, int((~circle.keep).sum()), middle + circle.centre @ Vt[:2], arc_normal(kept, Vt[2]), offset,
-        circle.sigma, float(np.sign(side)), Vt[:2], measured, circle.covariance,
-    )  # fmt: skip
+        name=name,
+        points=kept,
+        dropped=int((~circle.keep).sum()),
+        foot=middle + circle.centre @ Vt[:2],
+        normal=arc_normal(kept, Vt[2]),
+        offset=float(np.sqrt(max(radius**2 - circle.radius**2, 0.0))),
+        sigma=circle.sigma,
+        side=float(np.sign(side)),
+        directions=Vt[:2],
+        measured=np.append(circle.centre + Vt[:2] @ middle, circle.radius),
+        covariance=circle.covariance,
+    )
 
 
 def _area(name: str, points: Array, radius: float) -> SphereView:
@@ -79,9 +91,18 @@ def _area(name: str, points: Array, radius: float) -> SphereView:
             "sphere.radius in session.toml and cloud_unit, or leave the view out"
         )
     return SphereView(
-        name, kept, int((~known.keep).sum()), known.centre, np.zeros(3), 0.0, free.sigma, 0.0,
-        np.eye(3), np.append(free.centre, free.radius), free.covariance,
-    )  # fmt: skip
+        name=name,
+        points=kept,
+        dropped=int((~known.keep).sum()),
+        foot=known.centre,
+        normal=np.zeros(3),
+        offset=0.0,
+        sigma=free.sigma,
+        side=0.0,
+        directions=np.eye(3),
+        measured=np.append(free.centre, free.radius),
+        covariance=free.covariance,
+    )
 
 
 def arc_normal(arc: Array, normal: Array) -> Array:

@@ -6,23 +6,25 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from stitch.calibrate.robot_calibration import calibrated
 from stitch.calibrate.robot_files import beyond_sentence, write_robot
 from stitch.calibrate.robot_files import document_of as robot_document
-from stitch.calibrate.sphere import calibrate_sphere
+from stitch.calibrate.sphere_calibration import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
-from stitch.calibrate.tracker import calibrate_tracker
-from stitch.calibrate.tracker import document_of as tracker_document
+from stitch.calibrate.tracker_calibration import calibrate_tracker
+from stitch.calibrate.tracker_calibration import document_of as tracker_document
 from stitch.cli.change import show_ledger
 from stitch.cli.diagnose import write_diagnosis
+from stitch.cli.options import Force, Json
+from stitch.cli.streams import emit, results_alone
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
 from stitch.stepwise import suggest
-from stitch.stored.load_state import state_of
+from stitch.runs.state import state_of
+from stitch.system.console import console
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json, write_json
 
@@ -32,15 +34,15 @@ calibrate = typer.Typer(
     rich_markup_mode=None,
 )
 _SESSION = Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")]
-_JSON = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
 
 
 @calibrate.command()
+@results_alone
 def sphere(
     session: _SESSION,
     radius_free: Annotated[bool, typer.Option("--radius-free", help="Fit the sphere's radius too.")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the JSON there.")] = None,
-    as_json: _JSON = False,
+    as_json: Json = False,
 ) -> None:
     """Hand-eye from laser-line or area scans of one sphere of known radius."""
     loaded = load_session(session)
@@ -48,7 +50,7 @@ def sphere(
     if output is not None:
         write_json(document, output)
     if as_json:
-        print(json.dumps(document, indent=1))
+        emit(json.dumps(document, indent=1))
         return
     unit, radius = document["length_unit"], document["radius"]
     facts = [
@@ -64,12 +66,13 @@ def sphere(
 
 
 @calibrate.command()
-def tracker(session: _SESSION, as_json: _JSON = False) -> None:
+@results_alone
+def tracker(session: _SESSION, as_json: Json = False) -> None:
     """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board."""
     loaded = load_session(session)
     document = tracker_document(calibrate_tracker(loaded), loaded)
     if as_json:
-        print(json.dumps(document, indent=1))
+        emit(json.dumps(document, indent=1))
         return
     unit, other, heldout = document["length_unit"], document["other"], document["heldout_position_error"]
     facts = [
@@ -82,13 +85,15 @@ def tracker(session: _SESSION, as_json: _JSON = False) -> None:
 
 
 @calibrate.command()
+@results_alone
 def robot(
     session: _SESSION,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT", help="Run folder; default runs/NAME-robot.")
     ] = None,
+    force: Force = False,
     at_most: Annotated[int, typer.Option("--at-most", help="Largest number of effects.")] = 8,
-    as_json: _JSON = False,
+    as_json: Json = False,
 ) -> None:
     """Kinematic calibration: what the arm's nominal model lacks, as model, corrected DH rows and URDF."""
     loaded = load_session(session)
@@ -97,22 +102,22 @@ def robot(
     found, lines, diagnosis = suggest(state_of(first), at_most)
     result = found or first
     target = output or Path("runs") / f"{loaded.name}-robot"
-    with run_folder.new_folder(target) as scratch:
+    with run_folder.new_folder(target, [session], force) as scratch:
         run_folder.write_with_page(result, scratch)
         write_robot(result, calibrated(result), scratch)
         write_diagnosis(diagnosis, state_of(result), scratch)
     document = robot_document(result, lines, diagnosis.sentence)
     if as_json:
-        print(to_json(document))
+        emit(to_json(document))
     else:
         _show_robot(result, document, lines, target)
 
 
 def _show_robot(result: Run, document: dict[str, Any], lines: list[str], target: Path) -> None:
     """The way, the history, the rows, the poses to add."""
-    console = Console(stderr=True)
+    terminal = console()
     for line in lines:
-        console.print(line, soft_wrap=True, highlight=False)
+        terminal.print(line, soft_wrap=True)
     show_ledger(result)
     table = Table(title="Corrected DH rows", title_justify="left")
     for heading in ("joint", "a", "alpha (°)", "d", "theta (°)"):
@@ -120,26 +125,26 @@ def _show_robot(result: Run, document: dict[str, Any], lines: list[str], target:
     for i, row in enumerate(document["robot"] or ()):
         table.add_row(str(i + 1), *(f"{row[key]:.5f}" for key in ("a", "alpha_deg", "d", "theta_deg")))
     if document["robot"]:
-        console.print(table)
-    console.print(beyond_sentence(calibrated(result)), soft_wrap=True, highlight=False)
+        terminal.print(table)
+    terminal.print(beyond_sentence(calibrated(result)), soft_wrap=True)
     for pose in document["next"]:
         told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(pose))
-        console.print(f"A pose that would tell most of the rest: {told}.", soft_wrap=True, highlight=False)
+        terminal.print(f"A pose that would tell most of the rest: {told}.", soft_wrap=True)
     for name in ("model.toml", "robot.toml", "robot.urdf", "report.html"):
         if (target / name).exists():
-            console.print(f"  {target / name}", soft_wrap=True, highlight=False)
+            terminal.print(f"  {target / name}", soft_wrap=True)
 
 
 def show(document: dict[str, Any], facts: list[tuple[str, str]]) -> None:
     """The hand-eye with its sigmas, more facts, and the notes, for people."""
-    console, unit = Console(stderr=True), document["length_unit"]
+    terminal, unit = console(), document["length_unit"]
     mount = "flange" if document["mount"] == "eye_in_hand" else "base"
     table = Table(title=f"{document['session']}: T_{mount}_scanner", title_justify="left", show_header=False)
     for name, text in [*hand_eye_rows(document, unit), *facts]:
         table.add_row(name, text)
-    console.print(table)
+    terminal.print(table)
     for note in document["notes"]:
-        console.print(f"{note}.", soft_wrap=True, highlight=False)
+        terminal.print(f"{note}.", soft_wrap=True)
 
 
 def hand_eye_rows(document: dict[str, Any], unit: str) -> list[tuple[str, str]]:

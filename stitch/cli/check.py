@@ -7,17 +7,19 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.options import Json
+from stitch.cli.streams import emit
 from stitch.errors import InputError
 from stitch.measurement.session import Session
 from stitch.reading.session_folder import load_session
+from stitch.system.console import console
 
 
 def check(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Read sessions completely and say what is wrong; computes nothing."""
     facts, errors = [], []
@@ -27,7 +29,7 @@ def check(
         except InputError as error:
             errors.append(str(error))
     if as_json:
-        print(json.dumps({"sessions": facts, "errors": errors}, indent=1))
+        emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
     else:
         _print(facts)
     for line in errors:
@@ -58,9 +60,9 @@ def summary(session: Session) -> dict[str, object]:
 
 
 def _print(facts: list[dict[str, object]]) -> None:
-    console = Console(stderr=True)
+    terminal = console()
     for fact in facts:
         table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
         for key, value in fact.items():
             table.add_row(key, ", ".join(value) if isinstance(value, list) else str(value))
-        console.print(table)
+        terminal.print(table)

@@ -1,42 +1,42 @@
 """`stitch effects`: the library with formulas; `stitch effects NAME`: one of them."""
 
 from math import isfinite
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.options import EffectsFile, Json
+from stitch.cli.streams import emit, results
 from stitch.effects.contract import EFFECTS, PLACES, Effect
+from stitch.effects.in_session import known
 from stitch.effects.user_file import load
-from stitch.model.terms import known
+from stitch.system.console import console
 from stitch.writing.json_file import to_json
 
 
 def effects(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Show one effect.")] = None,
-    effects_file: Annotated[
-        Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the effects as JSON.")] = False,
+    effects_file: EffectsFile = None,
+    as_json: Json = False,
 ) -> None:
     """List the physical effects with place, formula, parameters and plausible sizes."""
     if effects_file:
         load(effects_file)
-    console = Console()
+    terminal = console(results())
     if as_json:
-        print(to_json([_document(e) for e in ([known(name)] if name else EFFECTS.values())]))
+        emit(to_json([_document(e) for e in ([known(name)] if name else EFFECTS.values())]))
         return
     if name:
-        _one(console, name)
+        _one(terminal, name)
         return
     table = Table()
     for heading in ("effect", "place", "what nature does", "parameters"):
         table.add_column(heading, overflow="fold")
     for effect in EFFECTS.values():
         table.add_row(effect.name, effect.place, effect.formula, signature(effect))
-    console.print(table)
+    terminal.print(table)
 
 
 def signature(effect: Effect) -> str:
@@ -57,17 +57,20 @@ def _document(effect: Effect) -> dict[str, Any]:
         for key, s in effect.specs.items()
     ]
     return {
-        "effect": effect.name, "place": effect.place, "tier": effect.tier, "formula": effect.formula,
-        "parameters": parameters, "needs": list(effect.needs), "uses": list(effect.prefers),
-    }  # fmt: skip
+        "effect": effect.name,
+        "place": effect.place,
+        "tier": effect.tier,
+        "formula": effect.formula,
+        "parameters": parameters,
+        "needs": list(effect.needs),
+        "uses": list(effect.prefers),
+    }
 
 
-def _one(console: Console, name: str) -> None:
+def _one(terminal: Console, name: str) -> None:
     effect = known(name)
-    console.print(
-        f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", soft_wrap=True, highlight=False
-    )
-    console.print(f"  {effect.formula}", highlight=False)
+    terminal.print(f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", soft_wrap=True)
+    terminal.print(f"  {effect.formula}")
     kinds = {
         "number": "",
         "offset": ", x, y, z, or zero",
@@ -78,8 +81,8 @@ def _one(console: Console, name: str) -> None:
     for key, spec in effect.specs.items():
         shift = f" and {spec.typical_shift:g} {spec.unit_shift}" if spec.kind == "twist" else ""
         sizes = f"plausible {spec.typical:g}{shift}, not believed beyond {spec.limit:g}"
-        console.print(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}", soft_wrap=True, highlight=False)
+        terminal.print(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}", soft_wrap=True)
     if effect.needs:
-        console.print(f"  needs {', '.join(effect.needs)}", highlight=False)
+        terminal.print(f"  needs {', '.join(effect.needs)}")
     if effect.prefers:
-        console.print(f"  uses {', '.join(effect.prefers)} where the session has it", highlight=False)
+        terminal.print(f"  uses {', '.join(effect.prefers)} where the session has it")

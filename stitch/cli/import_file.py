@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
+from stitch.cli.streams import results
 from stitch.controllers.importer import import_file
 from stitch.errors import InputError
+from stitch.system.whole_file import whole
 
 
 def import_command(
@@ -29,13 +31,14 @@ def import_command(
     ] = None,
 ) -> None:
     """Write the points of a robot program or of a tracker as views.csv (frames.csv, points.csv)."""
-    if output is not None and output.exists():
+    if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
     imported = import_file(file, unit, frame, tool)
     if output is None:
-        print(imported.text, end="")
+        results().write(imported.text)
     else:
-        output.write_text(imported.text, encoding="utf-8")
+        with whole(output) as file:
+            file.write_text(imported.text, encoding="utf-8")
     for warning in imported.warnings:
         print(f"stitch: {file}: {warning}", file=sys.stderr)
     where = output or "standard output"

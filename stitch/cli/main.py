@@ -3,9 +3,12 @@
 Other packages, and the cells, add commands through the entry-point group `stitch.commands`.
 """
 
+import os
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import typer
 
@@ -19,27 +22,37 @@ from stitch.cli.effects import effects
 from stitch.cli.import_file import import_command
 from stitch.cli.report import report
 from stitch.cli.run import run
+from stitch.cli.streams import results_alone, speak_any_terminal
 from stitch.errors import StitchError
+from stitch.system import time_limit
 
-app = typer.Typer(
-    help="Stitch robot scans: find and correct the hand-eye, register, fuse, and say what is left.",
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
-)  # fmt: skip
+_COMMANDS = {
+    "run": run,
+    "check": check,
+    "compare": compare_run,
+    "diagnose": diagnose_run,
+    "add": add,
+    "drop": drop,
+    "next": next_measurement,
+    "effects": effects,
+    "report": report,
+    "batch": batch,
+    "import": import_command,
+}
+_LONGEST = 2000
 
 
 def build() -> typer.Typer:
     """The application with the commands of every installed package."""
-    app.command()(run)
-    app.command()(check)
-    app.command("compare")(compare_run)
-    app.command("diagnose")(diagnose_run)
-    app.command()(add)
-    app.command()(drop)
-    app.command("next")(next_measurement)
-    app.command()(effects)
-    app.command()(report)
-    app.command()(batch)
-    app.command("import")(import_command)
+    app = typer.Typer(
+        help="Stitch robot scans: find and correct the hand-eye, register, fuse, and say what is left.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    for name, command in _COMMANDS.items():
+        app.command(name)(results_alone(command))
     app.add_typer(calibrate, name="calibrate")
     for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
         app.command(entry.name)(entry.load())
@@ -48,11 +61,38 @@ def build() -> typer.Typer:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; errors of the input or the computation end in one line and their exit code."""
+    speak_any_terminal()
+    time_limit.may_end_process()
     try:
         build()(list(arguments) if arguments is not None else None)
     except StitchError as error:
-        print(f"stitch: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        _end(str(error), error.exit_code)
+    except BrokenPipeError:
+        # Whoever read the output has seen enough; nothing must be flushed to it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(1)
     except OSError as error:
-        print(f"stitch: {error.filename or 'file system'}: {error.strerror or error}", file=sys.stderr)
-        sys.exit(2)
+        _end(f"{error.filename or 'file system'}: {error.strerror or error}", 2)
+    except MemoryError:
+        _end("not enough memory; leave out views, or thin the scans", 1)
+    except Exception as error:
+        _end(_unexpected(error), 1)
+
+
+def _end(message: str, code: int) -> None:
+    """One line on standard error, and the end of the process."""
+    line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
+    print(f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}", file=sys.stderr, flush=True)
+    if time_limit.running_over():
+        # The thread of an effect that never ends would be waited for.
+        os._exit(code)
+    sys.exit(code)
+
+
+def _unexpected(error: Exception) -> str:
+    """A fault of the program in one line; the environment variable STITCH_TRACEBACK shows all of it."""
+    if os.environ.get("STITCH_TRACEBACK"):
+        traceback.print_exception(error)
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{Path(last.filename).name} line {last.lineno}"
+    return f"unexpected {type(error).__name__} in {place}: {error}; a fault of stitch: STITCH_TRACEBACK=1 shows where"

@@ -3,12 +3,11 @@
 import atexit
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Run, StageResult
+from stitch.system.console import console
 from stitch.units import MICROMETRES
 
 
@@ -16,7 +15,7 @@ class Progress:
     """One changing line on standard error; silent when that is no terminal."""
 
     def __init__(self) -> None:
-        self.console = Console(stderr=True)
+        self.console = console()
         self.status = self.console.status("reading") if self.console.is_terminal else None
         self.to_um = 1e3
 

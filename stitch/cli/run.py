@@ -6,24 +6,28 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.options import EffectsFile, Force, Json, Trust
 from stitch.cli.progress import Progress, Tee
+from stitch.cli.streams import emit
+from stitch.effects.in_session import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.measurement.session import Session
-from stitch.model.model_toml import read_model, write_model
-from stitch.model.terms import known
+from stitch.model.model_toml import write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Run
+from stitch.stored.trusted_model import trusted_model
+from stitch.system.console import console
 from stitch.units import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.mesh import write_mesh
 from stitch.writing.result_document import model_of, result_document
+from stitch.writing.run_contents import FILES
 
 
 def run(
@@ -35,13 +39,13 @@ def run(
         Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
     ] = None,
     effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
-    effects_file: Annotated[
-        Path | None, typer.Option("--effects-file", metavar="PY", help="Python file with effects of your own.")
-    ] = None,
+    effects_file: EffectsFile = None,
+    trust: Trust = False,
+    force: Force = False,
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print result.json alone on standard output.")] = False,
-) -> None:  # fmt: skip
+    as_json: Json = False,
+) -> None:
     """Find and correct the hand-eye, register the views, fuse them."""
     names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
     if effects_file:
@@ -58,11 +62,13 @@ def run(
         raise InputError(
             f"two sessions are named {max(names, key=names.count)!r}; give each its own name in session.toml"
         )
+    if len(names) > 1 and (taken := FILES & set(names)):
+        raise InputError(
+            f"a session is named {taken.pop()!r}, as a file of the run is; give it another in session.toml"
+        )
     target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
-    model = read_model(hand_eye) if hand_eye else None
-    if model and model.effects_file and not effects_file:
-        load_effects(Path(model.effects_file))
-    with run_folder.new_folder(target) as scratch:
+    model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
+    with run_folder.new_folder(target, sessions, force) as scratch:
         folders = [scratch] if len(loaded) == 1 else [scratch / name for name in names]
         for folder in folders:
             folder.mkdir(exist_ok=True)
@@ -75,7 +81,7 @@ def run(
             write_model(model_of(runs[0]), scratch / "model.toml")
     documents = [result_document(result) for result in runs]
     if as_json:
-        print(to_json(documents[0] if len(documents) == 1 else documents))
+        emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
 
@@ -98,7 +104,7 @@ def _write(result: Run, folder: Path, mesh: bool) -> None:
 
 def show(runs: list[Run], target: Path) -> None:
     """The stage table, the verdict and the paths, for people."""
-    console = Console(stderr=True)
+    terminal = console()
     for result in runs:
         session: Session = result.session
         to_um = MICROMETRES[session.length_unit]
@@ -109,11 +115,11 @@ def show(runs: list[Run], target: Path) -> None:
             table.add_row(
                 s.name, f"{s.rms * to_um:.1f}", f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}"
             )
-        console.print(table)
-        console.print(result.verdict, soft_wrap=True, highlight=False)
+        terminal.print(table)
+        terminal.print(result.verdict, soft_wrap=True)
         for line in (*(f"Not observable from these motions: {u}." for u in result.unobservable), *result.notes):
-            console.print(line, soft_wrap=True, highlight=False)
+            terminal.print(line, soft_wrap=True)
         folder = target if len(runs) == 1 else target / session.name
         for name in ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"):
             if (folder / name).exists():
-                console.print(f"  {folder / name}", soft_wrap=True, highlight=False)
+                terminal.print(f"  {folder / name}", soft_wrap=True)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from stitch import frames
-from stitch.calibrate.axxb_together import andreff, daniilidis
-from stitch.calibrate.motions import axis_spread, matched_rotations, require_motion, roots, translation
+from stitch.closed_form.axxb_simultaneous import andreff, daniilidis
+from stitch.closed_form.relative_motions import axis_spread, matched_rotations, require_motion, roots, translation
 from stitch.frames import Array, skew
 
 __all__ = ["SOLVERS", "andreff", "axis_spread", "daniilidis", "horaud_dornaika", "park_martin", "tsai_lenz"]

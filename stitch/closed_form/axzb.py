@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stitch import frames
-from stitch.calibrate.motions import require_motion
+from stitch.closed_form.relative_motions import from_first, require_motion, roots, solve_translation
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -26,7 +26,7 @@ def require_poses(A: Array) -> None:
         raise NoResultError(
             f"{len(A)} poses cannot show the base and the tool; measure three or more, turned both ways"
         )
-    require_motion(frames.inverse(A[:1]) @ A[1:])
+    require_motion(from_first(A))
 
 
 def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
@@ -36,14 +36,13 @@ def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array
         NoResultError: poses that cannot show both; names the axis they share.
     """
     require_poses(A)
-    w = np.ones(len(A)) if weights is None else np.asarray(weights, float)
     Ra, Rb = A[:, :3, :3], B[:, :3, :3]
     # Row-major vec: vec(RaᵀZ Rb) = (Raᵀ ⊗ Rbᵀ) vec Z.
-    K = np.einsum("v,vji,vlk->ikjl", w, Ra, Rb).reshape(9, 9)
+    K = np.einsum("v,vji,vlk->ikjl", roots(A, weights) ** 2, Ra, Rb).reshape(9, 9)
     U, _, Vt = np.linalg.svd(K)
     x, z = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)
     sign = np.sign(np.linalg.det(x))
-    return _with_translations(A, B, frames.nearest_rotation(sign * x), frames.nearest_rotation(sign * z), w)
+    return _with_translations(A, B, frames.nearest_rotation(sign * x), frames.nearest_rotation(sign * z), weights)
 
 
 def li(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
@@ -53,25 +52,22 @@ def li(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
         NoResultError: poses that cannot show both; names the axis they share.
     """
     require_poses(A)
-    w = np.ones(len(A)) if weights is None else np.asarray(weights, float)
     eye, unit = np.eye(3), float(np.abs(np.concatenate([A[:, :3, 3], B[:, :3, 3]])).max()) or 1.0
     rows, right = [], []
-    for a, b, root in zip(A, B, np.sqrt(w), strict=True):
+    for a, b, root in zip(A, B, roots(A, weights), strict=True):
         turn = np.hstack([np.kron(a[:3, :3], eye), -np.kron(eye, b[:3, :3].T), np.zeros((9, 6))])
         move = np.hstack([np.zeros((3, 9)), np.kron(eye, b[None, :3, 3]) / unit, -a[:3, :3], eye])
         rows.append(root * np.vstack([turn, move]))
         right.append(root * np.concatenate([np.zeros(9), a[:3, 3] / unit]))
     x = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
     R_x, R_z = (frames.nearest_rotation(x[k : k + 9].reshape(3, 3)) for k in (0, 9))
-    return _with_translations(A, B, R_x, R_z, w)
+    return _with_translations(A, B, R_x, R_z, weights)
 
 
-def _with_translations(A: Array, B: Array, R_x: Array, R_z: Array, weights: Array) -> tuple[Array, Array]:
+def _with_translations(A: Array, B: Array, R_x: Array, R_z: Array, weights: Array | None) -> tuple[Array, Array]:
     """t_X, t_Z from R_A t_X − t_Z = R_Z t_B − t_A, weighted least squares."""
-    root = np.sqrt(weights)[:, None]
     left = np.concatenate([A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3))], axis=2)
-    right = B[:, :3, 3] @ R_z.T - A[:, :3, 3]
-    t = np.linalg.lstsq((root[..., None] * left).reshape(-1, 6), (root * right).reshape(-1), rcond=None)[0]
+    t = solve_translation(left, B[:, :3, 3] @ R_z.T - A[:, :3, 3], weights)
     return frames.make(R_x, t[:3]), frames.make(R_z, t[3:])
 
 

@@ -15,7 +15,7 @@ from stitch.model.forward import corrected
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.observations.surfaces.match import Match, sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
-from stitch.stored.load_state import State
+from stitch.runs.state import State
 from stitch.system.threads import library_threads_off
 
 # Correspondences of a view in a bin that make a sample.
@@ -30,8 +30,8 @@ def compare(state: State) -> Comparison:
         NoResultError: no two views overlap.
     """
     with library_threads_off():
-        own = corrected(state.measurement, state.terms, state.T_mount)
-        poses = own.poses(state.T_mount)
+        own = corrected(state.measurement, state.model)
+        poses = own.poses(state.model.T_mount)
         overlaps = collect(own, poses, state.gate, [sample(s, FINE_SAMPLES) for s in own.scans])
     rows = _Rows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = [view.name for view in state.session.views]

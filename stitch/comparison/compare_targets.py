@@ -14,8 +14,8 @@ from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
 from stitch.observations.targets.rows import rows_of
+from stitch.runs.state import State
 from stitch.statistics.block_least_squares import Blocks
-from stitch.stored.load_state import State
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,11 @@ def compare_targets(state: State) -> Comparison:
 
 def _offsets(state: State) -> _Offsets:
     """With the targets where hand-eye and effects of the model put them best."""
-    own = corrected(state.measurement, state.terms, state.T_mount)
+    own = corrected(state.measurement, state.model)
     s = own.sightings
     assert s is not None
-    rows = rows_of(own, state.T_mount, initial_landmarks(own, state.T_mount, drawing_of(state.session.nominal, s)))
+    T_mount = state.model.T_mount
+    rows = rows_of(own, T_mount, initial_landmarks(own, T_mount, drawing_of(state.session.nominal, s)))
     diagonal = np.zeros((*rows.residual.shape, rows.residual.shape[1]))
     diagonal[:, np.arange(rows.residual.shape[1]), np.arange(rows.residual.shape[1])] = rows.noise + rows.fixed
     k = rows.landmarks.shape[2]

@@ -7,9 +7,7 @@ DH joint 3 of most published tables is J2 + J3.
 import re
 from pathlib import Path
 
-import numpy as np
-
-from stitch.controllers.taught import Taught, fixed_xyz, line_of
+from stitch.controllers.taught import Taught, fixed_xyz, line_of, pose_or_joints
 from stitch.errors import InputError
 from stitch.reading.csv_number import number
 
@@ -47,9 +45,7 @@ def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
     }
     taught_in = _FRAME.search(group[1])
     frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
-    if all(key in fields for key in "XYZWPR"):
-        return Taught(name, line, fixed_xyz(np.array([fields[key] for key in "XYZWPR"])), None, frame)
-    joints = [fields[f"J{i}"] for i in range(1, 10) if f"J{i}" in fields]
-    if len(joints) < 4:
+    T_frame_tool, joints = pose_or_joints(fields, "XYZWPR", fixed_xyz, joint="J")
+    if T_frame_tool is None and joints is None:
         raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; teach it again")
-    return Taught(name, line, None, np.radians(joints), frame)
+    return Taught(name, line, T_frame_tool, joints, frame)

@@ -10,15 +10,21 @@ import numpy as np
 
 from stitch import frames
 from stitch.controllers import abb, fanuc, kuka, tracker_csv, universal
-from stitch.controllers.tables import POSE, csv_text, pose_cells, unique, view_rows
+from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique, view_rows
 from stitch.controllers.taught import Taught
 from stitch.controllers.tracker_csv import Measured
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
+from stitch.reading.csv_number import is_number
 
 _READERS: dict[str, ModuleType] = {
-    ".ls": fanuc, ".dat": kuka, ".src": kuka, ".mod": abb, ".script": universal, ".csv": universal,
-}  # fmt: skip
+    ".ls": fanuc,
+    ".dat": kuka,
+    ".src": kuka,
+    ".mod": abb,
+    ".script": universal,
+    ".csv": universal,
+}
 # Programs are in mm; views.csv is in the session's length_unit.
 _SCALE = {"mm": 1.0, "m": 1e-3}
 
@@ -43,7 +49,7 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
         tool: T_flange_tool in force when they were taught, likewise. T_base_flange = frame · point · tool⁻¹.
 
     Raises:
-        InputError: unknown or broken file, points of different frames; names the line and the mend.
+        InputError: unknown or broken file, points of different frames; names the line and how to fix it.
         NoResultError: no points in the file.
     """
     if not file.is_file():
@@ -56,37 +62,30 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
     text = file.read_text(encoding="utf-8-sig", errors="replace")
     if not text.strip():
         raise InputError(f"{file}: empty; export it again")
-    if reader is universal and file.suffix.lower() == ".csv" and not _recording(text):
+    if reader is universal and file.suffix.lower() == ".csv" and not universal.is_recording(text):
         return _tracker(file, text, unit)
     points: Sequence[Taught] = reader.read(file, text)
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
     warnings = _check_frames(file, points, frame, tool)
-    T_base_frame, T_flange_tool = (
-        _given(reader.pose, name, value) for name, value in (("frame", frame), ("tool", tool))
-    )
+    T_base_frame, T_flange_tool = _given(reader.pose, "frame", frame), _given(reader.pose, "tool", tool)
     rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _SCALE[unit])
     return Imported("views.csv", csv_text(rows), len(points), reader.CONVENTION, warnings)
-
-
-def _recording(text: str) -> bool:
-    first = text.lstrip().splitlines()[0]
-    separator = next((s for s in ",;\t" if s in first), " ")
-    return universal.is_recording([cell.strip() for cell in first.split(separator)])
 
 
 def _given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
     if value is None:
         return np.eye(4)
+    count = 7 if pose is abb.pose else 6
+    cells = value.split(",")
+    if len(cells) != count or not all(is_number(cell) for cell in cells):
+        raise InputError(
+            f"--{name} {value}: to fix: write {count} numbers with commas, as the controller shows the pose"
+        )
     try:
-        numbers = np.array([float(cell) for cell in value.split(",")])
-        if not len(numbers) == (7 if pose is abb.pose else 6):
-            raise ValueError
-        return pose(numbers)
-    except (ValueError, IndexError) as error:
-        mend = f"write {'7' if pose is abb.pose else '6'} numbers with commas, as the controller shows the pose"
-        reason = f" ({error})" if str(error) else ""
-        raise InputError(f"--{name} {value}: {mend}{reason}") from None
+        return pose(np.array([float(cell) for cell in cells]))
+    except ValueError as error:
+        raise InputError(f"--{name} {value}: {error}") from None
 
 
 def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool: str | None) -> tuple[str, ...]:

@@ -6,9 +6,7 @@ A .src gives the points in the order of its motions; names in it are looked up i
 import re
 from pathlib import Path
 
-import numpy as np
-
-from stitch.controllers.taught import Taught, line_of, zyx
+from stitch.controllers.taught import Taught, line_of, pose_or_joints, without_comments, zyx
 from stitch.errors import InputError
 from stitch.reading.csv_number import number
 
@@ -32,19 +30,14 @@ def read(file: Path, text: str) -> list[Taught]:
     if file.suffix.lower() == ".dat":
         return list(_declared(file, text).values())
     known = _declared(file, text)
-    beside = next((p for p in (file.with_suffix(".dat"), file.with_suffix(".DAT")) if p.is_file()), None)
-    if beside is not None:
-        known |= _declared(beside, beside.read_text(encoding="utf-8", errors="replace"))
-    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(_without_comments(text))]
-
-
-def _without_comments(text: str) -> str:
-    """Comments run from a semicolon to the end of the line; lengths stay."""
-    return re.sub(r";[^\n]*", lambda match: " " * len(match[0]), text)
+    data = next((p for p in (file.with_suffix(".dat"), file.with_suffix(".DAT")) if p.is_file()), None)
+    if data is not None:
+        known |= _declared(data, data.read_text(encoding="utf-8", errors="replace"))
+    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(without_comments(text, ";"))]
 
 
 def _declared(file: Path, text: str) -> dict[str, Taught]:
-    clean = _without_comments(text)
+    clean = without_comments(text, ";")
     found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2])) for m in _DECLARED.finditer(clean)]
     return {name.upper(): point for name, point in found}
 
@@ -62,9 +55,7 @@ def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taug
 
 def _point(file: Path, name: str, line: int, body: str) -> Taught:
     fields = {key.upper(): number(file, line, f"{name} {key}", value) for key, value in _FIELD.findall(body)}
-    if all(key in fields for key in "XYZABC"):
-        return Taught(name, line, zyx(np.array([fields[key] for key in "XYZABC"])), None)
-    joints = [fields[f"A{i}"] for i in range(1, 10) if f"A{i}" in fields]
-    if len(joints) < 4:
+    T_frame_tool, joints = pose_or_joints(fields, "XYZABC", zyx, joint="A")
+    if T_frame_tool is None and joints is None:
         raise InputError(f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; write all of them")
-    return Taught(name, line, None, np.radians(joints))
+    return Taught(name, line, T_frame_tool, joints)

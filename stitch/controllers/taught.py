@@ -1,5 +1,7 @@
 """A taught point, and how each controller writes an orientation. Lengths in mm, angles in rad."""
 
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array
+
+_FEWEST_JOINTS = 4
 
 
 @dataclass(frozen=True)
@@ -36,17 +40,43 @@ def quaternion_w_first(numbers: Array) -> Array:
     Raises:
         ValueError: not a unit quaternion.
     """
-    q = np.asarray(numbers[3:7], float)
-    norm = float(np.linalg.norm(q))
+    return posed(np.asarray(numbers[:3], float), np.asarray(numbers, float)[[4, 5, 6, 3]])
+
+
+def posed(position: Array, quaternion: Array) -> Array:
+    """Pose (4, 4) from a position (3,) and a unit quaternion (4,), w last.
+
+    Raises:
+        ValueError: not a unit quaternion.
+    """
+    norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-3:
-        raise ValueError(f"quaternion of length {norm:.4f}, not a rotation; write q1 … q4 of length 1, w first")
-    return frames.from_quaternion(np.asarray(numbers[:3], float), np.array([q[1], q[2], q[3], q[0]]) / norm)
+        raise ValueError(f"quaternion of length {norm:.4f}, not a rotation; to fix: write or export it with length 1")
+    return frames.from_quaternion(position, quaternion / norm)
 
 
 def rotation_vector(numbers: Array) -> Array:
     """UR x, y, z, rx, ry, rz (m, rad): turn by the vector's length about its direction."""
     numbers = np.asarray(numbers, float)
     return frames.make(Rotation.from_rotvec(numbers[3:6]).as_matrix(), numbers[:3] * 1000)
+
+
+def pose_or_joints(
+    fields: Mapping[str, float], axes: str, pose: Callable[[Array], Array], *, joint: str
+) -> tuple[Array | None, Array | None]:
+    """Pose (4, 4) from the fields named by `axes`, else joint angles (n,) rad from fields joint1, joint2, …
+
+    Both are None where neither is complete.
+    """
+    if all(axis in fields for axis in axes):
+        return pose(np.array([fields[axis] for axis in axes])), None
+    joints = [fields[f"{joint}{i}"] for i in range(1, 10) if f"{joint}{i}" in fields]
+    return None, np.radians(joints) if len(joints) >= _FEWEST_JOINTS else None
+
+
+def without_comments(text: str, mark: str) -> str:
+    """Comments run from the mark to the end of the line; they are blanked, so that positions stay."""
+    return re.sub(rf"{mark}[^\n]*", lambda match: " " * len(match[0]), text)
 
 
 def line_of(text: str, position: int) -> int:

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stitch import frames
+from stitch.controllers.taught import fixed_xyz, posed
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.csv_number import number
@@ -47,7 +46,7 @@ def read(file: Path, text: str) -> list[Measured]:
     """Measurements in the order of the file.
 
     Raises:
-        InputError: names the line and the mend.
+        InputError: names the line and how to fix it.
     """
     header, separator = columns(text)
     if not all(axis in header for axis in "xyz"):
@@ -80,12 +79,11 @@ def _pose(
     file: Path, line: int, row: dict[str, str], position: Array, quaternion: tuple[str, ...] | None, angles: bool
 ) -> Array | None:
     if angles:
-        turns = [number(file, line, n, row[n]) for n in _ANGLES]
-        return frames.make(Rotation.from_euler("xyz", turns, degrees=True).as_matrix(), position)
+        return fixed_xyz(np.append(position, [number(file, line, n, row[n]) for n in _ANGLES]))
     if quaternion is None:
         return None
     q = np.array([number(file, line, n, row[n]) for n in quaternion])
-    norm = float(np.linalg.norm(q))
-    if abs(norm - 1) > 1e-3:
-        raise InputError(f"{file} line {line}: the quaternion has length {norm:.4f}; export unit quaternions")
-    return frames.from_quaternion(position, q / norm)
+    try:
+        return posed(position, q)
+    except ValueError as error:
+        raise InputError(f"{file} line {line}: {error}") from None

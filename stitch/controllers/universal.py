@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, rotation_vector
+from stitch.controllers.taught import Taught, line_of, rotation_vector, without_comments
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.csv_number import is_number, number
@@ -29,13 +29,13 @@ def read(file: Path, text: str) -> list[Taught]:
     """Points of a .script, or one per row of a .csv.
 
     Raises:
-        InputError: names the line and the mend.
+        InputError: names the line and how to fix it.
     """
     return _table(file, text) if file.suffix.lower() == ".csv" else _script(file, text)
 
 
 def _script(file: Path, text: str) -> list[Taught]:
-    clean = re.sub(r"#[^\n]*", lambda match: " " * len(match[0]), text)
+    clean = without_comments(text, "#")
     found = [(m.start(), m[1], m[2], m[3]) for m in _NAMED.finditer(clean)]
     found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m[2]) for m in _MOVE.finditer(clean)]
     points: dict[str, Taught] = {}
@@ -56,14 +56,16 @@ def _script(file: Path, text: str) -> list[Taught]:
     return list(points.values())
 
 
-def is_recording(header: list[str]) -> bool:
-    """True for the header of a robot's recording: a pose or joints under one of the known names."""
+def is_recording(text: str) -> bool:
+    """True for a robot's recording: a header with a pose or joints under one of the known names."""
+    first = text.lstrip().splitlines()[0]
+    header = [cell.strip() for cell in first.split(_separator(first))]
     return any(all(name in header for name in names) for names in (*_POSE, *_JOINTS))
 
 
 def _table(file: Path, text: str) -> list[Taught]:
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    separator = next((s for s in ",;\t" if s in lines[0][1]), " ")
+    separator = _separator(lines[0][1])
     rows = list(csv.reader([line for _, line in lines], delimiter=separator, skipinitialspace=True))
     header = [name.strip() for name in rows[0]]
     pose, joints = (next((c for c in choice if all(n in header for n in c)), None) for choice in (_POSE, _JOINTS))
@@ -75,6 +77,10 @@ def _table(file: Path, text: str) -> list[Taught]:
         T = None if pose is None else rotation_vector(_values(file, line, cells, pose))
         out.append(Taught(f"row{line}", line, T, None if joints is None else _values(file, line, cells, joints)))
     return out
+
+
+def _separator(header: str) -> str:
+    return next((s for s in ",;\t" if s in header), " ")
 
 
 def _values(file: Path, line: int, cells: dict[str, str], names: list[str]) -> Array:

@@ -1,7 +1,7 @@
 """All effects that could be missing, each with the forms in which it may appear."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -9,10 +9,11 @@ import numpy as np
 from stitch.effects.contract import EFFECTS, Effect, Parameter
 from stitch.effects.empirical import empirical_effects
 from stitch.effects.groups import by_joint, one_by_one, without_offset
-from stitch.frames import Array
-from stitch.measurement.measurement import Term
-from stitch.observations.evidence import ViewEvidence
-from stitch.observations.surfaces.point_effects import PointGram
+from stitch.effects.in_session import lacking, parameters_in
+from stitch.frames import Array, Mask
+from stitch.model.term import Term
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.response import PointSums, Response
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,21 @@ class Form:
     """One form of an effect: all its parameters, those of one joint, or all but an offset; one value of each grid."""
 
     term: Term  # at zero, gridded parameters at their value
-    keep: Array  # (P,) bool: parameters that are free in this form
-    twists: Array  # (·, p) of the free ones: the response of the views
+    keep: Mask  # (P,) parameters that are free in this form
+    response: Array  # (·, p) of the observation to the free ones
     columns: Array  # (n, p) of the free ones in the channel
     sizes: Array  # (p,) plausible sizes
+
+    @property
+    def free(self) -> list[Parameter]:
+        """The p parameters that are free."""
+        return [p for p, keep in zip(self.term.parameters, self.keep, strict=True) if keep]
+
+    def at(self, values: Array) -> Term:
+        """The term with fitted values (p,) of the free parameters."""
+        filled = self.term.values
+        filled[self.keep] = values
+        return self.term.at(filled)
 
 
 @dataclass(frozen=True)
@@ -31,73 +43,71 @@ class Candidate:
     """An effect with its forms; the first one has all parameters free."""
 
     effect: Effect
-    parameters: tuple[Parameter, ...]
     forms: tuple[Form, ...]
-    twists: Array  # (·, P) of the first form
-    points: slice | None  # of the first form's columns in the PointGram
+    response: Array  # (·, P) of the first form
+    points: PointSums | None  # of the first form, where the effect changes points
 
     @property
     def name(self) -> str:
+        """That of the effect."""
         return self.effect.name
 
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All P parameters at zero."""
+        return self.forms[0].term.parameters
 
-def candidates_of(evidence: ViewEvidence) -> tuple[list[Candidate], PointGram | None, dict[str, tuple[str, ...]]]:
+    @property
+    def empirical(self) -> bool:
+        """True for a shape without a cause."""
+        return self.effect.tier == "empirical"
+
+
+def candidates_of(linear: LinearModel) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
     """Physical, user and empirical effects that are not in the model, and what each unavailable one lacks."""
-    measurement = evidence.measurement
-    used = {term.effect.name for term in evidence.terms}
+    used = linear.model.effects
     library = [e for e in EFFECTS.values() if e.name not in used]
-    missing = {e.name: measurement.lacks(e) for e in library if measurement.lacks(e)}
-    effects = [e for e in library if e.name not in missing] + empirical_effects(measurement.views)
-    terms, owner = [], []
-    for k, effect in enumerate(effects):
-        for term in _grid_terms(effect, measurement.parameters(effect)):
-            terms.append(term)
-            owner.append(k)
-    columns, sums, where = evidence.columns(terms)
-    out = []
-    for k, effect in enumerate(effects):
-        own = [i for i, o in enumerate(owner) if o == k]
-        parameters = measurement.parameters(effect)
-        forms = [f for i in own for f in _forms(evidence, terms[i], parameters, columns[i])]
-        if forms:
-            out.append(Candidate(effect, parameters, tuple(forms), columns[own[0]], where[own[0]]))
-    return out, sums, missing
+    missing = {e.name: lacks for e in library if (lacks := lacking(linear.measurement, e))}
+    effects = [e for e in library if e.name not in missing] + empirical_effects(linear.measurement.views)
+    terms = [_grid_terms(linear, effect) for effect in effects]
+    responses = iter(linear.responses([term for own in terms for term in own]))
+    tried = [_candidate(linear, own, [next(responses) for _ in own]) for own in terms]
+    return [c for c in tried if c is not None], missing
 
 
-def candidate_of(evidence: ViewEvidence, effect: Effect) -> Candidate | None:
-    """One effect as a candidate."""
-    parameters = evidence.measurement.parameters(effect)
-    terms = _grid_terms(effect, parameters)
-    columns, _, where = evidence.columns(terms)
-    forms = [f for term, c in zip(terms, columns, strict=True) for f in _forms(evidence, term, parameters, c)]
-    return Candidate(effect, parameters, tuple(forms), columns[0], where[0]) if forms else None
+def candidate_of(linear: LinearModel, effect: Effect) -> Candidate | None:
+    """One effect as a candidate; None if it has no parameters here."""
+    terms = _grid_terms(linear, effect)
+    return _candidate(linear, terms, linear.responses(terms))
 
 
-def as_fitted(evidence: ViewEvidence, term: Term) -> Candidate:
+def as_fitted(linear: LinearModel, term: Term) -> Candidate:
     """An effect with those of its parameters that a fit left in use, as the one form it may have."""
-    parameters = evidence.measurement.parameters(term.effect)
-    held = np.array([bool(p.grid) for p in parameters])
-    zero, keep = replace(term, values=np.where(held, term.values, 0.0)), ~held & (term.values != 0)
-    twists = evidence.columns([zero])[0][0]
-    sizes = np.array([p.typical for p in parameters])[keep]
-    form = Form(zero, keep, twists[:, keep], evidence.in_channel(twists)[:, keep], sizes)
-    return Candidate(term.effect, parameters, (form,), twists, None)
+    zero, keep = term.at(np.where(term.gridded, term.values, 0.0)), ~term.gridded & (term.values != 0)
+    response = linear.responses([zero])[0].columns
+    form = Form(zero, keep, response[:, keep], linear.reduce(response)[:, keep], term.typical[keep])
+    return Candidate(term.effect, (form,), response, None)
 
 
-def _grid_terms(effect: Effect, parameters: Sequence[Parameter]) -> list[Term]:
+def _grid_terms(linear: LinearModel, effect: Effect) -> list[Term]:
     """The effect at zero, once for every combination of its gridded parameters."""
-    grids = [p.grid or (0.0,) for p in parameters]
-    return [Term(effect, np.array(values)) for values in product(*grids)]
+    zero = Term(effect, parameters_in(linear.measurement, effect))
+    return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
 
-def _forms(evidence: ViewEvidence, term: Term, parameters: Sequence[Parameter], twists: Array) -> list[Form]:
+def _candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
+    forms = [f for term, r in zip(terms, responses, strict=True) for f in _forms(linear, term, r.columns)]
+    if not forms:
+        return None
+    return Candidate(terms[0].effect, tuple(forms), responses[0].columns, responses[0].points)
+
+
+def _forms(linear: LinearModel, term: Term, response: Array) -> list[Form]:
     """All parameters together, then those that can be true alone."""
-    free = np.array([not p.grid for p in parameters])
-    sizes = np.array([p.typical for p in parameters])
-    channel = evidence.in_channel(twists)
-    alone = [free & np.isin(np.arange(len(parameters)), g) for g in _groups(term.effect, parameters)]
+    free, columns = ~term.gridded, linear.reduce(response)
+    alone = [free & np.isin(np.arange(len(free)), g) for g in _groups(term.effect, term.parameters)]
     keeps = [free, *(keep for keep in alone if (keep != free).any())]
-    return [Form(term, keep, twists[:, keep], channel[:, keep], sizes[keep]) for keep in keeps]
+    return [Form(term, keep, response[:, keep], columns[:, keep], term.typical[keep]) for keep in keeps]
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
@@ -105,10 +115,3 @@ def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
     joints = by_joint(effect, parameters) or without_offset(effect, parameters)
     single = effect.place == "links" and len(effect.specs) > 1
     return joints + one_by_one(effect, parameters) if joints and single else joints
-
-
-def with_values(form: Form, values: Array) -> Term:
-    """The term of a form with fitted values of its free parameters."""
-    filled = form.term.values.copy()
-    filled[form.keep] = values
-    return replace(form.term, values=filled)

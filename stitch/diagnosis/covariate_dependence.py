@@ -9,7 +9,7 @@ import numpy as np
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.frames import Array
 from stitch.measurement.views import Views
-from stitch.observations.evidence import ViewEvidence
+from stitch.observations.linear_model import LinearModel
 
 _BINS = 5
 
@@ -27,16 +27,16 @@ class Dependence:
     shape: str  # the empirical form that fits best, in words
 
 
-def dependences(evidence: ViewEvidence, empirical: Sequence[Ranked]) -> list[Dependence]:
+def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
     """The best empirical form of every covariate, clearest first."""
-    views = evidence.measurement.views
+    views = linear.measurement.views
     best: dict[str, Ranked] = {}
     for r in empirical:
         group = r.score.candidate.effect.group
-        if group not in best or r.score.gain > best[group].score.gain:
+        if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
             best[group] = r
     found = [
-        _dependence(evidence, r, course) for name, r in best.items() if (course := course_of(views, name)) is not None
+        _dependence(linear, r, course) for name, r in best.items() if (course := course_of(views, name)) is not None
     ]
     return sorted(found, key=lambda d: (d.p_value, -d.score))
 
@@ -52,15 +52,15 @@ def course_of(views: Views, name: str) -> Array | None:
     return views.covariates.get(name)
 
 
-def _dependence(evidence: ViewEvidence, ranked: Ranked, course: Array) -> Dependence:
+def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependence:
     scored = ranked.score
-    white = evidence.whiten_channel(scored.form.columns)
+    white = linear.residual(scored.form.columns)
     basis, s, _ = np.linalg.svd(white, full_matrices=False)
     basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
-    share = float(np.sum((basis.T @ evidence.white_z) ** 2) / max(float(np.sum(evidence.white_z**2)), 1e-300))
-    displacement = evidence.displaced()
+    share = float(np.sum((basis.T @ linear.white_residual) ** 2) / max(float(np.sum(linear.white_residual**2)), 1e-300))
+    displacement = linear.displaced()
     # The direction in which the displacements follow the fitted shape most.
-    fitted = evidence.at_part(scored.form.columns @ scored.values)
+    fitted = linear.at_part(scored.form.columns @ scored.values)
     direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
     y = displacement @ direction
     if np.dot(y, fitted @ direction) < 0:

@@ -1,4 +1,4 @@
-"""What a diagnosis says: verdict, suspects, what depends on what, what to measure next."""
+"""What a diagnosis says: verdict, candidate effects, what depends on what, what to measure next."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.frames import Array
-from stitch.observations.evidence import ViewEvidence
+from stitch.observations.linear_model import LinearModel
 
 
 @dataclass(frozen=True)
@@ -19,16 +19,17 @@ class CandidateEffect:
     aliases: tuple[Alias, ...]
     cross_validation: CrossValidation | None
     detectable: dict[str, float]  # smallest detectable size per parameter, alone
-    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`missed.py`)
+    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`omitted_effect_bias.py`)
 
     @property
     def name(self) -> str:
+        """That of the effect."""
         return self.ranked.name
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Verdict, suspects, dependences, next measurement."""
+    """Verdict, candidate effects, what the rest depends on, what to measure next."""
 
     verdict: str
     effects: tuple[str, ...]
@@ -38,9 +39,12 @@ class Diagnosis:
     rotation: float  # repeatability under the present model, rad
     translation: float  # length_unit
     candidates: tuple[CandidateEffect, ...]
-    matrix: Array  # (S, S) alias matrix of the suspects
+    matrix: Array  # (S, S) alias matrix of the candidates
     depends_on: tuple[Dependence, ...]
     next: tuple[Proposal, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
-    evidence: ViewEvidence
+    linear: LinearModel
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Diagnosis({self.verdict}: {self.sentence})"

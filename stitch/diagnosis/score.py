@@ -14,8 +14,8 @@ from scipy.stats import f as f_distribution
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.frames import Array
-from stitch.observations.evidence import ViewEvidence
-from stitch.statistics.variance_components import MANY_NUMBERS, VarianceFit, at_variances, fit_variances
+from stitch.observations.linear_model import LinearModel
+from stitch.statistics.variance_components import MANY_NUMBERS, at_variances, fit_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 _SEEN = 0.5
@@ -36,67 +36,87 @@ class Score:
     observable: bool
     form: Form  # the best one
     p_value: float  # of the candidate, its forms counted; not yet counted over candidates
-    gain: float  # log evidence over the null's
+    log_bayes_factor: float  # over the null
     values: Array  # (p,) of the best form, free fit
-    sigmas: Array  # (p,)
-    covariance: Array  # (p, p)
-    fit: VarianceFit
+    covariance: Array  # (p, p); NaN where no form was worth a fit
 
     @property
     def name(self) -> str:
+        """That of the effect."""
         return self.candidate.name
 
+    @property
+    def sigmas(self) -> Array:
+        """(p,) standard deviations of the values."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0))
 
-def score(evidence: ViewEvidence, candidate: Candidate) -> Score:
+    @property
+    def fitted(self) -> bool:
+        """True if the best form was worth a fit."""
+        return bool(np.isfinite(self.covariance).all())
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """One form against the null."""
+
+    log_bayes_factor: float
+    p_value: float = 1.0
+    values: Array | None = None  # (p,) free fit; None where the form was not worth one
+    covariance: Array | None = None
+
+
+def score(linear: LinearModel, candidate: Candidate) -> Score:
     """Try all forms of a candidate."""
     full = candidate.forms[0]
-    whites = [evidence.whiten_channel(form.columns) for form in candidate.forms]
+    whites = [linear.residual(form.columns) for form in candidate.forms]
     seen = bool((np.linalg.norm(whites[0], axis=0) * full.sizes > _SEEN).any()) if whites[0].size else False
-    quick = np.array([_null_gain(evidence, form, w) for form, w in zip(candidate.forms, whites, strict=True)])
-    size = evidence.evidence.size
-    count = _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
-    worth = np.argsort(-quick, kind="stable")[:count]
+    quick = np.array([_at_null(linear, form, white) for form, white in zip(candidate.forms, whites, strict=True)])
+    size = linear.mixed.size
+    worth = np.argsort(-quick, kind="stable")[: _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size]
     tried = [
-        _try(evidence, form) if i in worth and quick[i] >= _HOPELESS else (float(quick[i]), 1.0, evidence.null)
+        _try(linear, form) if i in worth and quick[i] >= _HOPELESS else _Tried(float(quick[i]))
         for i, form in enumerate(candidate.forms)
     ]
-    best = max(range(len(tried)), key=lambda i: tried[i][0])
-    gains, weights = np.array([gain for gain, *_ in tried]), form_weights(candidate)
-    gain = float(logsumexp(gains + np.log(weights)))
-    p_values = np.array([p for _, p, _ in tried])
-    p = float(min(1.0, np.min(p_values / weights)))
-    return _fill(evidence, candidate, seen, tried[best], candidate.forms[best], p, gain)
+    weights = form_weights(candidate)
+    k = max(range(len(tried)), key=lambda i: tried[i].log_bayes_factor)
+    total = float(logsumexp(np.array([t.log_bayes_factor for t in tried]) + np.log(weights)))
+    p = float(min(1.0, np.min(np.array([t.p_value for t in tried]) / weights)))
+    best, form = tried[k], candidate.forms[k]
+    if best.values is None or best.covariance is None:
+        nothing = np.zeros(len(form.sizes))
+        return Score(candidate, seen, form, 1.0, total, values=nothing, covariance=np.diag(nothing + np.nan))
+    p, total = (p, total) if seen else (1.0, 0.0)
+    return Score(candidate, seen, form, p, total, values=best.values, covariance=best.covariance)
 
 
-def promising(evidence: ViewEvidence, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """The candidates that gain most at the null's variances, with all their parameters or those of one joint."""
-    gains = [
-        max(_null_gain(evidence, form, evidence.whiten_channel(form.columns)) for form in c.forms) for c in candidates
-    ]
-    return [candidates[k] for k in np.argsort(-np.array(gains), kind="stable")[:count]]
+def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """The most likely candidates at the null's variances, with all their parameters or those of one joint."""
+    quick = [max(_at_null(linear, form, linear.residual(form.columns)) for form in c.forms) for c in candidates]
+    return [candidates[k] for k in np.argsort(-np.array(quick), kind="stable")[:count]]
 
 
-def _try(evidence: ViewEvidence, form: Form) -> tuple[float, float, VarianceFit]:
-    """Log evidence over the null, p-value and free fit of one form."""
-    e = evidence.evidence
-    G = evidence.in_blocks(form.columns)
-    integrated = fit_variances(e, G, form.sizes, start=evidence.null.variances)
-    gain = 0.5 * (evidence.null.deviance - integrated.deviance)
-    many = e.size > MANY_NUMBERS
-    wide = _FREE * form.sizes
-    free = at_variances(e, integrated.variances, G, wide) if many else fit_variances(e, G, wide, integrated.variances)
-    a = e.A.shape[2]
+def _try(linear: LinearModel, form: Form) -> _Tried:
+    """One form with its variances estimated anew."""
+    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
+    integrated = fit_variances(mixed, G, form.sizes, start=linear.null.variances)
+    if mixed.size > MANY_NUMBERS:
+        free = at_variances(mixed, integrated.variances, G, wide)
+    else:
+        free = fit_variances(mixed, G, wide, integrated.variances)
+    a = mixed.A.shape[2]
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
     rank, square = _wald(theta, covariance, form.sizes)
-    rest = max(e.size - a - rank, 1)
-    return gain, float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest)), free
+    rest = max(mixed.size - a - rank, 1)
+    p = float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest))
+    return _Tried(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance)
 
 
-def _null_gain(evidence: ViewEvidence, form: Form, white: Array) -> float:
-    """Log evidence gained at the null's variances: cheap, and an upper hand for what cannot help."""
+def _at_null(linear: LinearModel, form: Form, white: Array) -> float:
+    """Log Bayes factor at the null's variances: cheap, and an upper hand for what cannot help."""
     white = white * form.sizes
     information = np.eye(white.shape[1]) + white.T @ white
-    b = white.T @ evidence.white_z
+    b = white.T @ linear.white_residual
     return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
 
@@ -113,19 +133,3 @@ def form_weights(candidate: Candidate) -> Array:
     kept = np.array([form.keep.sum() for form in candidate.forms])
     whole = kept == kept[0]
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
-
-
-def _fill(
-    evidence: ViewEvidence, candidate: Candidate, seen: bool, tried: tuple[float, float, VarianceFit], form: Form,
-    p: float, gain: float,
-) -> Score:  # fmt: skip
-    a, size = evidence.evidence.A.shape[2], form.columns.shape[1]
-    fit = tried[2]
-    if len(fit.mean) < a + size:
-        nothing = np.zeros(size)
-        return Score(candidate, seen, form, 1.0, gain, nothing, np.full(size, np.nan), np.zeros((size, size)), fit)
-    covariance = fit.covariance[a:, a:]
-    return Score(
-        candidate, seen, form, p if seen else 1.0, gain if seen else 0.0, fit.mean[a:],
-        np.sqrt(np.maximum(np.diag(covariance), 0)), covariance, fit,
-    )  # fmt: skip

@@ -4,7 +4,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.select import IMPLAUSIBLE
+from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.units import MICROMETRES, rounded
 
 
@@ -34,8 +34,8 @@ def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | 
     amounts = amounts_of(candidate.ranked)
     gain = ""
     if candidate.cross_validation is not None:
-        left = d.residual_rms * np.sqrt(candidate.cross_validation.inside) * to_um
-        out = d.residual_rms * np.sqrt(candidate.cross_validation.heldout) * to_um
+        inside, heldout = candidate.cross_validation.inside, candidate.cross_validation.heldout
+        left, out = (d.residual_rms * np.sqrt(share) * to_um for share in (inside, heldout))
         gain = f"; adding it should leave about {left:.3g} µm, {out:.3g} µm on views left out"
     more = f" {second.name} seems to be there too." if second else ""
     return (
@@ -68,15 +68,10 @@ def _lack(d: Diagnosis) -> str:
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
     """The clearest parameters: c2 = 4.4e-07 ± 4e-08 rad/(N m)."""
     s = ranked.score
-    if not np.isfinite(s.sigmas).all():
+    if not s.fitted:
         return "too small to be worth a fit"
-    kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
     order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
-    told = [
-        f"{kept[i].name} = {rounded(s.values[i], s.sigmas[i])} ± {s.sigmas[i]:.1g} {kept[i].unit}".removesuffix(" 1")
-        for i in sorted(order)
-    ]
-    grid = [
-        f"{p.name} = {v:g} {p.unit}" for p, v in zip(s.candidate.parameters, s.form.term.values, strict=True) if p.grid
-    ]
-    return ", ".join(grid + told)
+    clearest = [(s.form.free[i], s.values[i], s.sigmas[i]) for i in sorted(order)]
+    fitted = [f"{p.name} = {rounded(v, sigma)} ± {sigma:.1g} {p.unit}".removesuffix(" 1") for p, v, sigma in clearest]
+    tried = [f"{p.name} = {p.value:g} {p.unit}" for p in s.form.term.parameters if p.grid]
+    return ", ".join(tried + fitted)

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.effects.contract import effect, number, per_joint, per_torque
+from stitch.effects.contract import effect
+from stitch.effects.specs import number, per_joint, per_torque
 from stitch.frames import Array
 from stitch.measurement.views import Views
 
@@ -33,9 +34,12 @@ def joint_offset(joints: Array, views: Views, d: Array) -> Array:
 
 
 @effect(
-    "links", needs=("joints",), da=per_joint("mm", 0.3, 5.0), dd=per_joint("mm", 0.3, 5.0),
+    "links",
+    needs=("joints",),
+    da=per_joint("mm", 0.3, 5.0),
+    dd=per_joint("mm", 0.3, 5.0),
     dalpha=per_joint("rad", 6e-4, 0.02),
-)  # fmt: skip
+)
 def link_geometry(links: Links, views: Views, da: Array, dd: Array, dalpha: Array) -> Links:
     """DH a, d, α off by Δ"""
     return replace(links, da=links.da + da, dd=links.dd + dd, dalpha=links.dalpha + dalpha)

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from stitch.effects.specs import Spec
 from stitch.errors import InputError
-from stitch.frames import Array
 
 PLACES = {
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
@@ -26,8 +26,6 @@ PLACES = {
     "part": "(views: Views, parameters) → twists (V, 6): the part sits displaced by exp(twist), reference frame",
     "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
 }
-# Stands for all views of the session in a grid.
-EVERY_VIEW = (-1.0,)
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Units are written for millimetres; a session in metres has the same unit with m.
 _PER_MM = {"mm": 1.0, "m": 1e-3}
@@ -38,64 +36,33 @@ _LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect, in a session's own unit."""
+    """One number of an effect in a session's own unit: what is plausible, its value, and how well that is known."""
 
     name: str
     unit: str
-    typical: float  # the size a real cell may well have; the prior's sigma
-    limit: float  # beyond this nobody would believe it
+    typical: float = float("nan")  # the size a real cell may well have; the prior's sigma
+    limit: float = float("inf")  # beyond this nobody would believe it
     grid: tuple[float, ...] = ()  # values tried one by one: time constants, the view of an event
+    argument: str = ""  # of the effect's function that it is, or is a part of
+    value: float = 0.0
+    sigma: float = float("nan")  # NaN where the views do not show it: it is held at its value
 
     @property
     def discrete(self) -> bool:
         """True for the view of an event: it is tried, never fitted."""
         return self.unit == "view"
 
+    @property
+    def fitted(self) -> bool:
+        """True if the views show it: a held one stays at its value."""
+        return bool(np.isfinite(self.sigma))
 
-@dataclass(frozen=True)
-class Spec:
-    """How an argument of the function becomes parameters."""
-
-    kind: str  # number | offset | joint | torque | twist
-    unit: str
-    typical: float
-    limit: float
-    grid: tuple[float, ...] = ()
-    unit_shift: str = ""  # of a twist's translation
-    typical_shift: float = 0.0
-    limit_shift: float = 0.0
-
-
-def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
-    """One number."""
-    return Spec("number", unit, typical, limit, tuple(grid))
-
-
-def offset(unit: str, typical: float, limit: float) -> Spec:
-    """A vector (3,) in the reference frame that may be zero beside the effect's other parameters: c is cx, cy, cz."""
-    return Spec("offset", unit, typical, limit)
-
-
-def event() -> Spec:
-    """The view from which on something is different; every view that can show it is tried."""
-    return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
-
-
-def per_joint(unit: str, typical: float, limit: float) -> Spec:
-    """An array (n,) with one number a joint: `c` becomes c1 … cn."""
-    return Spec("joint", unit, typical, limit)
-
-
-def per_torque(unit: str, typical: float, limit: float) -> Spec:
-    """One number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
-    return Spec("torque", unit, typical, limit)
-
-
-def twist(
-    unit: str, rotation: float, translation: float, limit_rotation: float = 0.02, limit_translation: float = 10.0
-) -> Spec:
-    """A twist (6,), rotation first, named rx … tz; `unit` follows rad and mm, such as "/h"."""
-    return Spec("twist", f"rad{unit}", rotation, limit_rotation, (), f"mm{unit}", translation, limit_translation)
+    @property
+    def status(self) -> str:
+        """Whether it was fitted, or why it was held."""
+        if self.fitted:
+            return "fitted"
+        return "held: the best of those tried" if self.grid else "held: these views do not show it"
 
 
 @dataclass(frozen=True)
@@ -117,45 +84,45 @@ class Effect:
         return (self.function.__doc__ or "").strip().splitlines()[0]
 
     def parameters(self, joints: int, torques: Sequence[str], length_unit: str) -> tuple[Parameter, ...]:
-        """All parameters for an arm of n joints, in the session's unit."""
-        out: list[Parameter] = []
-        for key, spec in self.specs.items():
-            if spec.kind == "twist":
-                for i, name in enumerate(TWIST):
-                    r = i < 3
-                    sizes = (spec.typical, spec.limit) if r else (spec.typical_shift, spec.limit_shift)
-                    out.append(_in_unit(name, spec.unit if r else spec.unit_shift, *sizes, (), length_unit))
-            else:
-                names = {"number": [key], "offset": [key + axis for axis in "xyz"],
-                         "joint": [f"{key}{i + 1}" for i in range(joints)],
-                         "torque": [f"{key}{name}" for name in torques]}[spec.kind]  # fmt: skip
-                # A torque between two joints is that of 1 kg there: the coefficient holds the link's mass.
-                for name in names:
-                    massless = spec.kind == "torque" and "_" in name[len(key) :]
-                    typical, limit = (_LINK_MASS, _LINK_MASS_LIMIT) if massless else (1.0, 1.0)
-                    unit = f"kg {spec.unit}" if massless else spec.unit
-                    out.append(_in_unit(name, unit, typical * spec.typical, limit * spec.limit, spec.grid,
-                                        length_unit))  # fmt: skip
-        return tuple(out)
+        """All parameters for an arm of n joints at zero, in the session's unit."""
+        named = [(key, spec, name) for key, spec in self.specs.items() for name in _names(key, spec, joints, torques)]
+        return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
 
-    def arguments(self, values: Array, joints: int, torques: int) -> dict[str, Any]:
-        """Keyword arguments of the function from the flat parameter vector."""
-        sizes = {"number": 1, "offset": 3, "joint": joints, "torque": torques, "twist": 6}
-        out, at = {}, 0
-        for key, spec in self.specs.items():
-            size = sizes[spec.kind]
-            part = np.asarray(values[at : at + size], float)
-            out[key] = float(part[0]) if spec.kind == "number" else part
-            at += size
-        return out
+    def arguments(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        """Keyword arguments of the function: a number, or an array for an argument of several parameters."""
+        values: dict[str, list[float]] = {key: [] for key in self.specs}
+        for p in parameters:
+            values[p.argument].append(p.value)
+        single = {key for key, spec in self.specs.items() if spec.kind == "number"}
+        return {key: float(own[0]) if key in single else np.array(own, float) for key, own in values.items()}
 
 
-def _in_unit(
-    name: str, unit: str, typical: float, limit: float, grid: tuple[float, ...], length_unit: str
-) -> Parameter:
+def _names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
+    """Names of the parameters that an argument stands for."""
+    match spec.kind:
+        case "number":
+            return [key]
+        case "offset":
+            return [key + axis for axis in "xyz"]
+        case "joint":
+            return [f"{key}{i + 1}" for i in range(joints)]
+        case "torque":
+            return [f"{key}{name}" for name in torques]
+        case _:
+            return TWIST
+
+
+def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
+    """A parameter in the session's unit."""
+    unit, typical, limit = spec.unit, spec.typical, spec.limit
+    if spec.kind == "twist" and name.startswith("t"):
+        unit, typical, limit = spec.unit_shift, spec.typical_shift, spec.limit_shift
+    if spec.kind == "torque" and "_" in name[len(key) :]:
+        # A torque between two joints is that of 1 kg there: the coefficient holds the link's mass.
+        unit, typical, limit = f"kg {unit}", _LINK_MASS * typical, _LINK_MASS_LIMIT * limit
     above, _, below = unit.partition("/")
     factor = _PER_MM[length_unit] ** ((above == "mm") - (below == "mm"))
-    return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, grid)
+    return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, spec.grid, argument=key)
 
 
 EFFECTS: dict[str, Effect] = {}
@@ -178,7 +145,9 @@ def effect(
             raise InputError(f"effect {name!r} is in the library already; give yours another name")
         if not (function.__doc__ or "").strip():
             raise InputError(f"effect {name!r} has no docstring; its first line says what nature does")
-        EFFECTS[name] = Effect(name, place, specs, function, tuple(needs), tuple(prefers), tier)
+        EFFECTS[name] = Effect(
+            name, place, specs, function=function, needs=tuple(needs), prefers=tuple(prefers), tier=tier
+        )
         return function
 
     return register

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stitch.effects.contract import Effect, Spec, event, number, twist
+from stitch.effects.contract import Effect
+from stitch.effects.specs import Spec, event, number, twist
 from stitch.frames import Array
 from stitch.measurement.views import ScanView, Views
 
@@ -27,13 +28,11 @@ def empirical_effects(views: Views) -> list[Effect]:
     for name, course in (courses | views.covariates).items():
         if np.ptp(course) > 0 and len(np.unique(course)) > 2:
             out += [_bias(name, course, 1), _bias(name, course, 2), _mount(name, course, 1), _mount(name, course, 2)]
-    out.append(_effect("an event", "knock_of_mount", "mount", _step,
-                       xi=twist("", 6e-4, 0.2), v=event()))  # fmt: skip
-    return out
+    return [*out, _effect("an event", "knock_of_mount", "mount", _step, xi=twist("", 6e-4, 0.2), v=event())]
 
 
 def _effect(group: str, name: str, place: str, function: Callable[..., Array], **specs: Spec) -> Effect:
-    return Effect(name, place, specs, function, (), (), "empirical", group)
+    return Effect(name, place, specs, function=function, needs=(), prefers=(), tier="empirical", group=group)
 
 
 def _harmonic(joint: int, order: int) -> Effect:
@@ -43,8 +42,8 @@ def _harmonic(joint: int, order: int) -> Effect:
         return out
 
     fourier.__doc__ = f"joint {joint + 1}: A sin {order}q + B cos {order}q"
-    return _effect(f"j{joint + 1}_deg", f"fourier_{order}_of_j{joint + 1}", "robot", fourier,
-                   A=number("rad", 4e-4, 0.01), B=number("rad", 4e-4, 0.01))  # fmt: skip
+    name, size = f"fourier_{order}_of_j{joint + 1}", number("rad", 4e-4, 0.01)
+    return _effect(f"j{joint + 1}_deg", name, "robot", fourier, A=size, B=size)
 
 
 def _standard(course: Array, order: int) -> Array:

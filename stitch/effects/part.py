@@ -3,7 +3,8 @@
 import numpy as np
 
 from stitch.effects.arm import warmer
-from stitch.effects.contract import effect, event, number, offset, twist
+from stitch.effects.contract import effect
+from stitch.effects.specs import event, number, offset, twist
 from stitch.frames import Array
 from stitch.measurement.views import ScanView, Views
 
@@ -21,9 +22,11 @@ def part_slip(views: Views, xi: Array, v: float) -> Array:
 
 
 @effect(
-    "shape", prefers=("part_temperature_c",), g=number("1/°C", typical=3e-5, limit=5e-4),
+    "shape",
+    prefers=("part_temperature_c",),
+    g=number("1/°C", typical=3e-5, limit=5e-4),
     c=offset("mm/°C", typical=3e-3, limit=0.2),
-)  # fmt: skip
+)
 def part_growth(points: Array, view: ScanView, g: float, c: Array) -> Array:
     """x = x* + ((x*−o)·g + c)·ΔT, o the flange or the middle of the scans; ΔT of part_temperature_c, else hours
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from stitch.effects.contract import effect, number
+from stitch.effects.contract import effect
+from stitch.effects.specs import number
 from stitch.frames import Array
 from stitch.measurement.views import ScanView
 

@@ -1,14 +1,23 @@
 """A user's own effects from a Python file, written in the form of the library's."""
 
 import importlib.util
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+from stitch.effects.checked import require_effect, require_result, sealed
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.errors import InputError
+from stitch.system.time_limit import within
+
+# Seconds for the file and for every call of an effect; a call on a million points takes less than one.
+_SECONDS = 5.0
+_LIMIT = "STITCH_EFFECT_SECONDS"
 
 
 def load(path: Path) -> list[str]:
@@ -17,7 +26,8 @@ def load(path: Path) -> list[str]:
     The file is Python and is executed: load only files that you would run.
 
     Raises:
-        InputError: no such file, no Python file, an error in it (with its line), or no effect in it.
+        InputError: no such file, no Python file, an error in it (with its line), or no effect in it. The registry is
+            then as it was.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; --effects-file names a Python file with @effect functions")
@@ -28,38 +38,68 @@ def load(path: Path) -> list[str]:
     for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
         del EFFECTS[name]
     try:
-        spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # whatever a user's file may raise
-        line = _line(error, path)
-        raise InputError(f"{path}{line}: {_told(error)}") from None
-    names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
-    if not names:
-        raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
+        with _named(path, ""):
+            spec.loader.exec_module(_module(spec))
+        names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
+        if not names:
+            raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
+        for name in names:
+            require_effect(EFFECTS[name], f"{path}: effect {name}")
+    except InputError:
+        EFFECTS.clear()
+        EFFECTS.update(before)
+        raise
     for name in names:
         EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guarded(EFFECTS[name], path))
     return names
 
 
+def _module(spec: Any) -> ModuleType:
+    return importlib.util.module_from_spec(spec)
+
+
 def _guarded(effect: Effect, path: Path) -> Callable[..., Any]:
-    """The effect's function; what goes wrong in it names the file and the line."""
+    """The effect's function; what goes wrong in it names the file and the line, and so does a result that cannot be."""
 
     @wraps(effect.function)
-    def function(*args: Any, **parameters: Any) -> Any:
-        try:
-            return effect.function(*args, **parameters)
-        except Exception as error:  # whatever a user's function may raise
-            raise InputError(f"{path}{_line(error, path)}: effect {effect.name}: {_told(error)}") from None
+    def function(*arguments: Any, **parameters: Any) -> Any:
+        with _named(path, f" effect {effect.name}:"):
+            result = effect.function(*sealed(arguments), **parameters)
+        return require_result(effect, arguments, result, f"{path}: effect {effect.name}")
 
     return function
 
 
-def _told(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+@contextmanager
+def _named(path: Path, what: str) -> Iterator[None]:
+    """Errors, ends of the program and endless loops in a user's file as one line."""
+    seconds = _seconds()
+    late = (
+        f"{path}:{what} does not end within {seconds:g} s; to fix: look for a loop in it, or allow more seconds in the "
+        f"environment variable {_LIMIT}"
+    )
+    try:
+        with within(seconds, late):
+            yield
+    except InputError as error:
+        told = str(error)
+        raise InputError(told if told.startswith(str(path)) else f"{path}:{what} {told}") from None
+    except (Exception, SystemExit) as error:  # whatever a user's file may raise
+        reason = "ends the program" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}{_line(error, path)}:{what} {reason}") from None
 
 
-def _line(error: Exception, path: Path) -> str:
+def _seconds() -> float:
+    try:
+        seconds = float(os.environ.get(_LIMIT, _SECONDS))
+    except ValueError:
+        seconds = float("nan")
+    if not seconds > 0:
+        raise InputError(f"{_LIMIT} is {os.environ[_LIMIT]!r}; to fix: write a number of seconds")
+    return seconds
+
+
+def _line(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
         return f" line {error.lineno}"
     trace, found = error.__traceback__, ""

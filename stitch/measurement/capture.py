@@ -88,3 +88,9 @@ def place(
         return Capture(name, tuple(scans), T_base_flange, T_base_flange, sightings=sightings)
     still = np.broadcast_to(np.eye(4), T_base_flange.shape)
     return Capture(name, tuple(scans), frames.inverse(T_base_flange), still, sightings=sightings)
+
+
+def part_size(captures: Sequence[Capture]) -> float:
+    """Median diameter of the scans' point sets: twice the rms distance from their centroids."""
+    spread = [np.sqrt(scan.points.var(axis=0).sum()) for c in captures for scan in c.scans]
+    return 2 * float(np.median(spread))

@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
-from stitch.effects.contract import EVERY_VIEW, Effect, Parameter
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import Robot
-from stitch.measurement.session import Session
+from stitch.measurement.session import Mount, Session
 from stitch.measurement.views import ScanView, Views, views_of
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 _SMALLEST_COSINE = 0.1
-_EVENT_PLACES = 50
 
 
 @dataclass(frozen=True)
@@ -36,44 +34,18 @@ class Measurement:
     length_unit: str
     target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
 
-    def parameters(self, effect: Effect) -> tuple[Parameter, ...]:
-        """The parameters of an effect in this session; where time stands in for a temperature, rates are per hour."""
-        found = effect.parameters(self.views.joints.shape[1], self.views.torques.names, self.length_unit)
-        timed = bool(effect.prefers) and not any(self.views.has(name) for name in effect.prefers)
-        return tuple(replace(p, grid=self._grid(p), unit=p.unit.replace("°C", "h") if timed else p.unit) for p in found)
-
-    def _grid(self, parameter: Parameter) -> tuple[float, ...]:
-        if parameter.grid != EVERY_VIEW:
-            return parameter.grid
-        # An event can come before any view but the first two and the last: one view alone shows no event.
-        places = range(2, self.views.count - 1)
-        # Among hundreds of views the place of an event matters less than the time to try them all.
-        return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
-
-    def arguments(self, effect: Effect, values: Array) -> dict[str, float | Array]:
-        """Keyword arguments of the effect's function."""
-        return effect.arguments(values, self.views.joints.shape[1], len(self.views.torques.names))
-
-    def lacks(self, effect: Effect) -> tuple[str, ...]:
-        """What an effect needs and this session has not; time stands in for a covariate that it prefers."""
-        known = {"intensity": self.has_intensity}
-        lacking = [need for need in effect.needs if not known.get(need, self.views.has(need))]
-        if effect.prefers and not any(self.views.has(name) for name in (*effect.prefers, "time")):
-            lacking.append("time")
-        return tuple(lacking)
+    @property
+    def mount(self) -> Mount:
+        """eye_to_hand | eye_in_hand"""
+        return "eye_to_hand" if self.eye_to_hand else "eye_in_hand"
 
     @property
     def has_intensity(self) -> bool:
         """True if every point has an intensity."""
         return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
 
-
-@dataclass(frozen=True)
-class Term:
-    """An effect in use with the values of its parameters (P,), in the order of its specs."""
-
-    effect: Effect
-    values: Array
+    def __repr__(self) -> str:
+        return f"Measurement({self.capture.name!r}, {self.views.count} views)"
 
 
 def measurement_of(session: Session, capture: Capture) -> Measurement:

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
@@ -62,3 +64,13 @@ class Session:
     def has_sightings(self) -> bool:
         """True if some view shows labelled points or a probe."""
         return any(view.sighting is not None for view in self.views)
+
+    @property
+    def joints(self) -> Array | None:
+        """(V, n) rad; None where a view states none."""
+        known = [view.joints for view in self.views if view.joints is not None]
+        return np.array(known) if len(known) == len(self.views) else None
+
+    def __repr__(self) -> str:
+        shows = [word for word, has in (("clouds", self.has_clouds), ("labelled points", self.has_sightings)) if has]
+        return f"Session({self.name!r}, {self.mount}, {len(self.views)} views of {' and '.join(shows) or 'nothing'})"

@@ -1,4 +1,4 @@
-"""Effects taken out again: poses and points as they truly were."""
+"""What a model does to poses and points, and both without it: as they truly were."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,12 +11,14 @@ from stitch.effects.arm import Links
 from stitch.frames import Array, Indices
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement, Term
+from stitch.measurement.measurement import Measurement
 from stitch.measurement.scan import Scan
 from stitch.measurement.views import ScanView
+from stitch.model.model import Model
+from stitch.model.term import Term
 
 
-def placed(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
+def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
     """(V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
     views = measurement.views
     joints = views.joints
@@ -25,7 +27,7 @@ def placed(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Arra
     mount, part = np.zeros((2, count, 6))
     moved = False
     for term in terms:
-        arguments = measurement.arguments(term.effect, term.values)
+        arguments = term.arguments
         if term.effect.place == "robot":
             # The function adds to what it is given; what it reads of the pose are the reported angles.
             joints, moved = term.effect.function(joints, views, **arguments), True
@@ -51,22 +53,22 @@ def shift(measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, 
         pose: (4, 4) T_reference_scanner of the view.
     """
     view = measurement.scan_views[v]
-    view = replace(view, cosine=view.cosine[index],
-                   intensity=None if view.intensity is None else view.intensity[index])  # fmt: skip
-    return undone(measurement, terms, measurement.capture.scans[v].points[index], view, pose)
+    intensity = None if view.intensity is None else view.intensity[index]
+    view = replace(view, cosine=view.cosine[index], intensity=intensity)
+    return undone(terms, measurement.capture.scans[v].points[index], view, pose)
 
 
-def undone(measurement: Measurement, terms: Sequence[Term], points: Array, view: ScanView, pose: Array) -> Array:
+def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array) -> Array:
     """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects."""
     true = points
     for term in (t for t in terms if t.effect.place == "sensor"):
+        arguments = term.arguments
         # Corrections are thousandths of the range: one fixed-point step leaves millionths.
-        first = true - (term.effect.function(true, view, **measurement.arguments(term.effect, term.values)) - true)
-        true = true - (term.effect.function(first, view, **measurement.arguments(term.effect, term.values)) - first)
+        first = true - (term.effect.function(true, view, **arguments) - true)
+        true = true - (term.effect.function(first, view, **arguments) - first)
     for term in (t for t in terms if t.effect.place == "shape"):
-        placed_points = frames.transform(pose, true)
-        arguments = measurement.arguments(term.effect, term.values)
-        moved = term.effect.function(placed_points, view, **arguments) - placed_points
+        in_reference = frames.transform(pose, true)
+        moved = term.effect.function(in_reference, view, **term.arguments) - in_reference
         true = true - frames.rotate(frames.inverse(pose), moved)
     return np.asarray(true - points)
 
@@ -75,26 +77,31 @@ def shift_targets(measurement: Measurement, terms: Sequence[Term], poses: Array)
     """(V, S, 3) the same as `shift` for the labelled points of all views; zero in empty slots."""
     sightings = measurement.capture.sightings
     assert sightings is not None
-    if not any(term.effect.place in ("sensor", "shape") for term in terms):
+    if not moves_points(terms):
         return np.zeros(sightings.points.shape)
     # An empty slot borrows a point: its own zero has no ray.
     first = sightings.points[np.arange(len(poses)), (sightings.target >= 0).argmax(axis=1)]
     filled = np.where((sightings.target >= 0)[..., None], sightings.points, first[:, None])
     blank = ~(sightings.target >= 0).any(axis=1)
     filled[blank] = filled[~blank].mean(axis=0)
-    moved = [undone(measurement, terms, filled[v], view, poses[v]) for v, view in enumerate(measurement.target_views)]
+    moved = [undone(terms, filled[v], view, poses[v]) for v, view in enumerate(measurement.target_views)]
     return np.where((sightings.target >= 0)[..., None], np.array(moved), 0.0)
 
 
-def corrected(measurement: Measurement, terms: Sequence[Term], T_mount: Array) -> Capture:
-    """The capture as it would be without the effects in `terms`."""
-    left, right = placed(measurement, terms)
+def moves_points(terms: Sequence[Term]) -> bool:
+    """True if an effect changes the points within a view, and not only where the view sits."""
+    return any(term.effect.place in ("sensor", "shape") for term in terms)
+
+
+def corrected(measurement: Measurement, model: Model) -> Capture:
+    """The capture as it would be without the effects of the model."""
+    terms = model.terms
+    left, right = perturbed_frames(measurement, terms)
     capture = replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
-    if any(term.effect.place in ("sensor", "shape") for term in terms):
-        poses = capture.poses(T_mount)
-        scans = [
-            _moved(scan, shift(measurement, terms, v, poses[v], slice(None))) for v, scan in enumerate(capture.scans)
-        ]
+    if moves_points(terms):
+        poses = capture.poses(model.T_mount)
+        every = slice(None)
+        scans = [_moved(scan, shift(measurement, terms, v, poses[v], every)) for v, scan in enumerate(capture.scans)]
         capture = replace(capture, scans=tuple(scans))
         if capture.sightings is not None:
             points = capture.sightings.points + shift_targets(measurement, terms, poses)

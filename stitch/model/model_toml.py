@@ -1,4 +1,4 @@
-"""The model of a cell: hand-eye and effects in use; `model.toml` is its form for people."""
+"""model.toml, the form of a model for people: read and written."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from stitch.effects.contract import Parameter
 from stitch.errors import InputError
 from stitch.frames import Array, is_rigid
+from stitch.model.model import Target
 from stitch.reading.toml_file import choice, read_toml, text
 from stitch.units import METRES
 
@@ -20,38 +22,20 @@ _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps sc
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """One parameter of an effect; sigma NaN where the views cannot see it (it stays at its value)."""
-
-    value: float
-    sigma: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class Target:
-    """A labelled point in the reference frame, or a probe with its orientation."""
-
-    position: Array  # (3,) length_unit
-    sigma: Array  # (3,)
-    orientation: Array | None = None  # (3, 3) R_reference_probe
-
-
-@dataclass(frozen=True)
-class Model:
-    """Hand-eye (4, 4) in length_unit with its covariance, and the effects with their parameters."""
+class ModelFile:
+    """What model.toml says: the model with its unit and mount, parameters by effect and name."""
 
     length_unit: str
     mount: str  # eye_to_hand | eye_in_hand
     T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
     T_mount_coarse: Array  # (4, 4)
     covariance: Array  # (6, 6)
-    effects: dict[str, dict[str, Fitted]] = field(default_factory=dict)
+    effects: dict[str, dict[str, Parameter]] = field(default_factory=dict)
     effects_file: str | None = None  # Python file with effects of the user's own
     targets: dict[str, Target] = field(default_factory=dict)  # of a session with labelled points
 
 
-def write_model(model: Model, path: Path) -> None:
+def write_model(model: ModelFile, path: Path) -> None:
     """Write `model.toml`, commented, with all digits."""
     carrier = "base" if model.mount == "eye_to_hand" else "flange"
     document = {
@@ -64,17 +48,19 @@ def write_model(model: Model, path: Path) -> None:
             "sigma": np.sqrt(np.diag(model.covariance)).tolist(),
             "covariance": model.covariance.tolist(),
         },
-        "effects": {name: {p: _written(f) for p, f in fitted.items()} for name, fitted in model.effects.items()},
+        "effects": {
+            name: {p: _parameter_table(f) for p, f in fitted.items()} for name, fitted in model.effects.items()
+        },
     }
     if model.targets:
-        document["targets"] = {name: _told(target) for name, target in model.targets.items()}
+        document["targets"] = {name: _target_table(target) for name, target in model.targets.items()}
     if model.effects_file:
         document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
     path.write_text(header + tomli_w.dumps(document), encoding="utf-8")
 
 
-def read_model(path: Path) -> Model:
+def read_model(path: Path) -> ModelFile:
     """Read `model.toml`, or that of a run folder.
 
     Raises:
@@ -91,16 +77,21 @@ def read_model(path: Path) -> Model:
         if not is_rigid(T):
             raise InputError(f"{path}: hand_eye.{name} is not a rigid motion; its 3x3 part must be a rotation")
     covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
-    return Model(
-        choice(path, document, "length_unit", tuple(METRES)), str(document.get("mount")), corrected, coarse, covariance,
-        _effects(path, document.get("effects", {})), text(path, document, "", "effects_file"),
-        _targets(path, document.get("targets", {})),
-    )  # fmt: skip
+    return ModelFile(
+        length_unit=choice(path, document, "length_unit", tuple(METRES)),
+        mount=str(document.get("mount")),
+        T_mount=corrected,
+        T_mount_coarse=coarse,
+        covariance=covariance,
+        effects=_effects(path, document.get("effects", {})),
+        effects_file=text(path, document, "", "effects_file"),
+        targets=_targets(path, document.get("targets", {})),
+    )
 
 
-def _told(target: Target) -> dict[str, Any]:
-    told = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
-    return told if target.orientation is None else told | {"orientation": target.orientation.tolist()}
+def _target_table(target: Target) -> dict[str, Any]:
+    table = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
+    return table if target.orientation is None else table | {"orientation": target.orientation.tolist()}
 
 
 def _targets(path: Path, table: Any) -> dict[str, Target]:
@@ -118,17 +109,19 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
     return out
 
 
-def _written(fitted: Fitted) -> dict[str, Any]:
+def _parameter_table(p: Parameter) -> dict[str, Any]:
     """TOML has a nan, but who reads it expects a word."""
-    known = {"sigma": fitted.sigma} if np.isfinite(fitted.sigma) else {"observable": False}
-    return {"value": fitted.value, **known, "unit": fitted.unit}
+    known = {"sigma": p.sigma} if p.fitted else {"observable": False}
+    return {"value": p.value, **known, "unit": p.unit}
 
 
-def _effects(path: Path, table: Any) -> dict[str, dict[str, Fitted]]:
+def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
     try:
         return {
             str(name): {
-                str(p): Fitted(float(f["value"]), float(f.get("sigma", np.nan)), str(f.get("unit", "")))
+                str(p): Parameter(
+                    str(p), str(f.get("unit", "")), value=float(f["value"]), sigma=float(f.get("sigma", np.nan))
+                )
                 for p, f in parameters.items()
             }
             for name, parameters in table.items()
@@ -147,31 +140,3 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise InputError(f"{path}: hand_eye.{key} must be {size}x{size} finite numbers, is {matrix.shape}")
     return matrix
-
-
-def in_unit(model: Model, length_unit: str) -> Model:
-    """The model with lengths in another unit."""
-    if model.length_unit == length_unit:
-        return model
-    factor = METRES[model.length_unit] / METRES[length_unit]
-    scale = np.array([1.0] * 3 + [factor] * 3)
-    moved = []
-    for T in (model.T_mount, model.T_mount_coarse):
-        T = T.copy()
-        T[:3, 3] *= factor
-        moved.append(T)
-    effects = {name: {p: _rescaled(f, model.length_unit, length_unit, factor) for p, f in fitted.items()}
-               for name, fitted in model.effects.items()}  # fmt: skip
-    return Model(
-        length_unit, model.mount, moved[0], moved[1], model.covariance * np.outer(scale, scale), effects,
-        model.effects_file,
-        {name: Target(t.position * factor, t.sigma * factor, t.orientation) for name, t in model.targets.items()},
-    )  # fmt: skip
-
-
-def _rescaled(fitted: Fitted, old: str, new: str, factor: float) -> Fitted:
-    """A unit counts lengths where `old` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
-    above, _, below = fitted.unit.partition("/")
-    power = (above.strip() == old) - (below.strip() == old)
-    unit = "/".join(new if part.strip() == old else part for part in fitted.unit.split("/"))
-    return Fitted(fitted.value * factor**power, fitted.sigma * factor**power, unit)

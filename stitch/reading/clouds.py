@@ -11,6 +11,7 @@ from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.reading.csv_number import is_number
 from stitch.reading.pcd import read_pcd
+from stitch.reading.text_file import require_file, shortened
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")
@@ -22,8 +23,9 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     Raises:
         InputError: missing or broken file, no x, y, z, no points, or points that are not finite.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such cloud file")
+    if not path.exists():
+        raise InputError(f"{path}: no such cloud file; correct the column cloud of views.csv")
+    require_file(path, "name a file in the column cloud of views.csv")
     readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": _read_ply, ".pcd": read_pcd}
     readers |= dict.fromkeys(_TEXT, _read_text)
     reader = readers.get(path.suffix.lower())
@@ -33,8 +35,9 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
         columns = reader(path)
     except InputError:
         raise
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read ({error or type(error).__name__}); export it again") from None
+    except Exception as error:  # whatever a library raises at bytes that are no cloud
+        reason = shortened(" ".join(str(error).split()) or type(error).__name__)
+        raise InputError(f"{path}: cannot be read ({reason}); export it again") from None
     return _cloud(path, columns, scale)
 
 
@@ -66,9 +69,27 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
 def _read_ply(path: Path) -> dict[str, Array]:
     from plyfile import PlyData
 
+    require_room(path)
+
     data: NDArray[np.void] = PlyData.read(path)["vertex"].data
     # List properties have no column of numbers.
     return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
+
+
+def require_room(path: Path) -> None:
+    """Refuse a PLY whose header announces more elements than the file has bytes, before room is made for them.
+
+    Raises:
+        InputError: no such file, or the header promises too much.
+    """
+    require_file(path, "name a PLY file")
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(65536).split(b"end_header", 1)[0]
+    for line in header.splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2]) > size:
+            raise InputError(f"{path}: {words[2].decode()} elements announced in {size} bytes; export it again")
 
 
 def _read_text(path: Path) -> dict[str, Array]:
@@ -76,7 +97,7 @@ def _read_text(path: Path) -> dict[str, Array]:
 
     The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
     """
-    told = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    told = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     lines = [line for line in told if not _is_comment(line)]
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}

@@ -4,6 +4,8 @@ import csv
 from pathlib import Path
 
 from stitch.errors import InputError
+from stitch.reading.names import require_name
+from stitch.reading.text_file import require_file
 
 
 def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -12,12 +14,13 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     Raises:
         InputError: the file is not text, or a quote stays open.
     """
+    require_file(file, "write the table")
     rows: list[tuple[int, list[str]]] = []
     first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream, skipinitialspace=True)
-            header = [name.strip() for name in next(reader, [])]
+            header = [require_name(f"{file} line 1", name.strip(), "column") for name in next(reader, [])]
             first = reader.line_num + 1
             for row in reader:
                 if any(cell.strip() for cell in row):

@@ -5,6 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.reading.text_file import shortened
+
+# No quantity of a cell is larger in any unit; beyond, squares overflow.
+_LARGEST = 1e30
 
 
 def is_number(cell: str) -> bool:
@@ -26,6 +30,6 @@ def number(file: Path, line: int, column: str, cell: str, mend: str = "write a f
         value = float(cell)
     except ValueError:
         value = float("nan")
-    if not np.isfinite(value):
-        raise InputError(f"{file} line {line}: {column} is {cell.strip()!r}; {mend}")
+    if not np.abs(value) < _LARGEST:
+        raise InputError(f"{file} line {line}: {column} is {shortened(cell.strip())}; {mend}")
     return value

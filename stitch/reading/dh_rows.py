@@ -9,22 +9,29 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, elementary
+from stitch.reading.text_file import shortened
 from stitch.units import METRES
 
+# No length, angle or mass of an arm is larger in any unit; beyond, squares overflow.
+LARGEST = 1e12
 _DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")
 
 
 def robot_from_dh(
-    name: str, convention: str, joints: Sequence[dict[str, Any]], payload: dict[str, Any] | None,
-    gravity: Array, length_unit: str,
-) -> Robot:  # fmt: skip
+    name: str,
+    convention: str,
+    joints: Sequence[dict[str, Any]],
+    payload: dict[str, Any] | None,
+    gravity: Array,
+    length_unit: str,
+) -> Robot:
     """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
 
     Raises:
         InputError: unknown convention or key, no row, or a value that is not a finite number.
     """
-    if not joints:
-        raise InputError("robot.joints is empty; write one DH row a joint")
+    if not isinstance(joints, list) or not joints:
+        raise InputError("robot.joints is no list of rows; write one DH row a joint")
     rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
     for where, row in rows:
         known_keys(where, row, _DH_KEYS)
@@ -41,11 +48,23 @@ def robot_from_dh(
     else:
         raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
     masses = [point_mass(where, row) for where, row in rows]
+    payload_mass, payload_com = payload_of(payload)
     return Robot(
-        name, convention, before, after, theta, np.array([m for m, _ in masses]),
-        np.array([c for _, c in masses]), *payload_of(payload), gravity_of(gravity),
-        METRES[length_unit], a, alpha, d,
-    )  # fmt: skip
+        name=name,
+        convention=convention,
+        before=before,
+        after=after,
+        theta=theta,
+        mass=np.array([m for m, _ in masses]),
+        com=np.array([c for _, c in masses]),
+        payload_mass=payload_mass,
+        payload_com=payload_com,
+        gravity=gravity_of(gravity),
+        metres_per_unit=METRES[length_unit],
+        a=a,
+        alpha=alpha,
+        d=d,
+    )
 
 
 def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
@@ -72,21 +91,23 @@ def point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
 def known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
     """Refuse other keys: a misspelt alpha_deg would silently count as 0, and the arm be another one."""
     if not isinstance(table, dict):
-        raise InputError(f"{where}: {table!r} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}")
+        raise InputError(
+            f"{where}: {shortened(table)} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}"
+        )
     for key in table:
         if key not in known:
             close = get_close_matches(str(key), known, 1)
             hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
-            raise InputError(f"{where}: unknown key {key!r}; {hint}")
+            raise InputError(f"{where}: unknown key {shortened(key)}; {hint}")
 
 
 def numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
     """The finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
     try:
         value = np.array(table.get(key, np.zeros(shape)), float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         value = np.full(shape, np.nan)
-    if value.shape != shape or not np.isfinite(value).all():
+    if value.shape != shape or not (np.abs(value) < LARGEST).all():
         kind = "three finite numbers" if shape else "a finite number"
-        raise InputError(f"{where}: {key} is {table[key]!r}; use {kind}")
+        raise InputError(f"{where}: {key} is {shortened(table[key])}; use {kind}")
     return value

@@ -11,6 +11,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
+from stitch.reading.text_file import require_file, shortened
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _SIGMA = ("sigma", "sigma_deg")
@@ -33,8 +34,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
     Raises:
         InputError: names the line and the mend.
     """
-    if not file.is_file():
-        raise InputError(f"{file}: not found; a frames session needs {','.join(('view', *_POSE))} there")
+    require_file(file, f"a frames session needs {','.join(('view', *_POSE))} there")
     header, rows = read_lines(file)
     missing = [name for name in ("view", *_POSE) if name not in header]
     if missing:
@@ -70,5 +70,7 @@ def _check_name(file: Path, line: int, name: str, names: dict[str, int], allowed
     if name in names:
         raise InputError(f"{file} line {line}: view {name} stands on line {names[name]} already; leave one out")
     if name not in allowed:
-        raise InputError(f"{file} line {line}: view {name!r} is not in views.csv; add it there or remove the row")
+        raise InputError(
+            f"{file} line {line}: view {shortened(name)} is not in views.csv; add it there or remove the row"
+        )
     names[name] = line

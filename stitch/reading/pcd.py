@@ -27,7 +27,7 @@ def read_pcd(path: Path) -> dict[str, Array]:
     layout, count = _layout(path, header)
     body = raw[start:]
     if encoding == "ascii":
-        return _ascii(body, header, count)
+        return _ascii(path, body, header, count)
     if encoding == "binary":
         need = layout.itemsize * count
         if len(body) < need:
@@ -50,7 +50,7 @@ def _header(path: Path, raw: bytes) -> tuple[dict[str, list[str]], str, int]:
             raise InputError(f"{path}: no DATA line; this is not a PCD file")
         words = raw[start:end].decode("ascii", "replace").split()
         start = end + 1
-        if words and words[0] == "DATA":
+        if len(words) > 1 and words[0] == "DATA":
             return header, words[1], start
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
@@ -62,8 +62,10 @@ def _layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[np.void]
         counts = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
         kinds = [_KINDS[t] + s for t, s in zip(header["TYPE"], header["SIZE"], strict=True)]
         count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-        return np.dtype([(f"{i}", "<" + k, (c,)) if c > 1 else (f"{i}", "<" + k)
-                         for i, (k, c) in enumerate(zip(kinds, counts, strict=True))]), count  # fmt: skip
+        if count < 0 or min(counts) < 1:
+            raise ValueError("a negative number of points or values")
+        columns = zip(kinds, counts, strict=True)
+        return np.dtype([(f"{i}", "<" + k, (c,) if c > 1 else ()) for i, (k, c) in enumerate(columns)]), count
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
             f"{path}: PCD header is incomplete ({error}); it needs FIELDS, SIZE, TYPE and POINTS"
@@ -80,9 +82,12 @@ def _wanted(header: dict[str, list[str]]) -> dict[str, int]:
     return {name: i for i, (name, count) in enumerate(fields) if count == 1 and name != "_"}
 
 
-def _ascii(body: bytes, header: dict[str, list[str]], count: int) -> dict[str, Array]:
+def _ascii(path: Path, body: bytes, header: dict[str, list[str]], count: int) -> dict[str, Array]:
     counts = _counts(header)
-    table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=count).reshape(-1, sum(counts))
+    rows = min(count, body.count(b"\n") + 1)
+    table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=rows).reshape(-1, sum(counts))
+    if len(table) < count:
+        raise InputError(f"{path}: {count} points announced, data for {len(table)}; export it again")
     first = np.concatenate([[0], np.cumsum(counts)])
     return {name: table[:, first[i]] for name, i in _wanted(header).items()}
 
@@ -91,6 +96,8 @@ def _compressed(
     path: Path, body: bytes, header: dict[str, list[str]], layout: np.dtype[np.void], count: int
 ) -> dict[str, Array]:
     """LZF-compressed, and stored field by field."""
+    if len(body) < 8:
+        raise InputError(f"{path}: compressed data are cut short; export it again")
     packed, size = struct.unpack("<II", body[:8])
     data = lzf.decompress(body[8 : 8 + packed], size) if len(body) >= 8 + packed else None
     if data is None or size != layout.itemsize * count:

@@ -1,17 +1,28 @@
-"""Is the scale right? Metres read as millimetres, or the reverse, are off by 1000."""
+"""Is the scale right? Metres read as millimetres, or the reverse, are off by 1000.
+
+Sizes and motions are judged, and how far things can lie; not how near: the origin of many structured-light and line
+scanners lies in the middle of what they measure.
+"""
 
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.units import METRES
 
-# Working distances of scanners on robots, in metres: from a borescope to a hall.
-_RANGE_M = (0.01, 20.0)
+# What one scan of a robot's scanner shows, in metres: from a borescope to a hull.
+_SIZE_M = (3e-3, 20.0)
+# How far the middle of a scan may lie from the sensor's origin, and any single point.
+_RANGE_M, _FARTHEST_M = 20.0, 1000.0
 # Trackers see as far as a hall is long.
-_SIGHT_M = (0.01, 100.0)
+_SIGHT_M = 100.0
 # Reach of robots, in metres.
 _REACH_M = (0.03, 60.0)
+# A target moves about as far as the flange: not a few hundred times more or less.
+_MOTION = 300.0
+# Fields of view over the working distance; a 1000 times less or more is another unit.
+_FIELD = (2e-3, 30.0)
 _OTHER = {"mm": "m", "m": "mm"}
 
 
@@ -23,39 +34,79 @@ def check_scale(session: Session, cloud_unit: str) -> None:
     """
     metres = METRES[session.length_unit]
     toml = session.path / "session.toml"
+    own = session.length_unit
     for view in session.views:
         if view.cloud is not None:
-            distance = float(np.median(np.linalg.norm(view.cloud.points, axis=1)))
-            _refuse(
-                distance * metres, _RANGE_M, f"{toml}: the points of view {view.name} lie", "cloud_unit", cloud_unit
-            )
+            points = view.cloud.points * metres
+            _require_near(f"view {view.name}", points)
+            what = f"{toml}: the points of view {view.name}"
+            _refuse(_median_distance(points), (0.0, _RANGE_M), f"{what} lie", "away", "cloud_unit", cloud_unit)
+            _refuse(_size(points), _SIZE_M, f"{what} extend over", "", "cloud_unit", cloud_unit)
         if view.sighting is not None:
-            distance = float(np.median(np.linalg.norm(view.sighting.points, axis=1)))
+            distance = _median_distance(view.sighting.points) * metres
             what = f"{toml}: the targets of view {view.name} lie"
-            _refuse(distance * metres, _SIGHT_M, what, "length_unit", session.length_unit)
-    reach = float(np.max([np.linalg.norm(view.T_base_flange[:3, 3]) for view in session.views]))
-    _refuse(reach * metres, _REACH_M, f"{toml}: the flange stands at most", "length_unit", session.length_unit)
-    _compare(session, cloud_unit)
+            _refuse(distance, (0.0, _SIGHT_M), what, "away", "length_unit", own)
+    flange = np.array([view.T_base_flange[:3, 3] for view in session.views]) * metres
+    reach = float(np.linalg.norm(flange, axis=1).max())
+    _refuse(reach, _REACH_M, f"{toml}: the flange stands at most", "away", "length_unit", own)
+    _compare_motions(session, flange)
+    _compare_standoff(session, cloud_unit)
 
 
-def _refuse(size_m: float, limits: tuple[float, float], what: str, key: str, unit: str) -> None:
+def _median_distance(points: Array) -> float:
+    return float(np.median(np.linalg.norm(points, axis=1)))
+
+
+def _size(points: Array) -> float:
+    """The longest side of the box around all but the outermost points."""
+    low, high = np.percentile(points, (5, 95), axis=0)
+    return float((high - low).max())
+
+
+def _require_near(what: str, points: Array) -> None:
+    """Refuse single points that no sensor measures: one of them would stretch every grid over the cloud."""
+    far = np.abs(points).max(axis=1) > _FARTHEST_M
+    if far.any():
+        raise InputError(
+            f"{what}: {far.sum()} of {len(points)} points lie more than {_FARTHEST_M:g} m from the scanner, the first "
+            f"is point {int(far.argmax()) + 1}; to fix: remove them from the cloud, or check cloud_unit"
+        )
+
+
+def _refuse(size_m: float, limits: tuple[float, float], what: str, how: str, key: str, unit: str) -> None:
     if limits[0] <= size_m <= limits[1] or size_m == 0:
         return
     shown = f"{size_m * 1e3:.3g} mm" if size_m < 1 else f"{size_m:.3g} m"
     hint = f'the scale looks off by 1000: set {key} = "{_OTHER[unit]}"'
-    raise InputError(f'{what} {shown} away with {key} = "{unit}"; {hint}')
+    raise InputError(f'{what} {shown}{" " * bool(how)}{how} with {key} = "{unit}"; {hint}')
 
 
-def _compare(session: Session, cloud_unit: str) -> None:
-    """Against the sizes that the session itself states."""
+def _compare_motions(session: Session, flange: Array) -> None:
+    """Labelled points have no size of their own, but they move with the arm."""
+    metres = METRES[session.length_unit]
+    seen = [view.sighting.points for view in session.views if view.sighting is not None]
+    if len(seen) < 3 or session.has_clouds:
+        return
+    moved, arm = float(np.ptp(np.concatenate(seen), axis=0).max()) * metres, float(np.ptp(flange, axis=0).max())
+    if min(moved, arm) > 0 and not 1 / _MOTION < moved / arm < _MOTION:
+        raise InputError(
+            f"{session.path / 'session.toml'}: the targets move over {moved * 1e3:.3g} mm, the flange over "
+            f"{arm * 1e3:.3g} mm; the scale looks off by 1000: write poses and targets in length_unit "
+            f'(is "{session.length_unit}")'
+        )
+
+
+def _compare_standoff(session: Session, cloud_unit: str) -> None:
+    """Against the working distance that the session itself states."""
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     if not clouds or not session.scanner.standoff:
         return
-    distance = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in clouds]))
-    ratio = distance / session.scanner.standoff
-    if not 0.03 < ratio < 30:
+    size = float(np.median([_size(points) for points in clouds]))
+    distance = float(np.median([_median_distance(points) for points in clouds]))
+    low, high = _FIELD
+    if size < low * session.scanner.standoff or max(size, distance) > high * session.scanner.standoff:
         raise InputError(
-            f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away, but "
-            f"scanner.standoff is {session.scanner.standoff:.3g}; "
+            f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away over "
+            f"{size:.3g}, but scanner.standoff is {session.scanner.standoff:.3g}; "
             f'the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'
         )

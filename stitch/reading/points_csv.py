@@ -9,6 +9,8 @@ from stitch.errors import InputError
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
+from stitch.reading.names import require_name
+from stitch.reading.text_file import shortened
 
 _XYZ = ("x", "y", "z")
 
@@ -28,7 +30,9 @@ def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
     for line, row in _rows(file, ("view", "target", *_XYZ)):
         view, target = row["view"], row["target"]
         if view not in allowed:
-            raise InputError(f"{file} line {line}: view {view!r} is not in views.csv; add it there or remove the row")
+            raise InputError(
+                f"{file} line {line}: view {shortened(view)} is not in views.csv; add it there or remove the row"
+            )
         if (view, target) in seen:
             raise InputError(
                 f"{file} line {line}: view {view} shows target {target} on line {seen[view, target]} already; "
@@ -84,6 +88,7 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]
         out.append((line, dict(zip(header, (cell.strip() for cell in row), strict=True))))
         if not out[-1][1]["target"]:
             raise InputError(f"{file} line {line}: target is empty; give it a name")
+        require_name(f"{file} line {line}", out[-1][1]["target"], "target")
     return out
 
 

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.session import Mount, Session, View
 from stitch.reading import session_toml
@@ -13,6 +14,7 @@ from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.plausible import check_scale
 from stitch.reading.points_csv import read_points, read_targets
+from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
 from stitch.reading.views_csv import Row, read_views
 from stitch.units import METRES
@@ -37,12 +39,20 @@ def load_session(path: Path | str) -> Session:
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
     sightings = _sightings(path, [row.name for row in rows])
     views = _views(path, rows, METRES[cloud_unit] / METRES[unit], sightings)
-    radius = session_toml.positive(file, document.get("sphere", {}), "sphere", "radius")
+    cad, cad_unit = session_toml.cad(file, document.get("part", {}))
     session = Session(
-        path, str(document.get("name", path.name)), unit, mount,  # type: ignore[arg-type]
-        session_toml.scanner(file, document.get("scanner", {})), robot, radius,
-        *session_toml.cad(file, document.get("part", {})), views, nominal=_nominal(path, sightings),
-    )  # fmt: skip
+        path=path,
+        name=session_toml.name_of(file, document),
+        length_unit=unit,
+        mount=mount,  # type: ignore[arg-type]
+        scanner=session_toml.scanner(file, document.get("scanner", {})),
+        robot=robot,
+        sphere_radius=session_toml.positive(file, document.get("sphere", {}), "sphere", "radius"),
+        cad=cad,
+        cad_unit=cad_unit,
+        views=views,
+        nominal=_nominal(path, sightings),
+    )
     check_scale(session, cloud_unit)
     return session
 
@@ -50,6 +60,9 @@ def load_session(path: Path | str) -> Session:
 def _sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
     """By view, from points.csv or frames.csv."""
     points, frames_file = path / "points.csv", path / "frames.csv"
+    for optional in (points, frames_file, path / "targets.csv"):
+        if optional.exists() or optional.is_symlink():
+            require_file(optional, "write the table, or remove it")
     if points.is_file() and frames_file.is_file():
         raise InputError(f"{path}: has points.csv and frames.csv; keep one of them: a session has one kind of target")
     if points.is_file():
@@ -80,22 +93,36 @@ def _views(path: Path, rows: list[Row], scale: float, sightings: dict[str, Sight
     for row in rows:
         cloud = None
         if row.cloud:
-            try:
-                cloud = read_cloud(path / row.cloud, scale)
-                if len(cloud.points) < _FEWEST:
-                    raise InputError(
-                        f"{path / row.cloud}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of "
-                        "views.csv or scan it again"
-                    )
-            except InputError as error:
-                raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
+            cloud = _cloud(path, row, scale)
         elif not sightings:
             raise InputError(
                 f"{path / 'views.csv'} line {row.line}: view {row.name} names no cloud; fill the column "
                 "cloud, or put points.csv or frames.csv beside it"
             )
         views.append(
-            View(row.name, cloud, row.T_base_flange, row.joints, row.approach, row.time_s, row.covariates,
-                 sightings.get(row.name))
-        )  # fmt: skip
+            View(
+                name=row.name,
+                cloud=cloud,
+                T_base_flange=row.T_base_flange,
+                joints=row.joints,
+                approach=row.approach,
+                time_s=row.time_s,
+                covariates=row.covariates,
+                sighting=sightings.get(row.name),
+            )
+        )
     return tuple(views)
+
+
+def _cloud(path: Path, row: Row, scale: float) -> Cloud:
+    file = path / row.cloud
+    try:
+        cloud = read_cloud(file, scale)
+        if len(cloud.points) < _FEWEST:
+            raise InputError(
+                f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
+                "it again"
+            )
+    except InputError as error:
+        raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
+    return cloud

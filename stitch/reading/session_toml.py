@@ -12,6 +12,8 @@ from stitch.frames import Array
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Scanner
 from stitch.reading.dh_rows import numbers, robot_from_dh
+from stitch.reading.names import require_folder_name, require_name
+from stitch.reading.text_file import shortened
 from stitch.reading.toml_file import choice, read_toml, text
 from stitch.reading.urdf import robot_from_urdf
 from stitch.units import METRES
@@ -25,6 +27,8 @@ _KEYS = {
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
 }
+# No length of a cell is larger in any unit; beyond, squares overflow.
+_LARGEST = 1e12
 # Effects of the scanner count its field as x/z and y/z: they know no scanner that looks along x or y.
 _AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
 
@@ -37,7 +41,7 @@ def document(file: Path) -> dict[str, Any]:
     """
     document = read_toml(file, "a session is a folder with session.toml and views.csv")
     if document.get("format") != FORMAT:
-        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{FORMAT}"')
+        raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{FORMAT}"')
     for table, known in _KEYS.items():
         entries = document if not table else document.get(table, {})
         if not isinstance(entries, dict):
@@ -52,6 +56,16 @@ def document(file: Path) -> dict[str, Any]:
     return document
 
 
+def name_of(file: Path, document: dict[str, Any]) -> str:
+    """What the session is called: its name, or that of its folder.
+
+    Raises:
+        InputError: a name that cannot be that of its run's folder.
+    """
+    stated = text(file, document, "", "name")
+    return require_folder_name(str(file), file.resolve().parent.name if stated is None else stated, "name")
+
+
 def positive(file: Path, table: dict[str, Any], name: str, key: str) -> float | None:
     """A positive number, or None where it is absent.
 
@@ -61,8 +75,8 @@ def positive(file: Path, table: dict[str, Any], name: str, key: str) -> float | 
     value = table.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
-        raise InputError(f"{file}: {name}.{key} is {value!r}; use a positive number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < _LARGEST:
+        raise InputError(f"{file}: {name}.{key} is {shortened(value)}; use a positive number")
     return float(value)
 
 
@@ -75,8 +89,8 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
     axis = table.get("optical_axis", "+z")
     if axis not in tuple(_AXES):
         raise InputError(
-            f"{file}: scanner.optical_axis is {axis!r}; turn the clouds until their scanner looks along z, and write "
-            'the side: "+z" or "-z"'
+            f"{file}: scanner.optical_axis is {shortened(axis)}; turn the clouds until their scanner looks along z, "
+            'and write the side: "+z" or "-z"'
         )
     T_mount = None
     if "pose" in table:
@@ -88,9 +102,9 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
 def _pose(file: Path, value: Any) -> Array:
     try:
         T = np.array(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
+    if T.shape != (4, 4) or not (np.abs(T) < _LARGEST).all():
         raise InputError(f"{file}: scanner.pose must be four rows of four numbers")
     off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
     if off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
@@ -109,8 +123,9 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
     """
     if not table:
         return None
+    name = require_name(f"{file}: robot", text(file, table, "robot", "name") or "robot", "name")
     gravity = numbers(f"{file}: robot", {"gravity": [0.0, 0.0, -9.81]} | table, "gravity", (3,))
-    name, payload = str(table.get("name", "robot")), table.get("payload")
+    payload = table.get("payload")
     urdf, base, flange = (text(file, table, "robot", key) for key in ("urdf", "base_link", "flange_link"))
     if urdf is not None:
         return robot_from_urdf(file.parent / urdf, base, flange, unit, gravity, payload)
@@ -120,7 +135,7 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
         return robot_from_dh(name, str(table.get("dh", "standard")), table["joints"], payload, gravity, unit)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
 
 

@@ -5,6 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from stitch.errors import InputError
+from stitch.reading.text_file import read_text, shortened
+
+# A description written by hand; the model of a run with thousands of targets is smaller too.
+_LARGEST_MB = 20
 
 
 def read_toml(file: Path, hint: str) -> dict[str, Any]:
@@ -14,14 +18,15 @@ def read_toml(file: Path, hint: str) -> dict[str, Any]:
         hint: what to do where there is no such file.
 
     Raises:
-        InputError: the file is missing or not TOML.
+        InputError: the file is missing, no file, or not TOML.
     """
+    told = read_text(file, hint, _LARGEST_MB)
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; {hint}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(told)
+    except ValueError as error:  # wrong TOML, and integers of thousands of digits
         raise InputError(f"{file}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
 
 
 def choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
@@ -31,8 +36,8 @@ def choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]
         InputError: another one, or none.
     """
     value = table.get(key)
-    if value not in allowed:
-        raise InputError(f"{file}: {key} is {value!r}; use {' or '.join(repr(a) for a in allowed)}")
+    if not isinstance(value, str) or value not in allowed:
+        raise InputError(f"{file}: {key} is {shortened(value)}; use {' or '.join(repr(a) for a in allowed)}")
     return str(value)
 
 
@@ -44,5 +49,5 @@ def text(file: Path, table: dict[str, Any], name: str, key: str) -> str | None:
     """
     value = table.get(key)
     if value is not None and not isinstance(value, str):
-        raise InputError(f"{file}: {f'{name}.' * bool(name)}{key} is {value!r}; write a name in quotes")
+        raise InputError(f"{file}: {f'{name}.' * bool(name)}{key} is {shortened(value)}; write a name in quotes")
     return value

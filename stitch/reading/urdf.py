@@ -12,18 +12,21 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot
-from stitch.reading.dh_rows import gravity_of, payload_of
+from stitch.reading.dh_rows import LARGEST, gravity_of, payload_of
+from stitch.reading.text_file import require_file
 from stitch.units import METRES
-from stitch.writing.urdf_file import to_urdf
 
-__all__ = ["robot_from_urdf", "to_urdf"]
 Element = ElementTree.Element
 
 
 def robot_from_urdf(
-    path: Path | str, base_link: str | None, flange_link: str | None, length_unit: str, gravity: Array,
+    path: Path | str,
+    base_link: str | None,
+    flange_link: str | None,
+    length_unit: str,
+    gravity: Array,
     payload: dict[str, Any] | None = None,
-) -> Robot:  # fmt: skip
+) -> Robot:
     """The serial chain base_link → flange_link, in length_unit.
 
     Fixed joints are merged. A link's mass includes all links fixed to it, a tool beyond the flange too:
@@ -33,9 +36,10 @@ def robot_from_urdf(
         InputError: unreadable, no such link, no chain between them, or a joint that does not turn freely.
     """
     path = Path(path)
+    require_file(path, "correct robot.urdf in session.toml")
     try:
         robot = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
+    except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}") from None
     try:
         return _robot(path, robot, base_link, flange_link, 1 / METRES[length_unit], gravity, payload)
@@ -44,9 +48,14 @@ def robot_from_urdf(
 
 
 def _robot(
-    path: Path, root: Element, base_link: str | None, flange_link: str | None, scale: float, gravity: Array,
+    path: Path,
+    root: Element,
+    base_link: str | None,
+    flange_link: str | None,
+    scale: float,
+    gravity: Array,
     payload: dict[str, Any] | None,
-) -> Robot:  # fmt: skip
+) -> Robot:
     before: list[Array] = []
     after: list[Array] = []
     mass, com = [], []
@@ -68,10 +77,20 @@ def _robot(
     # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
     after[-1] = after[-1] @ pending
     com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
+    payload_mass, payload_com = payload_of(payload)
     return Robot(
-        str(root.get("name", path.stem)), "urdf", np.array(before), np.array(after), np.zeros(len(before)),
-        np.array(mass), np.array(com), *payload_of(payload), gravity_of(gravity), 1 / scale,
-    )  # fmt: skip
+        name=str(root.get("name", path.stem)),
+        convention="urdf",
+        before=np.array(before),
+        after=np.array(after),
+        theta=np.zeros(len(before)),
+        mass=np.array(mass),
+        com=np.array(com),
+        payload_mass=payload_mass,
+        payload_com=payload_com,
+        gravity=gravity_of(gravity),
+        metres_per_unit=1 / scale,
+    )
 
 
 def _chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
@@ -145,7 +164,7 @@ def _values(element: Element | None, key: str, default: str, where: str) -> Arra
         values = np.array(text.split(), float)
     except ValueError:
         values = np.array([np.nan])
-    if len(values) != len(default.split()) or not np.isfinite(values).all():
+    if len(values) != len(default.split()) or not (np.abs(values) < LARGEST).all():
         raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
     return values
 

@@ -13,6 +13,8 @@ from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number, number
+from stitch.reading.names import require_name
+from stitch.reading.text_file import require_file
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _JOINT = re.compile(r"j([1-9]\d*)_deg$")
@@ -48,8 +50,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     Raises:
         InputError: with the line, and the mend.
     """
-    if not file.is_file():
-        raise InputError(f"{file}: not found; a session needs a row per scan there")
+    require_file(file, "a session needs a row per scan there")
     header, lines = read_lines(file)
     _check_header(file, header, robot)
     if not lines:
@@ -65,7 +66,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
         if not name or name in seen:
             mend = f"is used on line {seen[name]} already" if name else "is empty"
             raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
-        seen[name] = line
+        seen[require_name(f"{file} line {line}", name, "view")] = line
         time_s = number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
         if time_s is not None:
             _require_later(file, line, time_s, latest)

@@ -3,8 +3,8 @@
 from typing import Protocol
 
 from stitch.frames import Array
-from stitch.runs.run import Run, StageResult
 from stitch.measurement.session import Session
+from stitch.runs.run import Run, StageResult
 
 
 class Recorder(Protocol):

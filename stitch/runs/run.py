@@ -1,21 +1,16 @@
 """What a run computed, as plain frozen data; `writing` puts it on disk."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-from stitch.measurement.measurement import Measurement, Term
 from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.model import Model
+from stitch.model.term import Term
 from stitch.observations.surfaces.overlaps import Overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.measurement.session import Session
-
-if TYPE_CHECKING:
-    from stitch.diagnosis.diagnosis import Diagnosis
-    from stitch.stages.target_fit import LabelledFit
-    from stitch.observations.targets.outliers import Outlier
+from stitch.observations.targets.outliers import Outlier
+from stitch.observations.targets.target_fit import TargetFit
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class FusedCloud:
 
 
 @dataclass(frozen=True)
-class Step:
+class LedgerStep:
     """One change of the model: a line of ledger.json."""
 
     effects: tuple[str, ...]
@@ -53,13 +48,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Run:
-    """Everything `result.json` and the report show."""
+    """Everything `result.json` and the report show of one session; lengths in length_unit, angles in rad."""
 
     session: Session
-    measurement: Measurement  # what was measured
-    T_mount: Array  # (4, 4) corrected hand-eye
+    measurement: Measurement  # as it counts: without outliers
+    model: Model
     T_mount_coarse: Array  # (4, 4)
-    mount_covariance: Array  # (6, 6) of the right perturbation T·exp(ξ), rotation first
     unobservable: tuple[str, ...]  # plain words, one per unobservable direction
     stages: tuple[StageResult, ...]
     poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
@@ -73,38 +67,37 @@ class Run:
     repeatability: Repeatability  # of the flange poses, as the overlaps show it
     overlaps: Overlaps | None  # correspondences of the model, before register moves single views; None without clouds
     verdict: str  # one plain sentence
-    terms: tuple[Term, ...] = ()  # effects in use
-    sigmas: tuple[Array, ...] = ()  # per term (P,); NaN where the views cannot see a parameter
-    ledger: tuple[Step, ...] = ()
+    ledger: tuple[LedgerStep, ...] = ()
     effects_file: str | None = None
     poses_before: Array | None = None  # (V, 4, 4) poses_model before the last change of the model
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
-    labelled: LabelledFit | None = None  # what the labelled points say, where there are any
+    targets: TargetFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
 
-    def diagnose(self) -> Diagnosis:
-        """Which effect is missing."""
-        from stitch.diagnosis.diagnose import diagnose
-        from stitch.stored.load_state import state_of
-
-        return diagnose(state_of(self))
-
-    def add(self, *effects: str) -> Run:
-        """The run with further effects in its model, fitted anew."""
-        from stitch.pipeline import change
-        from stitch.stored.load_state import state_of
-
-        return change(state_of(self), [*self.effects, *(e for e in effects if e not in self.effects)])
-
-    def drop(self, *effects: str) -> Run:
-        """The run without some effects, fitted anew."""
-        from stitch.pipeline import change
-        from stitch.stored.load_state import state_of
-
-        return change(state_of(self), [e for e in self.effects if e not in effects])
+    @property
+    def T_mount(self) -> Array:
+        """(4, 4) corrected hand-eye."""
+        return self.model.T_mount
 
     @property
-    def effects(self) -> Sequence[str]:
+    def mount_covariance(self) -> Array:
+        """(6, 6) of the right perturbation T·exp(ξ), scanner frame, rotation first."""
+        return self.model.covariance
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Effects in use."""
+        return self.model.terms
+
+    @property
+    def effects(self) -> list[str]:
         """Names of the effects in use."""
-        return [term.effect.name for term in self.terms]
+        return self.model.effects
+
+    def __repr__(self) -> str:
+        unit = self.session.length_unit
+        return (
+            f"Run({self.session.name!r}, {len(self.session.views)} views, residual {self.residual_rms:.4g} {unit}, "
+            f"held-out {self.heldout_rms:.4g} {unit}, {self.model!r})"
+        )

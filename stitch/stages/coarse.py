@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.measurement.capture import Capture
+from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.match import sample, search
 from stitch.stages.correct import close_in
 from stitch.stages.initial_guess.centroids import centroid_hand_eyes, scanner_centre
@@ -70,12 +70,6 @@ def given(captures: Sequence[Capture], T_mount: Array, source: str) -> Coarse:
         source: where from, in words.
     """
     return Coarse(T_mount, COARSE_GATE * part_size(captures), source, ())
-
-
-def part_size(captures: Sequence[Capture]) -> float:
-    """Median diameter of the scans' point sets: twice the rms distance from their centroids."""
-    spread = [np.sqrt(scan.points.var(axis=0).sum()) for c in captures for scan in c.scans]
-    return 2 * float(np.median(spread))
 
 
 def coarse(captures: Sequence[Capture]) -> Coarse:
@@ -132,9 +126,8 @@ def _turn_about(rotation: Array, centre: Array) -> Array:
 def _close(captures: Sequence[Capture], source: str, T_mount: Array, size: float) -> Candidate | None:
     """Close in from one start; None if the views do not overlap there."""
     try:
-        T_mount, _, _ = close_in(
-            captures, T_mount, [COARSE_GATE * size] * len(captures), _SEARCH_SAMPLES, _SEARCH_ITERATIONS
-        )
+        gates = [COARSE_GATE * size] * len(captures)
+        T_mount, _, _ = close_in(captures, T_mount, gates, samples=_SEARCH_SAMPLES, maximum=_SEARCH_ITERATIONS)
     except NoResultError:
         return None
     return Candidate(source, T_mount, consistency(captures, T_mount, _SCORE_SHARE * size))

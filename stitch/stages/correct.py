@@ -6,41 +6,30 @@ generalised least-squares step weighs the views by the robot's own scatter (`han
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Term
+from stitch.model.model import Model
 from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
-from stitch.observations.surfaces.gram import assemble, least_squares
-from stitch.observations.surfaces.hand_eye import HandEye, fit_hand_eye
+from stitch.observations.surfaces.gram import assemble
+from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.runs.recorder import Recorder, Silent
+from stitch.stages.correction import Correction
+from stitch.statistics.least_squares import least_squares
 
 # Queries per view while the gate closes; the final normal equations take FINE_SAMPLES.
 COARSE_SAMPLES = 600
 _MAXIMUM_ITERATIONS = 40
 # A step that moves the part by less than this share of the robust sigma changes nothing.
 _CONVERGED = 2e-3
-
-
-@dataclass(frozen=True)
-class Correction:
-    """The corrected hand-eye; `overlaps` and `freed` in the order of the captures."""
-
-    hand_eye: HandEye
-    overlaps: tuple[Overlaps, ...]
-    freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
-    history: tuple[float, ...]  # rms per iteration
-    captures: tuple[Capture, ...]  # without the effects in use
-    terms: tuple[Term, ...] = ()  # effects in use
-    sigmas: tuple[Array, ...] = ()  # per term (P,)
 
 
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
@@ -58,9 +47,14 @@ def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mou
 
 
 def close_in(
-    captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], samples: int = COARSE_SAMPLES,
-    maximum: int = _MAXIMUM_ITERATIONS, recorder: Recorder | None = None,
-) -> tuple[Array, list[Overlaps], list[float]]:  # fmt: skip
+    captures: Sequence[Capture],
+    T_mount: Array,
+    gates: Sequence[float],
+    *,
+    samples: int = COARSE_SAMPLES,
+    maximum: int = _MAXIMUM_ITERATIONS,
+    recorder: Recorder | None = None,
+) -> tuple[Array, list[Overlaps], list[float]]:
     """Iterate matching and the common step until it no longer moves the parts.
 
     Args:
@@ -93,9 +87,12 @@ Repeating = Callable[[Sequence[FreePoses]], list[Array]]
 
 
 def correct(
-    captures: Sequence[Capture], T_mount: Array, gate: float, recorder: Recorder | None = None,
+    captures: Sequence[Capture],
+    T_mount: Array,
+    gate: float,
+    recorder: Recorder | None = None,
     repeating: Repeating | None = None,
-) -> Correction:  # fmt: skip
+) -> Correction:
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
     Args:
@@ -109,7 +106,7 @@ def correct(
     """
     T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
-    T_mount, overlaps, fine = close_in(captures, T_mount, gates, FINE_SAMPLES, 2, recorder)
+    T_mount, overlaps, fine = close_in(captures, T_mount, gates, samples=FINE_SAMPLES, maximum=2, recorder=recorder)
     freed = tuple(free_poses(c, c.poses(T_mount), o.gate) for c, o in zip(captures, overlaps, strict=True))
     first = fit_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
@@ -124,8 +121,14 @@ def correct(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)
     )
-    poses = tuple(f.poses for f in freed)
-    return Correction(hand_eye, final, poses, (*history, *fine, pooled_rms(final)), tuple(captures))
+    return Correction(
+        model=Model(hand_eye.T_mount, (), hand_eye.covariance),
+        hand_eye=hand_eye,
+        overlaps=final,
+        freed=tuple(f.poses for f in freed),
+        history=(*history, *fine, pooled_rms(final)),
+        captures=tuple(captures),
+    )
 
 
 def weighing(capture: Capture, scatter: Repeatability) -> Capture:

@@ -1,63 +1,127 @@
 """The last steps of a run: register single views, fuse them, collect the result."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.observations.surfaces.noise_floor import noise_floor
 from stitch.observations.surfaces.overlaps import Overlaps
+from stitch.observations.surfaces.pose_channel import Repeatability, scatter_from
+from stitch.observations.targets.target_fit import TargetFit, rms_of
 from stitch.runs.recorder import Recorder, Silent
-from stitch.runs.run import Run, StageResult
-from stitch.runs.sentences import correct_note, sentence, warnings
-from stitch.stages.coarse import Coarse
-from stitch.stages.correct import Correction
+from stitch.runs.run import FusedCloud, StageResult
+from stitch.stages.correction import Correction
 from stitch.stages.fuse import fuse, view_residuals
-from stitch.stages.observability import unobservable
 from stitch.stages.register import register
+from stitch.stages.register_targets import register_targets
+from stitch.stages.sentences import correct_note, surface_sentence, target_sentence
+from stitch.statistics.robust import MAD_TO_SIGMA
 from stitch.system.threads import Clock
 
 
-def finish(
-    session: Session, measurement: Measurement, index: int, start: Coarse, correction: Correction, before: StageResult,
-    recorder: Recorder, seconds: float,
-) -> Run:  # fmt: skip
+@dataclass(frozen=True)
+class Finished:
+    """One session under its model, with single views registered and fused."""
+
+    own: Capture  # without the effects in use
+    stages: tuple[StageResult, ...]
+    poses_model: Array  # (V, 4, 4) T_reference_scanner
+    poses: Array  # (V, 4, 4) after register
+    view_rms: Array  # (V,)
+    residual_rms: float
+    heldout_rms: float
+    noise_floor: float
+    fused: FusedCloud
+    repeatability: Repeatability
+    verdict: str
+    convergence: dict[str, list[float]]
+    overlaps: Overlaps | None = None
+
+    @property
+    def corrections(self) -> Array:
+        """(V, 6) twists: poses = exp(corrections) @ poses_model."""
+        return frames.log(self.poses @ frames.inverse(self.poses_model))
+
+
+def finish_surfaces(
+    session: Session, correction: Correction, index: int, before: StageResult, recorder: Recorder, seconds: float
+) -> Finished:
     """Register and fuse session `index` of a rig under the common model, and show it to the recorder."""
     clock = Clock()
-    own, hand_eye, overlaps = correction.captures[index], correction.hand_eye, correction.overlaps[index]
-    scatter = hand_eye.repeatability[index]
-    poses_model = own.poses(hand_eye.T_mount)
-    g, iterations = overlaps.gram, len(correction.history)
-    note = correct_note(before.rms, g.rms)
-    stages = [before, StageResult("correct", g.rms, int(g.count.sum()), iterations, seconds, note)]
-    show(recorder, stages[1], own, poses_model, g.rms)
+    own, overlaps = correction.captures[index], correction.overlaps[index]
+    scatter = correction.hand_eye.repeatability[index]
+    poses_model = own.poses(correction.model.T_mount)
+    g, note = overlaps.gram, correct_note(before.rms, overlaps.gram.rms)
+    corrected = StageResult("correct", g.rms, int(g.count.sum()), len(correction.history), seconds, note)
+    show(recorder, corrected, own, poses_model)
     clock.lap()
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
-    final = registration.overlaps
-    stages.append(
-        StageResult("register", final.gram.rms, int(final.gram.count.sum()), len(registration.history), clock.lap())
-    )
+    final, iterations = registration.overlaps.gram, len(registration.history)
+    registered = StageResult("register", final.rms, int(final.count.sum()), iterations, clock.lap())
     fused = fuse(own, registration.poses)
-    stages.append(StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap()))
-    show(recorder, stages[2], own, registration.poses, final.gram.rms)
-    floor = noise_floor(own, final, session.scanner.noise)
-    joints = None if any(v.joints is None for v in session.views) else np.array([v.joints for v in session.views])
-    alone = len(correction.captures) == 1
-    return Run(
-        session=session, measurement=measurement, T_mount=hand_eye.T_mount, T_mount_coarse=start.T_mount,
-        mount_covariance=hand_eye.covariance,
-        unobservable=unobservable(correction.captures, hand_eye.T_mount, session.robot, joints if alone else None),
-        stages=tuple(stages), poses_model=poses_model, poses=registration.poses,
-        corrections=registration.corrections, view_rms=per_view_rms(final, len(own.scans)),
-        residual_rms=overlaps.gram.rms, heldout_rms=overlaps.gram.rms * hand_eye.heldout_ratio,
-        noise_floor=floor, fused=fused, repeatability=scatter, overlaps=overlaps,
-        verdict=sentence(overlaps.gram.rms, final.gram.rms, floor, scatter, session.length_unit),
-        terms=correction.terms, sigmas=correction.sigmas,
+    last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
+    show(recorder, registered, own, registration.poses)
+    floor = noise_floor(own, registration.overlaps, session.scanner.noise)
+    return Finished(
+        own=own,
+        stages=(before, corrected, registered, last),
+        poses_model=poses_model,
+        poses=registration.poses,
+        view_rms=per_view_rms(registration.overlaps, len(own.scans)),
+        residual_rms=g.rms,
+        heldout_rms=g.rms * correction.hand_eye.heldout_ratio,
+        noise_floor=floor,
+        fused=fused,
+        repeatability=scatter,
+        verdict=surface_sentence(g.rms, final.rms, floor, scatter, session.length_unit),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
-        notes=warnings(start, hand_eye.inflation),
-    )  # fmt: skip
+        overlaps=overlaps,
+    )
+
+
+def finish_targets(
+    session: Session, found: TargetFit, before: StageResult, recorder: Recorder, seconds: float
+) -> Finished:
+    """Register single views by their labelled points, and show it to the recorder; there is no cloud to fuse."""
+    clock, rows = Clock(), found.rows
+    own = rows.capture
+    poses_model = own.poses(found.model.T_mount)
+    distances = rows.distances(rows.residual)
+    count = np.isfinite(distances).sum(axis=1)
+    poses, after = register_targets(rows, found.variances, poses_model)
+    total, history = int(count.sum()), len(found.history)
+    corrected = StageResult("correct", found.rms, total, history, seconds, "3D distance of targets from their place")
+    registered = StageResult(
+        "register", rms_of(after), total, 1, clock.lap(), "each view moved by its own most likely error"
+    )
+    recorder.stage(corrected, poses_model, list(distances))
+    recorder.stage(registered, poses, list(after))
+    scatter = scatter_from(found.variances)
+    return Finished(
+        own=own,
+        stages=(before, corrected, registered),
+        poses_model=poses_model,
+        poses=poses,
+        view_rms=np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(count, 1)),
+        residual_rms=found.rms,
+        heldout_rms=found.heldout_rms,
+        noise_floor=found.noise_floor,
+        fused=_targets_as_cloud(found),
+        repeatability=scatter,
+        verdict=target_sentence(found, rms_of(after), scatter, session.length_unit),
+        convergence={"correct": list(found.history), "register": [rms_of(after)]},
+    )
+
+
+def _targets_as_cloud(found: TargetFit) -> FusedCloud:
+    """The targets in place of a fused cloud: position, rms distance of the views from it, number of views."""
+    positions, seen = found.landmarks.positions, np.minimum(found.rows.sightings.seen, 65535)
+    return FusedCloud(positions, np.zeros_like(positions), found.target_rms, seen.astype(np.int32))
 
 
 def per_view_rms(overlaps: Overlaps, views: int) -> Array:
@@ -69,11 +133,13 @@ def per_view_rms(overlaps: Overlaps, views: int) -> Array:
     return np.sqrt(square / np.maximum(count, 1))
 
 
-def show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array, rms: float) -> None:
+def show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array) -> None:
     """Hand a stage to the recorder with the distances between the views."""
+    if isinstance(recorder, Silent):
+        return
     # The cell of the residual map must hold the step between the views.
-    if not isinstance(recorder, Silent):
-        recorder.stage(stage, poses, view_residuals(own, poses, max(2 * own.spacing, 3 * min(rms, own.spacing * 3))))
+    cell = max(2 * own.spacing, 3 * min(stage.rms, own.spacing * 3))
+    recorder.stage(stage, poses, view_residuals(own, poses, cell))
 
 
 def _fused_rms(residual: Array) -> float:
@@ -81,4 +147,4 @@ def _fused_rms(residual: Array) -> float:
     if not len(seen):
         return float("nan")
     # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
-    return float(np.sqrt(np.mean(seen[seen < RMS_GATE * 1.4826 * np.median(seen)] ** 2)))
+    return float(np.sqrt(np.mean(seen[seen < RMS_GATE * MAD_TO_SIGMA * np.median(seen)] ** 2)))

@@ -27,10 +27,10 @@ from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collec
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.surfaces.target_pairs import joined
 from stitch.runs.recorder import Recorder, Silent
+from stitch.statistics.robust import MAD_TO_SIGMA
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
-_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def sign_weights(d: Array, base: Array) -> Array:
         if side.sum() < 8:
             continue
         mean = np.average(d[side], weights=base[side])
-        sigma = _MAD_TO_SIGMA * np.median(np.abs(d[side] - mean))
+        sigma = MAD_TO_SIGMA * np.median(np.abs(d[side] - mean))
         weight[side] *= np.exp(-((d[side] - mean) ** 2) / (2 * max(sigma, 1e-12) ** 2))
     return weight
 

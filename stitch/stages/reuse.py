@@ -1,33 +1,29 @@
-"""Use a hand-eye that was corrected on another object of the same rig, without correcting again."""
+"""Use a model that was fitted on another object of the same rig, without correcting again."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from stitch.frames import Array
-from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Term
-from stitch.model.model_toml import Model
+from stitch.measurement.capture import Capture, part_size
+from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.hand_eye import HandEye, scatter_of
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
-from stitch.stages.coarse import part_size
-from stitch.stages.correct import Correction, weighing
+from stitch.stages.correct import weighing
+from stitch.stages.correction import Correction
 
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
 _TIGHTENINGS = 4
 
 
-def reuse(
-    captures: Sequence[Capture], model: Model, terms: Sequence[Term] = (), sigmas: Sequence[Array] = ()
-) -> Correction:
-    """Overlaps and pose scatter of `captures` under the model's hand-eye, as `correct` returns them.
+def reuse(captures: Sequence[Capture], model: Model) -> Correction:
+    """Overlaps and pose scatter of `captures` under a model, as `correct` returns them.
 
     Args:
-        captures: without the model's effects, `terms`.
-        sigmas: per term (P,), as the model states them.
+        captures: without the model's effects.
 
     Raises:
         NoResultError: no two views overlap under the hand-eye.
@@ -37,15 +33,13 @@ def reuse(
     poses = [c.poses(model.T_mount) for c in captures]
     freed = [free_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(scatter_of(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
-    hand_eye = HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0)
     return Correction(
-        hand_eye,
-        overlaps,
-        tuple(f.poses for f in freed),
-        (pooled_rms(overlaps),),
-        tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
-        tuple(terms),
-        tuple(sigmas),
+        model=model,
+        hand_eye=HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0),
+        overlaps=overlaps,
+        freed=tuple(f.poses for f in freed),
+        history=(pooled_rms(overlaps),),
+        captures=tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
     )
 
 

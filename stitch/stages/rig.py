@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
+from stitch.effects.in_session import known, parameters_in, require
 from stitch.errors import InputError
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.model.model_toml import Model
-from stitch.model.terms import known, require
+from stitch.model.model_toml import ModelFile
 
 
-def require_same_rig(sessions: Sequence[Session], model: Model | None) -> None:
+def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> None:
     """Refuse sessions that cannot share a hand-eye, or that show nothing.
 
     Raises:
@@ -45,7 +45,7 @@ def require_effects(measurements: Sequence[Measurement], effects: Sequence[str])
         for measurement in measurements:
             require(measurement, effect)
         first, *others = (
-            {f"{p.name} ({p.unit})" for p in measurement.parameters(effect)} for measurement in measurements
+            {f"{p.name} ({p.unit})" for p in parameters_in(measurement, effect)} for measurement in measurements
         )
         for measurement, own in zip(measurements[1:], others, strict=True):
             if own != first:

@@ -1,0 +1,1 @@
+"""Statistics on plain arrays: variance components, least squares, folds, selection; nothing here knows a robot."""

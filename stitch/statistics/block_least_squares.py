@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from stitch.frames import Array, Indices
-from stitch.statistics.variance_components import Evidence
+from stitch.statistics.jackknife import grouped_inflation
 
 
 @dataclass(frozen=True)
@@ -61,26 +61,9 @@ class Blocks:
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
-        """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1.
-
-        The jackknife's covariance over the model's, mean over all directions (Efron & Stein 1981).
-        """
-        if len(groups) < 4:
-            return 1.0
-        out = np.array([self.solve(group) for group in groups])
-        centred = (out - out.mean(axis=0)) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        correlation = covariance / np.outer(unit, unit)
-        values, vectors = np.linalg.eigh(correlation)
-        keep = values > 1e-9
-        squares = (len(groups) - 1) / len(groups) * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
-        return float(max(1.0, squares.mean()))
+        """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
+        return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
 
 
 def _inverse(M: Array, scale: Array) -> Array:
     return np.asarray(np.linalg.pinv(M * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale))
-
-
-def whitener(evidence: Evidence, variances: Array) -> Array:
-    """(B, m, m) inverse Cholesky factors of the blocks' covariance."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(evidence.covariance(variances))))

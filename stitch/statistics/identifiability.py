@@ -1,35 +1,9 @@
 """Which parameters the views can know: absolute first, then beside the hand-eye and each other."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from stitch.frames import Array
-from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.gram import column_space
-from stitch.observations.surfaces.pose_channel import covariance_of, estimate, pose_channel
-
-
-def whitened(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Sequence[Array], values: Array,
-    free: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """In units of the pose scatter, all captures stacked: columns of the hand-eye (N, 6) and of effects (N, P), z (N,).
-
-    Args:
-        values: (P,) of the effects at which the views were freed; z is what was seen without them.
-        free: (P,) bool: effects that explain scatter.
-    """
-    out = []
-    for capture, f, extra in zip(captures, freed, columns, strict=True):
-        channel = pose_channel(f.overlaps.gram, f.twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
-        further = channel.reduction @ extra
-        half = np.linalg.cholesky(covariance_of(channel, estimate(channel, further[:, free])))
-        stack = np.column_stack([channel.hand_eye, further, channel.z + further @ values])
-        out.append(np.linalg.solve(half, stack))
-    everything = np.concatenate(out)
-    return everything[:, :6], everything[:, 6:-1], everything[:, -1]
+from stitch.statistics.least_squares import column_space
 
 
 def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Array:

@@ -6,30 +6,40 @@ integrated over amplitudes of plausible size, exceeds that of leaving it at zero
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import expit
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.statistics.identifiability import project_out
 
-# Log evidence that a group must add: 12 to 1, as a name must in the diagnosis.
-_GAIN = 2.5
+# Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
+_LOG_BAYES_FACTOR = 2.5
+# A parameter that these views know worse than this many times its plausible size stays at zero: it would
+# only borrow from the hand-eye.
+UNSEEN = 4.0
 
 
-def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequence[Sequence[int]],
-              effects: Sequence[int]) -> Array:  # fmt: skip
+@dataclass(frozen=True)
+class Whitened:
+    """An observation in units of its scatter."""
+
+    base: Array  # (N, a) columns of what is fitted in any case: hand-eye, landmarks
+    further: Array  # (N, P) columns per unit of the effects' parameters
+    z: Array  # (N,) what was seen, without the effects
+
+
+def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]], effects: Sequence[int]) -> Mask:
     """(P,) bool: parameters that are fitted; of every effect at least its best group.
 
     Args:
-        own: (N, a) whitened columns of the hand-eye, fitted in any case.
-        further: (N, P) whitened columns per unit of the parameters.
-        z: (N,) whitened observation without the effects.
         sizes: (P,) plausible sizes.
         groups: indices of parameters that stand or fall together; one may hold another.
         effects: number of the effect that each group belongs to.
     """
-    G, y = project_out(own, further * sizes), project_out(own, z[:, None])[:, 0]
+    G = project_out(whitened.base, whitened.further * sizes)
+    y = project_out(whitened.base, whitened.z[:, None])[:, 0]
     M, v = G.T @ G, G.T @ y
 
     def gain(chosen: Sequence[int]) -> float:
@@ -48,18 +58,18 @@ def supported(own: Array, further: Array, z: Array, sizes: Array, groups: Sequen
     return out
 
 
-def omitted_rms(own: Array, further: Array, z: Array, sizes: Array, fitted: Array) -> Array:
+def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask) -> Array:
     """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
 
     Each may be there or not, even odds before the views were asked: with probability π it has the mean μ and the
     sigma σ that they give it, so that its mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999).
 
     Args:
-        own, further, z, sizes: as in `supported`.
+        sizes: (P,) plausible sizes.
         fitted: (P,) bool.
     """
-    base = np.hstack([own, further[:, fitted]])
-    G, y = project_out(base, further * sizes), project_out(base, z[:, None])[:, 0]
+    base = np.hstack([whitened.base, whitened.further[:, fitted]])
+    G, y = project_out(base, whitened.further * sizes), project_out(base, whitened.z[:, None])[:, 0]
     told, pull = np.einsum("np,np->p", G, G), G.T @ y
     mean, variance = pull / (1 + told), 1 / (1 + told)
     gain = 0.5 * pull * mean - 0.5 * np.log1p(told)
@@ -72,11 +82,11 @@ def _forward_and_back(gain: Callable[[Sequence[int]], float], count: int) -> lis
     chosen: list[int] = []
     while len(chosen) < count:
         best = max((k for k in range(count) if k not in chosen), key=lambda k: gain([*chosen, k]))
-        if gain([*chosen, best]) - gain(chosen) < _GAIN:
+        if gain([*chosen, best]) - gain(chosen) < _LOG_BAYES_FACTOR:
             break
         chosen.append(best)
     for k in list(chosen):
         rest = [other for other in chosen if other != k]
-        if gain(chosen) - gain(rest) < _GAIN:
+        if gain(chosen) - gain(rest) < _LOG_BAYES_FACTOR:
             chosen = rest
     return chosen

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
-from stitch.observations.surfaces.gram import column_space
-from stitch.statistics.variance_components import FACTOR_SPREAD, Evidence, VarianceFit
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.variance_components import FACTOR_SPREAD, MixedModel, VarianceFit
 
 # More is as good as knowing it.
 _MANY = 1e4
@@ -33,11 +33,11 @@ class Satterthwaite:
         return float(min(2 / max(shares @ self.spread @ shares, 2 / _MANY), _MANY))
 
 
-def satterthwaite(evidence: Evidence, null: VarianceFit) -> Satterthwaite:
+def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     """From the fit without the columns that are asked for."""
-    half = np.linalg.inv(np.linalg.cholesky(evidence.covariance(null.variances)))
-    white = null.variances[:, None, None, None] * (half @ evidence.components @ half.transpose(0, 2, 1))
-    mean = half @ evidence.A
+    half = np.linalg.inv(np.linalg.cholesky(mixed.covariance(null.variances)))
+    white = null.variances[:, None, None, None] * (half @ mixed.components @ half.transpose(0, 2, 1))
+    mean = half @ mixed.A
     U = column_space(mean.reshape(-1, mean.shape[2])).reshape(*mean.shape[:2], -1)
     KU = white @ U
     within = np.einsum("bik,cbil->ckl", U, KU, optimize=True)

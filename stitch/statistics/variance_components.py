@@ -27,8 +27,8 @@ _FLAT, _FLAT_AMONG_MANY, MANY_NUMBERS = 1e-4, 0.1, 1_000
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What was seen: B blocks of m numbers."""
+class MixedModel:
+    """B blocks of m numbers that were seen, the columns of their mean and the components of their covariance."""
 
     z: Array  # (B, m)
     A: Array  # (B, m, a) columns of the free mean
@@ -58,7 +58,7 @@ class VarianceFit:
 
 
 def fit_variances(
-    evidence: Evidence, G: Array | None = None, prior: Array | None = None, start: Array | None = None,
+    mixed: MixedModel, G: Array | None = None, prior: Array | None = None, start: Array | None = None,
     both_starts: bool = False,
 ) -> VarianceFit:  # fmt: skip
     """Maximise over the three variances.
@@ -69,12 +69,12 @@ def fit_variances(
         start: (3,) variances to begin with; None starts from the spread of z.
         both_starts: also begin from noise alone, where the likelihood may have a second maximum.
     """
-    problem = _problem(evidence, G, prior)
-    guess = _guess(evidence) if start is None else start
+    problem = _problem(mixed, G, prior)
+    guess = _guess(mixed) if start is None else start
     first = np.log(np.maximum(guess, 1e-300))
     begin = [first, first + np.array([-9.0, -9.0, 0.0])] if both_starts else [first]
-    centre = np.log(_guess(evidence))
-    flat = _FLAT_AMONG_MANY if evidence.size > MANY_NUMBERS else _FLAT
+    centre = np.log(_guess(mixed))
+    flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else _FLAT
     bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
     fits = [
         minimize(_deviance, np.clip(s, *np.array(bounds).T), args=(problem,), jac=True, method="L-BFGS-B",
@@ -82,18 +82,18 @@ def fit_variances(
         for s in begin
     ]  # fmt: skip
     best = min(fits, key=lambda f: float(f.fun))
-    return at_variances(evidence, np.exp(best.x), G, prior)
+    return at_variances(mixed, np.exp(best.x), G, prior)
 
 
 def at_variances(
-    evidence: Evidence, variances: Array, G: Array | None = None, prior: Array | None = None
+    mixed: MixedModel, variances: Array, G: Array | None = None, prior: Array | None = None
 ) -> VarianceFit:
     """The same without searching: mean, covariance and deviance for given variances (3,)."""
-    problem = _problem(evidence, G, prior)
+    problem = _problem(mixed, G, prior)
     deviance, _ = _deviance(np.log(variances), problem)
-    V = evidence.covariance(variances)
+    V = mixed.covariance(variances)
     X = problem.X
-    weighted = np.linalg.solve(V, np.concatenate([X, evidence.z[..., None]], axis=2))
+    weighted = np.linalg.solve(V, np.concatenate([X, mixed.z[..., None]], axis=2))
     M = _summed(X, weighted[..., :-1]) + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
@@ -102,36 +102,41 @@ def at_variances(
     return VarianceFit(np.asarray(variances), deviance, mean, covariance)
 
 
+def whitener(mixed: MixedModel, variances: Array) -> Array:
+    """(B, m, m) inverse Cholesky factors of the blocks' covariance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(mixed.covariance(variances))))
+
+
 @dataclass(frozen=True)
 class _Problem:
-    evidence: Evidence
+    mixed: MixedModel
     X: Array  # (B, m, a + g)
     precision: Array  # (a + g,) of the prior
     offset: float  # log det of the prior covariance
 
 
-def _problem(evidence: Evidence, G: Array | None, prior: Array | None) -> _Problem:
-    a = evidence.A.shape[2]
+def _problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> _Problem:
+    a = mixed.A.shape[2]
     if G is None:
-        return _Problem(evidence, evidence.A, np.zeros(a), 0.0)
-    X = np.concatenate([evidence.A, G], axis=2)
+        return _Problem(mixed, mixed.A, np.zeros(a), 0.0)
+    X = np.concatenate([mixed.A, G], axis=2)
     if prior is None:
-        return _Problem(evidence, X, np.zeros(X.shape[2]), 0.0)
+        return _Problem(mixed, X, np.zeros(X.shape[2]), 0.0)
     precision = np.concatenate([np.zeros(a), 1 / prior**2])
-    return _Problem(evidence, X, precision, float(2 * np.log(prior).sum()))
+    return _Problem(mixed, X, precision, float(2 * np.log(prior).sum()))
 
 
-def _guess(evidence: Evidence) -> Array:
-    traces = np.einsum("cbii->c", evidence.components)
-    spread = float((evidence.z**2).sum()) or 1e-24
+def _guess(mixed: MixedModel) -> Array:
+    traces = np.einsum("cbii->c", mixed.components)
+    spread = float((mixed.z**2).sum()) or 1e-24
     return np.array([spread / max(traces[0], 1e-300), spread / max(traces[1], 1e-300), 1.0]) / [4.0, 4.0, 1.0]
 
 
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     variances = np.exp(log_variances)
-    evidence = problem.evidence
-    V = evidence.covariance(variances)
+    mixed = problem.mixed
+    V = mixed.covariance(variances)
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:
@@ -143,14 +148,14 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = _rows(WX).T @ evidence.z.ravel()
+    b = _rows(WX).T @ mixed.z.ravel()
     beta = half @ (half.T @ b)
-    rest = evidence.z - problem.X @ beta
+    rest = mixed.z - problem.X @ beta
     Wr = np.matmul(inverse, rest[..., None])
     WXh = WX @ half
     # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
     against = inverse - WXh @ WXh.transpose(0, 2, 1) - Wr @ Wr.transpose(0, 2, 1)
-    slope = variances * (evidence.components.reshape(len(variances), -1) @ against.ravel())
+    slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())

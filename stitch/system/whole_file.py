@@ -9,6 +9,8 @@ from pathlib import Path
 def whole(path: Path) -> Iterator[Path]:
     """A scratch file beside `path` that takes its place if the block succeeds, and goes if it fails."""
     scratch = path.with_name(f".{path.name}.new")
+    # One that a stranger has put there may be a link to elsewhere.
+    scratch.unlink(missing_ok=True)
     try:
         yield scratch
         scratch.replace(path)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.writing.json_file import rows_of_fields
 
 FORMAT = "stitch-diagnosis/1"
 
@@ -19,38 +20,42 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "residual_rms": d.residual_rms,
         "noise_floor": d.noise_floor,
         "repeatability": {"rotation": d.rotation, "translation": d.translation},
-        "candidates": [_candidate(d, s) for s in d.candidates] + [
-            {"effect": name, "p_value": None, "posterior": 0.0, "observable": False, "parameters": {},
-             "rms_if_added": None, "heldout_rms_if_added": None, "minimum_detectable": None, "aliases": [],
-             "needs": list(needs)}
-            for name, needs in d.missing.items()
+        "candidates": [
+            *(_candidate(d, c) for c in d.candidates),
+            *(_untested(name, needs) for name, needs in d.missing.items()),
         ],
-        "depends_on": [
-            {"covariate": x.covariate, "score": x.score, "p_value": x.p_value, "bins": x.bins.tolist(),
-             "mean": x.mean.tolist(), "sigma": x.sigma.tolist(), "shape": x.shape}
-            for x in d.depends_on
-        ],
-        "next": [
-            {"do": p.do, "separates": list(p.separates), "joints_deg": p.joints_deg, "views": p.views} for p in d.next
-        ],
-        "alias_matrix": {"effects": [s.name for s in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
+        "depends_on": rows_of_fields(d.depends_on, "covariate score p_value bins mean sigma shape"),
+        "next": rows_of_fields(d.next, "do separates joints_deg views"),
+        "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
         "notes": list(d.notes),
-        "views": d.evidence.measurement.views.count,
-        "evidence": d.evidence.evidence.size,
-    }  # fmt: skip
+        "views": d.linear.measurement.views.count,
+        "evidence": d.linear.mixed.size,
+    }
+
+
+def _untested(name: str, needs: tuple[str, ...]) -> dict[str, Any]:
+    """An effect that lacks what it needs."""
+    unknown = ("p_value", "rms_if_added", "heldout_rms_if_added", "minimum_detectable")
+    return {
+        "effect": name,
+        "posterior": 0.0,
+        "observable": False,
+        "parameters": {},
+        "aliases": [],
+        "needs": list(needs),
+        **dict.fromkeys(unknown),
+    }
 
 
 def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
-    r = candidate.ranked
-    s = r.score
-    values = {p.name: v for p, v in zip(s.candidate.parameters, s.form.term.values, strict=True) if p.grid}
-    kept = [p for p, k in zip(s.candidate.parameters, s.form.keep, strict=True) if k]
-    units = {p.name: p.unit for p in s.candidate.parameters}
-    parameters = {name: {"value": float(v), "sigma": None, "unit": units[name]} for name, v in values.items()}
-    if s.observable and np.isfinite(s.sigmas).all():
+    r, s, left_out = candidate.ranked, candidate.ranked.score, candidate.cross_validation
+    parameters: dict[str, Any] = {
+        p.name: {"value": p.value, "sigma": None, "unit": p.unit} for p in s.form.term.parameters if p.grid
+    }
+    if s.observable and s.fitted:
         parameters |= {
             p.name: {"value": float(v), "sigma": float(x), "unit": p.unit}
-            for p, v, x in zip(kept, s.values, s.sigmas, strict=True)
+            for p, v, x in zip(s.form.free, s.values, s.sigmas, strict=True)
         }
     detectable = {name: x for name, x in candidate.detectable.items() if np.isfinite(x)}
     return {
@@ -59,12 +64,8 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
         "posterior": r.posterior if s.observable else 0.0,
         "observable": s.observable,
         "parameters": parameters,
-        "rms_if_added": None
-        if candidate.cross_validation is None
-        else d.residual_rms * float(np.sqrt(candidate.cross_validation.inside)),
-        "heldout_rms_if_added": None
-        if candidate.cross_validation is None
-        else d.residual_rms * float(np.sqrt(candidate.cross_validation.heldout)),
+        "rms_if_added": None if left_out is None else d.residual_rms * float(np.sqrt(left_out.inside)),
+        "heldout_rms_if_added": None if left_out is None else d.residual_rms * float(np.sqrt(left_out.heldout)),
         # Of the parameter that these views know best against its plausible size; all below.
         "minimum_detectable": detectable.get(_clearest(candidate) or ""),
         "minimum_detectable_of": _clearest(candidate),

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch.measurement.session import View
-from stitch.model.model_toml import Model
-from stitch.model.terms import fitted_of
+from stitch.model.model_toml import ModelFile
 from stitch.runs.run import Run
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
@@ -15,12 +14,18 @@ FORMAT = "stitch-run/1"
 _VERSIONS = ("stitch", "numpy", "scipy", "open3d-cpu", "open3d", "pykdtree", "rerun-sdk", "kiss-icp", "trimesh")
 
 
-def model_of(run: Run) -> Model:
-    """The model that a run fitted."""
-    return Model(
-        run.session.length_unit, run.session.mount, run.T_mount, run.T_mount_coarse, run.mount_covariance,
-        fitted_of(run.measurement, run.terms, run.sigmas), run.effects_file, targets_of(run.labelled),
-    )  # fmt: skip
+def model_of(run: Run) -> ModelFile:
+    """The model that a run fitted, as model.toml states it."""
+    return ModelFile(
+        length_unit=run.session.length_unit,
+        mount=run.session.mount,
+        T_mount=run.T_mount,
+        T_mount_coarse=run.T_mount_coarse,
+        covariance=run.mount_covariance,
+        effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
+        effects_file=run.effects_file,
+        targets=targets_of(run.targets),
+    )
 
 
 def result_document(run: Run) -> dict[str, Any]:
@@ -36,6 +41,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "hand_eye": run.T_mount.tolist(),
         "hand_eye_coarse": run.T_mount_coarse.tolist(),
         "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
+        "hand_eye_covariance": run.mount_covariance.tolist(),
         "unobservable": list(run.unobservable),
         "stages": [
             {"name": s.name, "rms": s.rms, "correspondences": s.correspondences, "iterations": s.iterations,
@@ -47,8 +53,8 @@ def result_document(run: Run) -> dict[str, Any]:
         "noise_floor": run.noise_floor,
         "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
         "effects": {
-            name: {p: {"value": f.value, "sigma": f.sigma, "unit": f.unit} for p, f in fitted.items()}
-            for name, fitted in fitted_of(run.measurement, run.terms, run.sigmas).items()
+            term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
+            for term in run.terms
         },
         "views": [
             {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),
@@ -56,7 +62,7 @@ def result_document(run: Run) -> dict[str, Any]:
             for view, pose, correction, rms in zip(
                 run.session.views, run.poses, run.corrections, run.view_rms, strict=True)
         ],
-        "targets": target_rows(run.labelled),
+        "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,
         "verdict": run.verdict,

@@ -1,9 +1,6 @@
 """The run folder on disk: written whole or not at all."""
 
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -12,76 +9,52 @@ from typing import Any
 from stitch.errors import InputError
 from stitch.model.model_toml import write_model
 from stitch.runs.run import Run
+from stitch.system.whole_folder import claimed, rewritten
 from stitch.writing.json_file import write_json
 from stitch.writing.result_document import ledger, model_of, result_document
+from stitch.writing.run_contents import ours, require_free
 from stitch.writing.tables import write_cloud, write_residuals
-
-_SCRATCH = ".new"
-# What commands make of a model and no change of it makes anew, or not always.
-_OF_THE_MODEL = (
-    "diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recording.rrd", "robot.toml", "robot.urdf",
-)  # fmt: skip
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Iterator[Path]:
     """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
 
+    Of what stands there, only what a run wrote goes; a person's own files stay.
+
+    Args:
+        sessions: folders of the sessions that are run.
+        force: replace the run of other sessions too.
+
     Raises:
-        InputError: `path` holds something that is not a run, or holds the present folder.
+        InputError: `path` is no place for this run, or another process writes there.
     """
-    here = Path.cwd()
-    if path.resolve() in (here, *here.parents):
-        raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
-    if path.exists() and not _is_run(path):
-        raise InputError(f"{path}: exists and is not a run folder; name another with -o")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
+    require_free(path, sessions, force)
+    with rewritten(path, ours(path)) as scratch:
         yield scratch
-        _replace(scratch, path)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _is_run(path: Path) -> bool:
-    return path.is_dir() and ((path / "model.toml").is_file() or not any(path.iterdir()))
-
-
-def _replace(scratch: Path, path: Path) -> None:
-    # A folder cannot replace a full one in one step: the old run steps aside until the new one stands.
-    scratch.chmod(0o777 & ~_umask())
-    old = path.with_name(f".{path.name}.old-{os.getpid()}")
-    if path.exists():
-        path.rename(old)
-    scratch.rename(path)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 @contextmanager
 def changed(path: Path) -> Iterator[Path]:
-    """A scratch folder whose files take their place in a run folder if the block succeeds; it goes if it fails.
-
-    What else was made of the old model goes then too.
-    """
-    scratch = path / _SCRATCH
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir()
-    try:
+    """A scratch folder whose files take the place of all that was made of the old model if the block succeeds."""
+    with rewritten(path, ours(path)) as scratch:
         yield scratch
-        for stale in _OF_THE_MODEL:
-            (path / stale).unlink(missing_ok=True)
-        shutil.rmtree(path / "pictures", ignore_errors=True)
-        for file in sorted(scratch.iterdir()):
-            file.replace(path / file.name)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Hold a run folder as its only writer, from reading it to writing into it.
+
+    Raises:
+        InputError: another process writes there, or its folder of pictures is a link to elsewhere.
+    """
+    if not path.parent.is_dir():
+        yield
+        return
+    with claimed(path):
+        if (path / "pictures").is_symlink():
+            raise InputError(f"{path}/pictures: is a link, and pictures would be written where it points; remove it")
+        yield
 
 
 def extend(group: str, *arguments: Any) -> None:

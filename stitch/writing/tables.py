@@ -43,8 +43,8 @@ def write_residuals(run: Run, path: Path) -> None:
     of_views = {key for view in session.views for key in view.covariates}
     of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}
     parts = [] if run.overlaps is None else [_columns(session, m, of_views, of_points) for m in run.overlaps.matches]
-    if run.labelled is not None:
-        parts.append(residual_columns(run.labelled, session))
+    if run.targets is not None:
+        parts.append(residual_columns(run.targets, session))
     # Beside clouds, labelled points have the columns of these.
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if all(key in p for p in parts)}
     arrays = {

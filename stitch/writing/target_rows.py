@@ -8,19 +8,17 @@ import numpy as np
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.model.model_toml import Target
+from stitch.model.model import Target
+from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import Run
-from stitch.stages.target_fit import LabelledFit
 
 
-def targets_of(found: LabelledFit | None) -> dict[str, Target]:
+def targets_of(found: TargetFit | None) -> dict[str, Target]:
     """The targets that were seen, for model.toml."""
     if found is None:
         return {}
-    sightings = found.rows.capture.sightings
-    assert sightings is not None
-    K = len(sightings.targets)
-    sigma = np.sqrt(np.maximum(np.diag(found.landmarks_covariance)[: 3 * K], 0)).reshape(K, 3)
+    sightings = found.rows.sightings
+    sigma = found.landmark_sigmas
     return {
         name: Target(found.landmarks.positions[k], sigma[k], found.landmarks.orientation)
         for k, name in enumerate(sightings.targets)
@@ -28,13 +26,12 @@ def targets_of(found: LabelledFit | None) -> dict[str, Target]:
     }
 
 
-def target_rows(found: LabelledFit | None) -> list[dict[str, Any]]:
+def target_rows(found: TargetFit | None) -> list[dict[str, Any]]:
     """The list `targets` of result.json, reference frame."""
     targets = targets_of(found)
     if found is None:
         return []
-    sightings = found.rows.capture.sightings
-    assert sightings is not None
+    sightings = found.rows.sightings
     seen = dict(zip(sightings.targets, sightings.seen, strict=True))
     return [
         {"target": name, "position": t.position.tolist(), "sigma": t.sigma.tolist(), "seen": int(seen[name])}
@@ -45,9 +42,9 @@ def target_rows(found: LabelledFit | None) -> list[dict[str, Any]]:
 
 def labelled_facts(run: Run) -> dict[str, Any]:
     """What the rms of a run on labelled points counts, the errors left out and inside, and the outliers."""
-    if run.labelled is None:
+    if run.targets is None:
         return {}
-    rows = run.labelled.rows
+    rows = run.targets.rows
     facts = {
         "position_error": _sizes(rows.distances(rows.residual)),
         "outliers": [
@@ -60,7 +57,7 @@ def labelled_facts(run: Run) -> dict[str, Any]:
         return facts | {"cloud_noise_factor": run.measurement.capture.noise_factor}
     return facts | {
         "rms_of": "3D distances of the targets from their place",
-        "heldout_position_error": _sizes(run.labelled.heldout),
+        "heldout_position_error": _sizes(run.targets.heldout),
     }
 
 
@@ -69,10 +66,9 @@ def _sizes(distances: Array) -> dict[str, float]:
     return {"mean": float(d.mean()), "median": float(np.median(d)), "max": float(d.max())}
 
 
-def residual_columns(found: LabelledFit, session: Session) -> dict[str, Array]:
+def residual_columns(found: TargetFit, session: Session) -> dict[str, Array]:
     """Columns of residuals.parquet, a row per target and view: `partner` is the target, `residual` the 3D distance."""
-    rows, s = found.rows, found.rows.capture.sightings
-    assert s is not None
+    rows, s = found.rows, found.rows.sightings
     v, slot = np.nonzero(s.used)
     left = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
     names = np.array([view.name for view in session.views])

@@ -9,10 +9,10 @@ from stitch.cells.base_to_base.contradiction import compare_distances
 from stitch.cells.base_to_base.report import LIMIT, BaseResult, describe
 from stitch.cells.base_to_base.stand import Stand
 from stitch.frames import Array
+from stitch.units import MICROMETRES
 from viz.cells import stage
 from viz.cells.base_to_base_figures import contradictions, plan, rods
 from viz.cells.page import Page, Picture, Table, write
-from viz.units import to_millimetres
 
 
 def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
@@ -42,7 +42,7 @@ _PLAN = (
 
 def sentence(stand: Stand, result: BaseResult) -> str:
     """Where base 2 stands, and how well that is known."""
-    T, sigma, mm = result.fit.T_base1_base2, result.fit.sigma, to_millimetres(stand.length_unit)
+    T, sigma, mm = result.fit.T_base1_base2, result.fit.sigma, MICROMETRES[stand.length_unit] / 1e3
     x, y, z = T[:3, 3]
     turn = np.degrees(np.linalg.norm(frames.log(T)[:3]))
     return (

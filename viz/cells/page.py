@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
-from viz.report import png, svg
+from viz.page_parts import png, render, svg
 
 # Beyond so many marks a drawing of lines is larger than one of pixels.
 _PIXELS = 130
@@ -51,6 +50,4 @@ class Page:
 
 def write(page: Page, path: Path) -> None:
     """Render the page."""
-    environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
-    text = environment.get_template("cell.html.j2").render(page=page, version=version("stitch"))
-    path.write_text(text, encoding="utf-8")
+    path.write_text(render("cell.html.j2", page=page, version=version("stitch")), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Views that nobody has taken yet, and how they would answer to a model and to two suspects."""
+"""Views that nobody has taken yet, and how they would answer to a model and to two candidate effects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,74 +7,78 @@ from typing import Any
 import numpy as np
 
 from stitch import frames
-from stitch.diagnosis.candidates import with_values
 from stitch.diagnosis.design.candidate_targets import candidate_rows
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.views import torques_of
-from stitch.model.forward import placed
+from stitch.model.forward import moves_points, perturbed_frames
 from stitch.model.jacobian import twists
-from stitch.observations.surfaces.point_effects import POINTS
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
-from stitch.observations.targets.target_evidence import TargetEvidence
+from stitch.model.model import Model
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.observations.targets.target_model import Targets
 
 _SAMPLES = 6000
 _TRIED = 250
 _SPREAD = np.radians(40.0)  # about joint angles that were driven before
 _LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they were beyond already
+# A view may see the part by this share of its distance farther off than any before, and turned by so much.
+_MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
 
 @dataclass(frozen=True)
 class CandidateViews:
-    """K views with m numbers each, in the units of the evidence before whitening."""
+    """K views with m numbers each, before whitening."""
 
     joints: Array  # (K, n) rad
-    model: Array  # (K, m, a) per column of the model
-    a: Array  # (K, m, p) per free parameter of one suspect
+    design: Array  # (K, m, a) per column of the model
+    a: Array  # (K, m, p) per free parameter of one effect
     b: Array  # (K, m, q) of the other
     half: Array  # (K, m, m) Cholesky factors of the scatter of one view
 
 
-def candidate_poses(evidence: PoseEvidence, a: Score, b: Score) -> CandidateViews | None:
-    """Poses in which the scanner would see the part about as it has before; None if poses cannot show the suspects."""
-    if a.candidate.effect.place in POINTS or b.candidate.effect.place in POINTS:
+def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> CandidateViews | None:
+    """Poses in which the scanner would see the part about as it has before; None if poses cannot show the effects."""
+    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
+    joints = _reachable(linear, seen)
+    if moves_points(zero) or not len(joints):
         return None
-    joints = _reachable(evidence)
-    if not len(joints):
-        return None
-    measurement = candidate_measurement(evidence.measurement, joints)
-    carrier = placed(measurement, ())[0] @ evidence.T_mount
-    own = frames.adjoint(frames.make(np.eye(3), -evidence.freed.overlaps.gram.centre) @ carrier)
-    extra = np.zeros((len(joints), 6, evidence.white_model.shape[1] - 6))
-    model, of_a, of_b = (
-        np.concatenate([own, extra], axis=2),
-        _rows(evidence, measurement, a),
-        _rows(evidence, measurement, b),
-    )
-    return CandidateViews(joints, model, of_a, of_b, _view_scatter(evidence, measurement))
+    measurement, bare = candidate_measurement(linear.measurement, joints), Model(linear.model.T_mount)
+    centre = seen.freed.overlaps.gram.centre
+    to_centre = frames.make(np.eye(3), -centre)
+    own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
+    extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
+    found = [twists(measurement, bare, term, centre) for term in zero]
+    of_a, of_b = (c[s.form.keep].transpose(1, 2, 0) for c, s in zip(found, (a, b), strict=True))
+    half = _view_scatter(linear, measurement, to_centre)
+    return CandidateViews(joints, np.concatenate([own, extra], axis=2), of_a, of_b, half)
 
 
-def candidate_targets(evidence: TargetEvidence, a: Score, b: Score) -> CandidateViews:
+def _of_targets(linear: LinearModel, seen: Targets, a: Score, b: Score) -> CandidateViews:
     """Poses near those driven, in which all targets are seen."""
-    joints = nearby(evidence.measurement)[:_TRIED]
-    measurement = candidate_measurement(evidence.measurement, joints)
-    terms = [with_values(s.form, np.zeros(len(s.values))) for s in (a, b)]
-    rows, columns, covariance = candidate_rows(
-        measurement, evidence.rows, evidence.landmarks, evidence.null.variances, terms
-    )
-    extra = np.zeros((*rows.residual.shape, evidence.model.shape[1] - 6 - rows.landmarks.shape[2]))
-    model = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
-    free = [c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True)]
-    return CandidateViews(joints, model, free[0], free[1], np.asarray(np.linalg.cholesky(covariance), float))
+    joints = nearby(linear.measurement)[:_TRIED]
+    measurement = candidate_measurement(linear.measurement, joints)
+    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
+    rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, linear.null.variances, zero)
+    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
+    design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
+    of_a, of_b = (c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True))
+    return CandidateViews(joints, design, of_a, of_b, np.asarray(np.linalg.cholesky(covariance), float))
 
 
-# The two kinds of evidence, and how each imagines a view.
-CANDIDATES: dict[type, Callable[[Any, Score, Score], CandidateViews | None]] = {
-    PoseEvidence: candidate_poses,
-    TargetEvidence: candidate_targets,
+# What was observed, and how it would look in a further view; nothing is proposed for what is not in here.
+_OF: dict[type, Callable[[LinearModel, Any, Score, Score], CandidateViews | None]] = {
+    Surfaces: _of_surfaces,
+    Targets: _of_targets,
 }
+
+
+def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews | None:
+    """Further views of a session for two effects; None if no pose can show them."""
+    of = _OF.get(type(linear.observation))
+    return None if of is None else of(linear, linear.observation, a, b)
 
 
 def nearby(measurement: Measurement) -> Array:
@@ -86,59 +90,52 @@ def nearby(measurement: Measurement) -> Array:
     return np.asarray(joints[(np.abs(joints) < limit).all(axis=1)])
 
 
-def _rows(evidence: PoseEvidence, measurement: Measurement, scored: Score) -> Array:
-    """(K, 6, p) twists of imagined views per unit of the form's free parameters."""
-    term = with_values(scored.form, np.zeros(len(scored.values)))
-    found = twists(measurement, (), term, evidence.T_mount, evidence.freed.overlaps.gram.centre)
-    return np.asarray(found[scored.form.keep].transpose(1, 2, 0))
-
-
-def _reachable(evidence: PoseEvidence) -> Array:
+def _reachable(linear: LinearModel, seen: Surfaces) -> Array:
     """(K, n) joint angles in which the scanner sees the part about as it has before."""
-    measurement = evidence.measurement
+    measurement, T_mount = linear.measurement, linear.model.T_mount
     assert measurement.robot is not None
     joints = nearby(measurement)
     T = kinematics.forward(measurement.robot, joints)
-    poses = (frames.inverse(T) if measurement.eye_to_hand else T) @ evidence.T_mount
-    centre = evidence.freed.overlaps.gram.centre[None]
+    poses = (frames.inverse(T) if measurement.eye_to_hand else T) @ T_mount
+    centre = seen.freed.overlaps.gram.centre[None]
     place = frames.transform(frames.inverse(poses), centre)[:, 0]
-    before = frames.transform(frames.inverse(evidence.capture.poses(evidence.T_mount)), centre)[:, 0]
-    margin = 0.15 * np.linalg.norm(before, axis=1).mean()
+    before = frames.transform(frames.inverse(seen.capture.poses(T_mount)), centre)[:, 0]
+    margin = _MARGIN * np.linalg.norm(before, axis=1).mean()
     inside = ((place > before.min(axis=0) - margin) & (place < before.max(axis=0) + margin)).all(axis=1)
     # A view direction far from all others would share no surface with them.
-    towards, known = poses[:, :3, 2], evidence.capture.poses(evidence.T_mount)[:, :3, 2]
-    inside &= (towards @ known.T).max(axis=1) > np.cos(np.radians(50.0))
+    towards, known = poses[:, :3, 2], seen.capture.poses(T_mount)[:, :3, 2]
+    inside &= (towards @ known.T).max(axis=1) > _TURNED
     return np.asarray(joints[inside][:_TRIED])
 
 
 def candidate_measurement(measurement: Measurement, joints: Array) -> Measurement:
-    """The chain with views that nobody has taken yet, right after the last one, each approached from there."""
+    """The measurement with views that nobody has taken yet, right after the last one, each approached from there."""
     assert measurement.robot is not None
     views, count = measurement.views, len(joints)
     last = np.repeat(views.joints[-1:], count, axis=0)
     torques = torques_of(measurement.robot, np.vstack([joints, views.joints]))
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
+    # They would be taken at rest.
+    velocity = None if views.velocity is None else np.zeros_like(joints)
     candidate = replace(
-        views, count=count, joints=joints, previous=last, approach=np.sign(joints - last),
-        # They would be taken at rest.
-        time=np.full(count, views.time[-1] + pause), velocity=None if views.velocity is None else np.zeros_like(joints),
+        views,
+        count=count,
+        joints=joints,
+        previous=last,
+        approach=np.sign(joints - last),
+        time=np.full(count, views.time[-1] + pause),
+        velocity=velocity,
         torques=replace(torques, values=torques.values[:count]),
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
         number=np.full(count, views.number[-1] + 1),
-    )  # fmt: skip
-    return replace(
-        measurement, views=candidate, T_base_flange=kinematics.forward(measurement.robot, joints), scan_views=()
     )
+    T_base_flange = kinematics.forward(measurement.robot, joints)
+    return replace(measurement, views=candidate, T_base_flange=T_base_flange, scan_views=())
 
 
-def _view_scatter(evidence: PoseEvidence, measurement: Measurement) -> Array:
+def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Array) -> Array:
     """(K, 6, 6) Cholesky factors of the pose scatter of one view about the centre."""
-    to_centre = frames.make(np.eye(3), -evidence.freed.overlaps.gram.centre)
-    T = (
-        np.broadcast_to(np.eye(4), measurement.T_base_flange.shape)
-        if measurement.eye_to_hand
-        else measurement.T_base_flange
-    )
-    carried = frames.adjoint(to_centre @ T)
-    variances = np.repeat(np.maximum(evidence.null.variances[:2], 1e-300), 3)
+    T = measurement.T_base_flange
+    carried = frames.adjoint(to_centre @ (np.broadcast_to(np.eye(4), T.shape) if measurement.eye_to_hand else T))
+    variances = np.repeat(np.maximum(linear.null.variances[:2], 1e-300), 3)
     return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))

@@ -1,4 +1,4 @@
-"""What to measure next: the pose that separates two suspects best, or the artefact that does.
+"""What to measure next: the pose that separates two candidate effects best, or the artefact that does.
 
 Two effects a and b are told apart by what of a's pattern b cannot imitate: λ = |y_a − best of b|² in units
 of the scatter. A further view adds six rows to both patterns; among poses that the arm can take and in which
@@ -10,17 +10,15 @@ from itertools import combinations
 
 import numpy as np
 
-from stitch.diagnosis.design.candidate_views import CANDIDATES
+from stitch.diagnosis.design.candidate_views import candidate_views
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.select import Selection
-from stitch.diagnosis.sensitivity.aliases import SIMILAR, alias_matrix
+from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.sensitivity.aliases import alias_matrix
+from stitch.diagnosis.thresholds import SIMILAR, TOLD_APART
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
-from stitch.observations.evidence import ViewEvidence
-
-# P(correct) = Φ(√(λ/2)) = 0.95.
-_ENOUGH = 5.4
+from stitch.observations.linear_model import LinearModel
 
 ARTEFACTS = {
     "range_scale": "scan a sphere or ball bar of known size, or the part's CAD: overlaps alone hardly show a scale",
@@ -54,12 +52,12 @@ class Proposal:
     views: int | None = None  # how many such views are needed
 
 
-def propose(evidence: ViewEvidence, selection: Selection) -> list[Proposal]:
-    """What would tell the named group apart; without a group, the clearest suspect from what resembles it."""
-    group = _group(evidence, selection)
+def propose(linear: LinearModel, selection: Selection) -> list[Proposal]:
+    """What would tell the named group apart; without a group, the clearest candidate from what resembles it."""
+    group = _group(linear, selection)
     names = tuple(score.name for score in group)
     artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
-    found = _best_pose(evidence, group) if _can_move(evidence.measurement) else None
+    found = _best_pose(linear, group) if _can_move(linear.measurement) else None
     if found is None:
         return artefacts
     joints, count, separated = found
@@ -69,16 +67,16 @@ def propose(evidence: ViewEvidence, selection: Selection) -> list[Proposal]:
     return [pose, *artefacts]
 
 
-def _group(evidence: ViewEvidence, selection: Selection) -> list[Score]:
-    """What to separate: the group that was named, or the best suspect and its nearest alias; else nothing."""
+def _group(linear: LinearModel, selection: Selection) -> list[Score]:
+    """What to separate: the group that was named, or the best candidate and its nearest alias; else nothing."""
     if len(selection.named) > 1:
         return [r.score for r in selection.named]
-    seen = [r for r in selection.ranked if r.score.observable and np.isfinite(r.score.sigmas).all()][:6]
+    seen = [r for r in selection.ranked if r.score.observable and r.score.fitted][:6]
     if selection.verdict == "adequate" or len(seen) < 2:
         return []
     first: Ranked = selection.named[0] if selection.named else seen[0]
     others = [r.score for r in seen if r.name != first.name]
-    row = alias_matrix(evidence, [first.score, *others])[0, 1:]
+    row = alias_matrix(linear, [first.score, *others])[0, 1:]
     return [first.score, others[int(row.argmax())]] if row.max() > SIMILAR else []
 
 
@@ -86,43 +84,43 @@ def _can_move(measurement: Measurement) -> bool:
     return measurement.robot is not None and measurement.views.joints.shape[1] > 0
 
 
-def _best_pose(evidence: ViewEvidence, group: list[Score]) -> tuple[Array, int, tuple[str, ...]] | None:
-    """Joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and whom
+def _best_pose(linear: LinearModel, group: list[Score]) -> tuple[Array, int, tuple[str, ...]] | None:
+    """Joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and what
     they separate; None if poses cannot separate anything.
     """
-    pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(evidence, a, b))]
-    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * _ENOUGH]
+    pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(linear, a, b))]
+    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * TOLD_APART]
     if not pairs:
         return None
     k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())
-    counts = [np.ceil(max(_ENOUGH - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
+    counts = [np.ceil(max(TOLD_APART - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
     separated = dict.fromkeys(score.name for score in group if any(score.name in names for _, names in pairs))
     return np.degrees(pairs[0][0].joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
 
 
 @dataclass(frozen=True)
 class _Gains:
-    """How much apart two suspects are, and how much each of K views would add to it."""
+    """How much apart two candidate effects are, and how much each of K views would add to it."""
 
     known: float
-    joints: Array  # (K, n) rad, the same for every two suspects
+    joints: Array  # (K, n) rad, the same for every two candidate effects
     of_views: Array  # (K,)
 
 
-def _gains(evidence: ViewEvidence, a: Score, b: Score) -> _Gains | None:
-    """None if poses cannot show the suspects."""
-    candidate = CANDIDATES[type(evidence)](evidence, a, b)
+def _gains(linear: LinearModel, a: Score, b: Score) -> _Gains | None:
+    """None if poses cannot show the effects."""
+    candidate = candidate_views(linear, a, b)
     if candidate is None or not len(candidate.joints):
         return None
     # What is known already, as normal equations of [hand-eye and model | b] against a's pattern.
-    X = np.hstack([evidence.white_model, evidence.whiten_raw(b.form.columns) * b.form.sizes])
-    y = evidence.whiten_raw(a.form.columns) @ a.values
-    ridge = np.diag(np.concatenate([np.zeros(evidence.white_model.shape[1]), np.full(len(b.form.sizes), 0.01)]))
+    X = np.hstack([linear.white_design, linear.whiten(b.form.columns) * b.form.sizes])
+    y = linear.whiten(a.form.columns) @ a.values
+    ridge = np.diag(np.concatenate([np.zeros(linear.white_design.shape[1]), np.full(len(b.form.sizes), 0.01)]))
     M, c, square = X.T @ X + ridge, X.T @ y, float(y @ y)
     known = square - float(c @ np.linalg.lstsq(M, c, rcond=1e-12)[0])
     gains = []
     for k in range(len(candidate.joints)):
-        base = np.hstack([candidate.model[k], candidate.b[k] * b.form.sizes])
+        base = np.hstack([candidate.design[k], candidate.b[k] * b.form.sizes])
         Xn, yn = (np.linalg.solve(candidate.half[k], v) for v in (base, candidate.a[k] @ a.values))
         cn = c + Xn.T @ yn
         gains.append(square + float(yn @ yn) - float(cn @ np.linalg.lstsq(M + Xn.T @ Xn, cn, rcond=1e-12)[0]) - known)

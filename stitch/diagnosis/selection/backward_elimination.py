@@ -1,17 +1,14 @@
 """Whether the effects of a model still hold their place beside each other."""
 
 from collections.abc import Collection
-from dataclasses import replace
 
 from stitch.diagnosis.candidates import as_fitted
-from stitch.diagnosis.initial_values import evidence_of_state
-from stitch.diagnosis.selection.ranking import certain, rank, score_all
+from stitch.diagnosis.selection.ranking import certain, ranked_one
+from stitch.diagnosis.thresholds import WORTH
 from stitch.diagnosis.validation.cross_validation import cross_validate
-from stitch.measurement.measurement import Term
-from stitch.stored.load_state import State
-
-# An effect that shortens the distances by less than a hundredth is not worth its place in a model.
-_WORTH = 0.99**2
+from stitch.model.term import Term
+from stitch.observations.linearise import linearise
+from stitch.runs.state import State
 
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
@@ -20,26 +17,27 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
     Args:
         names: effects of the model that may go.
     """
-    asked = [_doubt(state, term) for term in state.terms if term.effect.name in names]
-    failing = [(gain, name, reason) for gain, name, reason in asked if reason is not None]
+    asked = [(term.name, *_objection(state, term)) for term in state.model.terms if term.name in names]
+    failing = [(factor, name, reason) for name, factor, reason in asked if reason is not None]
     if not failing:
         return None
     _, name, reason = min(failing)
     return name, reason
 
 
-def _doubt(state: State, term: Term) -> tuple[float, str, str | None]:
-    """Log evidence of an effect beside the others, its name, and why it should go, if it should."""
-    name = term.effect.name
-    evidence = evidence_of_state(replace(state, terms=tuple(t for t in state.terms if t is not term)))
-    candidate = as_fitted(evidence, term)
+def _objection(state: State, term: Term) -> tuple[float, str | None]:
+    """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
+    name = term.name
+    linear = linearise(state.measurement, state.model.without(name), state.gate, state.session.nominal)
+    candidate = as_fitted(linear, term)
     if not candidate.forms[0].keep.any():
-        return 0.0, name, f"{name} is not seen beside the others"
-    own = rank(score_all(evidence, [candidate]))[0][0]
+        return 0.0, f"{name} is not seen beside the others"
+    own = ranked_one(linear, candidate, tests=1)
+    factor = own.score.log_bayes_factor
     if not certain(own):
-        return own.score.gain, name, f"{name} explains too little beside the others"
-    left = cross_validate(evidence, own.score, None)
-    if not left.helps or left.poses > _WORTH:
-        share = f"{left.poses:.3f} ± {left.poses_sigma:.3f}"
-        return own.score.gain, name, f"{name} hardly helps on views left out (mean square error {share} of without)"
-    return own.score.gain, name, None
+        return factor, f"{name} explains too little beside the others"
+    left_out = cross_validate(linear, own.score)
+    if not left_out.helps or left_out.poses > WORTH:
+        share = f"{left_out.poses:.3f} ± {left_out.poses_sigma:.3f}"
+        return factor, f"{name} hardly helps on views left out (mean square error {share} of without)"
+    return factor, None

@@ -1,4 +1,4 @@
-"""Candidates in the order of their evidence, and which of them are enough for a name."""
+"""Candidates in the order of their log Bayes factor, and which of them are enough for a name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +8,14 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.selection.thresholds import ALPHA_NAME, GAIN
-from stitch.observations.evidence import ViewEvidence
-
-# Prior shares: nothing is missing, one effect of the library, something without a name.
-_NOTHING, PHYSICAL, _UNKNOWN = 0.5, 0.45, 0.05
+from stitch.diagnosis.thresholds import (
+    ALPHA_NAME,
+    LOG_BAYES_FACTOR,
+    PRIOR_NOTHING,
+    PRIOR_PHYSICAL,
+    PRIOR_UNKNOWN,
+)
+from stitch.observations.linear_model import LinearModel
 
 
 @dataclass(frozen=True)
@@ -26,46 +29,60 @@ class Ranked:
 
     @property
     def name(self) -> str:
+        """That of the effect."""
         return self.score.name
 
     @property
     def physical(self) -> bool:
-        return self.score.candidate.effect.tier != "empirical"
+        """True for an effect of the library or a user's own; False for a shape without a cause."""
+        return not self.score.candidate.empirical
 
 
-def score_all(evidence: ViewEvidence, candidates: Sequence[Candidate]) -> list[Score]:
-    """Scores in the order of the candidates."""
-    return [score(evidence, c) for c in candidates]
+def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
+    """Physical and empirical candidates, best first; posterior shares among all and nothing.
 
-
-def rank(scores: Sequence[Score]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
-    """Physical and empirical candidates, best first; posterior shares among all and nothing."""
-    known = [s for s in scores if s.candidate.effect.tier != "empirical"]
-    other = [s for s in scores if s.candidate.effect.tier == "empirical" and s.observable]
-    seen = max(sum(s.observable for s in known), 1)
-    weights = [(s, PHYSICAL / seen, seen) for s in known] + [(s, _UNKNOWN / len(other), len(other)) for s in other]
-    logs = [s.gain + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
-    total = float(logsumexp([*logs, np.log(_NOTHING)]))
+    Args:
+        tests: physical candidates among which these were chosen, scored here or not: all of them count in the
+            family-wise p-value and share the prior.
+    """
+    known = [s for s in scores if not s.candidate.empirical]
+    other = [s for s in scores if s.candidate.empirical and s.observable]
+    tests = max(tests, 1)
+    weights = [(s, PRIOR_PHYSICAL / tests, tests) for s in known]
+    weights += [(s, PRIOR_UNKNOWN / len(other), len(other)) for s in other]
+    logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
+    total = float(logsumexp([*logs, np.log(PRIOR_NOTHING)]))
     out = [
-        Ranked(s, min(1.0, s.p_value * tests), log, float(np.exp(log - total)))
-        for (s, _, tests), log in zip(weights, logs, strict=True)
+        Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)))
+        for (s, _, family), log in zip(weights, logs, strict=True)
     ]
-    # Sorted by evidence; where there is none to tell them, by name, so that the order of a list decides nothing.
+    # Where there is nothing to tell them apart, by name, so that the order of a list decides nothing.
     out.sort(key=lambda r: (not r.score.observable, -round(r.log_posterior, 6) if r.score.observable else 0.0, r.name))
     return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
+
+
+def ranked_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
+    """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
+    scores = [score(linear, c) for c in candidates]
+    return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
+
+
+def ranked_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:
+    """One candidate that was chosen among so many."""
+    return rank([score(linear, candidate)], tests)[0][0]
 
 
 def contends(r: Ranked) -> bool:
     """Significant, more likely than nothing, seen, and of a size that somebody would believe.
 
-    Both are asked for: a p-value forgets how little a small effect of many parameters explains, the evidence
+    Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
     does not know how many were tried.
     """
-    kept = [p for p, k in zip(r.score.candidate.parameters, r.score.form.keep, strict=True) if k]
-    believable = all(abs(v) < p.limit for v, p in zip(r.score.values, kept, strict=True))
-    return r.physical and r.score.observable and r.adjusted < ALPHA_NAME and r.score.gain > 0 and believable
+    s = r.score
+    believable = all(abs(v) < p.limit for v, p in zip(s.values, s.form.free, strict=True))
+    return r.physical and s.observable and r.adjusted < ALPHA_NAME and s.log_bayes_factor > 0 and believable
 
 
 def certain(r: Ranked) -> bool:
     """Enough for an alarm."""
-    return contends(r) and r.score.gain > GAIN
+    return contends(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR

@@ -7,9 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
-from stitch.observations.evidence import ViewEvidence
-
-SIMILAR = 0.9
+from stitch.observations.linear_model import LinearModel
 
 
 @dataclass(frozen=True)
@@ -20,9 +18,9 @@ class Alias:
     correlation: float  # of this one's fitted pattern with the best that the other can do
 
 
-def pattern(evidence: ViewEvidence, scored: Score) -> Array:
+def pattern(linear: LinearModel, scored: Score) -> Array:
     """(n,) what the fitted candidate does to the views, in units of their scatter."""
-    white = evidence.whiten_channel(scored.form.columns)
+    white = linear.residual(scored.form.columns)
     if np.any(scored.values):
         return np.asarray(white @ scored.values)
     # Nothing fitted: the most visible combination of plausible size.
@@ -30,13 +28,13 @@ def pattern(evidence: ViewEvidence, scored: Score) -> Array:
     return np.asarray(U[:, 0] * s[0])
 
 
-def alias_matrix(evidence: ViewEvidence, scores: Sequence[Score]) -> Array:
+def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     """(K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
 
     The other effect may use all its parameters, but none beyond ten times its plausible size.
     """
-    patterns = [pattern(evidence, s) for s in scores]
-    whites = [evidence.whiten(s.candidate.twists)[:, s.candidate.forms[0].keep] for s in scores]
+    patterns = [pattern(linear, s) for s in scores]
+    whites = [linear.residual(s.candidate.forms[0].columns) for s in scores]
     out = np.eye(len(scores))
     for i, y in enumerate(patterns):
         for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):

@@ -7,6 +7,7 @@ p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -15,9 +16,9 @@ from scipy.stats import ncf
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import form_weights
-from stitch.diagnosis.selection.thresholds import ALPHA_NAME, GAIN, POWER
+from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
 from stitch.frames import Array
-from stitch.observations.evidence import ViewEvidence
+from stitch.observations.linear_model import LinearModel
 
 
 def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degrees_of_freedom: float) -> float:
@@ -35,40 +36,42 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degr
     if rank == 0:
         return float("inf")
     by_p = rank * float(f_distribution.isf(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1)))
-    evidence = GAIN - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
-    needed = max(by_p, degrees_of_freedom * float(np.expm1(2 * evidence / degrees_of_freedom)))
+    factor = LOG_BAYES_FACTOR - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
+    needed = max(by_p, degrees_of_freedom * float(np.expm1(2 * factor / degrees_of_freedom)))
     return float(
         brentq(lambda size: ncf.sf(needed / rank, rank, degrees_of_freedom, size) - POWER, 1e-9, 9 * needed + 99)
     )
 
 
-def smallest_detectable(evidence: ViewEvidence, candidate: Candidate, tests: int) -> dict[str, float]:
+@dataclass(frozen=True)
+class Shown:
+    """What the views show of one form of a candidate."""
+
+    names: tuple[str, ...]  # of its free parameters (p,)
+    white: Array  # (n, p) whitened columns per unit
+    sizes: Array  # (p,) plausible ones
+    weight: float  # share of the candidate's prior
+    degrees_of_freedom: float  # of the scatter along the columns
+
+
+def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
     """Smallest detectable size of every free parameter of a candidate among so many."""
-    told = []
+    shown = []
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        names = tuple(p.name for p, keep in zip(candidate.parameters, form.keep, strict=True) if keep)
-        white = evidence.whiten_channel(form.columns)
-        told.append(
-            (names, white, form.sizes, float(weight), evidence.degrees_of_freedom.of(evidence.in_blocks(white)))
-        )
-    e = evidence.evidence
-    return smallest_sizes(told, tests, e.size - e.A.shape[2] - int(candidate.forms[0].keep.sum()))
+        white = linear.residual(form.columns)
+        known = linear.satterthwaite.of(linear.in_blocks(white))
+        shown.append(Shown(tuple(p.name for p in form.free), white, form.sizes, float(weight), known))
+    mixed = linear.mixed
+    return smallest_sizes(shown, tests, mixed.size - mixed.A.shape[2] - int(candidate.forms[0].keep.sum()))
 
 
-def smallest_sizes(
-    forms: Sequence[tuple[tuple[str, ...], Array, Array, float, float]], tests: int, rest: int
-) -> dict[str, float]:
-    """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best.
-
-    Args:
-        forms: names of the parameters (p,), their whitened columns (n, p) per unit, plausible sizes (p,), weight,
-            degrees of freedom of the scatter along them.
-    """
+def smallest_sizes(forms: Sequence[Shown], tests: int, rest: int) -> dict[str, float]:
+    """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
-    for names, white, sizes, weight, degrees_of_freedom in forms:
-        least = least_noncentrality(white * sizes, weight, tests, rest, degrees_of_freedom)
-        for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
+    for form in forms:
+        least = least_noncentrality(form.white * form.sizes, form.weight, tests, rest, form.degrees_of_freedom)
+        for name, length in zip(form.names, np.linalg.norm(form.white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
-            found.setdefault(name, {}).setdefault(names, []).append(size)
+            found.setdefault(name, {}).setdefault(form.names, []).append(size)
     # Forms of the same parameters differ in when something happened: any of them could be true.
     return {name: min(float(np.median(own)) for own in by_form.values()) for name, by_form in found.items()}

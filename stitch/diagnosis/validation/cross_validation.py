@@ -6,8 +6,7 @@ import numpy as np
 
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
-from stitch.observations.evidence import Trial, ViewEvidence
-from stitch.observations.surfaces.point_effects import PointGram
+from stitch.observations.linear_model import LinearModel, Trial
 
 # Of a plausible size: what was not found has some size, or its prior would have none.
 _NOTHING = 1e-6
@@ -29,36 +28,34 @@ class CrossValidation:
         return self.poses <= 1 - self.poses_sigma
 
 
-def present_square(evidence: ViewEvidence) -> float:
-    """Weighted sum of squares of the present model."""
-    present = evidence.trial(evidence.model)
-    return float(present.squares(present.solve(None)).sum())
-
-
-def cross_validate(evidence: ViewEvidence, scored: Score, points: PointGram | None) -> CrossValidation:
+def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     """Add the best form of a candidate to the model, in the linear approximation."""
-    X = np.hstack([evidence.model, scored.form.twists])
-    own = None if points is None or scored.candidate.points is None else _own(points, scored)
-    trial, present = evidence.trial(X, own), evidence.trial(evidence.model)
-    believed = evidence.trial(X, own, believed_size(evidence, scored))
-    whole = trial.solve(None)
+    X, points = np.hstack([linear.design, scored.form.response]), scored.candidate.points
+    own = None if points is None else points.of(scored.form.keep)
+    trial, present = linear.trial(X, own), linear.present
+    believed = linear.trial(X, own, believed_size(linear, scored))
+    whole = trial.solve()
     shares, weights = [], []
     scatter = np.zeros((2, 0))
-    for fold in evidence.folds():
-        touched = evidence.touched(fold)
+    for fold in linear.folds():
+        touched = linear.touched(fold)
         without = [t.solve(fold) for t in (believed, present)]
         squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
         shares.append(squares[0] / max(squares[1], 1e-300))
         weights.append(squares[1])
         off = [t.scatter(fold, x) for t, x in zip((trial, present), without, strict=True)]
         scatter = np.column_stack([scatter, off])
+    poses, poses_sigma = share_of(*scatter)
     return CrossValidation(
-        float(trial.squares(whole).sum() / present_square(evidence)), float(np.average(shares, weights=weights)),
-        *share_of(*scatter), _steadiness(evidence, trial, X, whole),
-    )  # fmt: skip
+        inside=float(trial.squares(whole).sum() / present.squares(present.solve()).sum()),
+        heldout=float(np.average(shares, weights=weights)),
+        poses=poses,
+        poses_sigma=poses_sigma,
+        steadiness=_steadiness(linear, trial, X, whole),
+    )
 
 
-def believed_size(evidence: ViewEvidence, scored: Score) -> Array:
+def believed_size(linear: LinearModel, scored: Score) -> Array:
     """(k,) precision of a prior for model and candidate in fits without some views.
 
     Views that carry most of an effect leave little to predict it from where they are left out. So without them the
@@ -67,7 +64,7 @@ def believed_size(evidence: ViewEvidence, scored: Score) -> Array:
     """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
     size = np.maximum(size, _NOTHING * scored.form.sizes)
-    return np.append(np.zeros(evidence.model.shape[1]), 1 / size**2)
+    return np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
 
 
 def share_of(with_it: Array, without: Array) -> tuple[float, float]:
@@ -82,19 +79,14 @@ def share_of(with_it: Array, without: Array) -> tuple[float, float]:
     return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
 
 
-def _own(points: PointGram, scored: Score) -> PointGram:
-    keep = np.arange(points.residual.shape[1])[scored.candidate.points][scored.form.keep]
-    return PointGram(points.vector[:, :, keep], points.residual[:, keep], points.square[:, keep][:, :, keep])
-
-
-def _steadiness(evidence: ViewEvidence, trial: Trial, X: Array, whole: Array) -> float:
+def _steadiness(linear: LinearModel, trial: Trial, X: Array, whole: Array) -> float:
     """A combination of parameters that one view carries alone vanishes without it."""
-    size = X.shape[1] - evidence.model.shape[1]
+    size = X.shape[1] - linear.design.shape[1]
     theta = whole[-size:]
     norm = float(theta @ theta)
     if norm == 0:
         return 0.0
-    white = evidence.whiten(X[:, -size:])
+    white = linear.residual(linear.reduce(X[:, -size:]))
     strength = float(np.sum((white @ theta) ** 2))
     shares = [
         float((white @ theta) @ (white @ trial.solve(np.array([v]))[-size:])) / max(strength, 1e-300)

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.validation.cross_validation import believed_size, share_of
-from stitch.observations.evidence import ViewEvidence
+from stitch.observations.linear_model import LinearModel
 from stitch.statistics.folds import JointEnd
 
 
@@ -37,7 +37,7 @@ class Extrapolation:
         chance = float(norm.isf(norm.sf(1.0) / self.count))
         return self.share <= 1 - self.sigma and self.worst_share <= 1 + chance * self.worst_sigma
 
-    def told(self, name: str) -> str:
+    def objection(self, name: str) -> str:
         """What speaks against an effect that explains much."""
         return (
             f"{name} would help among the poses that were measured, but not beyond: at ends of joints' ranges that are "
@@ -46,11 +46,11 @@ class Extrapolation:
         )
 
 
-def extrapolation(evidence: ViewEvidence, scored: Score) -> Extrapolation | None:
+def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     """The best form of a candidate at the ends; None where the views are too few to leave one out."""
-    X = np.hstack([evidence.model, scored.form.twists])
-    trials = evidence.trial(X), evidence.trial(evidence.model), evidence.trial(X, None, believed_size(evidence, scored))
-    ends = evidence.ends()
+    X = np.hstack([linear.design, scored.form.response])
+    trials = linear.trial(X), linear.present, linear.trial(X, None, believed_size(linear, scored))
+    ends = linear.ends()
     if not ends:
         return None
     squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]

@@ -1,4 +1,4 @@
-"""Normal equations over view pairs, robust weights and generalised least squares on view poses.
+"""Normal equations over view pairs.
 
 Every pair (v, w) sees e = e₀ + B(δ_v − δ_w) with B = [m × n, n], m the midpoint and n the mean
 normal: the symmetric point-to-plane distance under left twists δ of the two poses in the reference
@@ -9,16 +9,14 @@ O(pairs), never O(points x parameters).
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch.frames import Array, Mask
 from stitch.observations.surfaces.match import Match
+from stitch.statistics.robust import mad_sigma, tukey
 
-_MAD_TO_SIGMA = 1.4826
-# Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).
-_TUKEY = 4.685
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
 RMS_GATE = 4.0
 
@@ -50,6 +48,11 @@ class Gram:
         total = self.matrix.sum(axis=0)
         return float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
 
+    def only(self, keep: Mask) -> "Gram":
+        """The sums of some pairs (P,)."""
+        of_pairs = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
+        return replace(self, **{name: getattr(self, name)[keep] for name in of_pairs})
+
     @property
     def variance(self) -> float:
         """Weighted mean of e² between surfaces."""
@@ -57,14 +60,9 @@ class Gram:
 
 
 def robust_scale(matches: Iterable[Match]) -> float:
-    """1.4826 × median |e| over all pairs: e is symmetric about zero, so no centring."""
-    residuals = [np.abs(m.residual) for m in matches]
-    return _MAD_TO_SIGMA * float(np.median(np.concatenate(residuals))) if residuals else float("nan")
-
-
-def tukey(e: Array, scale: float) -> Array:
-    """Biweight of residuals at a robust sigma."""
-    return np.asarray(np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2)
+    """Robust sigma of the residuals of all pairs: they are symmetric about zero, so no centring."""
+    residuals = [m.residual for m in matches]
+    return mad_sigma(np.concatenate(residuals)) if residuals else float("nan")
 
 
 def gram(
@@ -113,25 +111,3 @@ def pair_squares(g: Gram, twists: Array) -> Array:
     linear = np.einsum("pi,pi->p", g.vector, difference)
     quadratic = np.einsum("pi,pij,pj->p", difference, g.matrix, difference)
     return np.asarray(g.square + 2 * linear + quadratic)
-
-
-def column_space(columns: Array, relative: float = 1e-9) -> Array:
-    """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
-    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(U[:, s > relative * s[0]])
-
-
-def fit_columns(columns: Array, values: Array) -> Array:
-    """(K,) least squares of columns (n, K), whatever their units, to values (n,)."""
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale)
-
-
-def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
-    """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale[None, :])
-    keep = values > relative * values[-1]
-    projected = vectors[:, keep].T @ (-vector * scale) / values[keep]
-    return np.asarray(scale * (vectors[:, keep] @ projected))

@@ -1,4 +1,4 @@
-"""The hand-eye and the effects in use from per-view evidence: generalised least squares, covariance, held-out error.
+"""The hand-eye and the effects in use from freed views: generalised least squares, covariance, held-out error.
 
 The poses of the views scatter by the robot's repeatability, which no number of points averages
 out: views are the samples. Errors of the scanner that repeat in every view come on top: no number of views
@@ -9,15 +9,17 @@ not independent from view to view has a larger one, never a smaller.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.capture_evidence import DRAWS, CaptureEvidence, drop, information, measured_and_drawn
+from stitch.observations.surfaces.capture_evidence import DRAWS, CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.pose_channel import Repeatability, estimate
+from stitch.statistics.jackknife import drawn_inflation
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,19 @@ class HandEye:
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
+    @property
+    def values_sigma(self) -> Array:
+        """(P,) standard deviations of the effects' values."""
+        return np.sqrt(np.maximum(np.diag(self.values_covariance), 1e-300))
+
 
 def fit_hand_eye(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns | None = None,
+    captures: Sequence[Capture],
+    freed: Sequence[FreePoses],
+    T_mount: Array,
+    columns: Columns | None = None,
     repeating: Sequence[Array] | None = None,
-) -> HandEye:  # fmt: skip
+) -> HandEye:
     """Generalised least squares over the pose channels of all captures.
 
     Args:
@@ -56,44 +66,84 @@ def fit_hand_eye(
             that all views and captures have in common; they widen the covariance and change nothing else.
     """
     columns = columns or Columns(tuple(np.zeros((6 * len(c.scans), 0)) for c in captures), np.zeros(0), np.zeros(0))
-    evidence = [
+    parts = [
         CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), extra)
         for c, f, extra in zip(captures, freed, columns.twists, strict=True)
     ]
-    scatter = [estimate(e.channel(), e.further()) for e in evidence]
-    prior = _prior(captures, freed, T_mount, columns)
-    # Column 0 is what was measured; the others are draws of what this scatter alone would give.
-    twists = [measured_and_drawn(e, s) for e, s in zip(evidence, scatter, strict=True)]
-    blocks = [information(e, s, t) for e, s, t in zip(evidence, scatter, twists, strict=True)]
-    blocks.append(_pull(columns))
-    x, covariance = _combine(blocks, prior)
-    left_out, outside = [], np.zeros(2)
-    for k, (e, s, t) in enumerate(zip(evidence, scatter, twists, strict=True)):
-        for v in range(e.gram.views):
-            left_out.append(_without(blocks, k, e, s, t, np.array([v]), prior))
-        for fold in e.folds():
-            fewer = _without(blocks, k, e, s, t, fold, prior)
-            outside += e.squares(fold, (fewer[:, 0], x[:, 0]))
+    scatter = [estimate(e.channel, e.further) for e in parts]
+    # Column 0 of the twists is what was measured; the others are draws of what this scatter alone would give.
+    twists = [e.measured_and_drawn(s) for e, s in zip(parts, scatter, strict=True)]
+    joint = _Joint(parts, scatter, twists, _prior(captures, freed, T_mount, columns), _pull(columns))
+    x, covariance = joint.solve()
+    repeated = np.zeros((len(x), 0))
     if repeating is not None:
-        common = [information(e, s, r)[1] for e, s, r in zip(evidence, scatter, repeating, strict=True)]
+        common = [e.information(s, r)[1] for e, s, r in zip(parts, scatter, repeating, strict=True)]
         repeated = covariance @ np.sum(common, axis=0)
-    else:
-        repeated = np.zeros((len(prior), 0))
-    inflation = _jackknife_inflation(np.array(left_out), covariance) * _student(len(left_out))
-    ratio = float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+    left_out = [joint.without(k, np.array([v])) for k, e in enumerate(parts) for v in range(e.gram.views)]
+    inflation = drawn_inflation(np.array(left_out), covariance) * _student(len(left_out))
     covariance = covariance * inflation + repeated @ repeated.T
     return HandEye(
-        T_mount @ frames.exp(x[:6, 0]), covariance[:6, :6], inflation, tuple(scatter), ratio,
-        columns.values + x[6:, 0], covariance[6:, 6:],
-    )  # fmt: skip
+        T_mount=T_mount @ frames.exp(x[:6, 0]),
+        covariance=covariance[:6, :6],
+        inflation=inflation,
+        repeatability=tuple(scatter),
+        heldout_ratio=joint.heldout_ratio(x),
+        values=columns.values + x[6:, 0],
+        values_covariance=covariance[6:, 6:],
+    )
 
 
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
     """The repeatability of one capture's poses, whatever its hand-eye."""
     nothing = np.zeros((6 * len(capture.scans), 0))
-    return estimate(
-        CaptureEvidence(capture, freed.overlaps.gram, freed.twists, capture.hand_eye_frames(T_mount), nothing).channel()
-    )
+    own = CaptureEvidence(capture, freed.overlaps.gram, freed.twists, capture.hand_eye_frames(T_mount), nothing)
+    return estimate(own.channel)
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """All captures of a rig as normal equations of 6 + P unknowns, for the measurement and its draws."""
+
+    parts: Sequence[CaptureEvidence]
+    scatter: Sequence[Repeatability]
+    twists: Sequence[Array]  # per capture (6V, 1 + draws)
+    prior: Array  # (6 + P, 6 + P)
+    pull: Array  # (6 + P, 1 + draws)
+
+    @cached_property
+    def blocks(self) -> list[tuple[Array, Array]]:
+        """Per capture information (6 + P, 6 + P) and vectors (6 + P, 1 + draws)."""
+        return [e.information(s, t) for e, s, t in zip(self.parts, self.scatter, self.twists, strict=True)]
+
+    def solve(self, k: int | None = None, instead: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+        """Estimates (6 + P, 1 + draws) and covariance, with another block for capture k.
+
+        Parameters count in rad and mm, so the matrix is equilibrated first.
+        """
+        blocks = list(self.blocks)
+        if k is not None and instead is not None:
+            blocks[k] = instead
+        matrix = self.prior + np.sum([block[0] for block in blocks], axis=0)
+        vector = np.sum([*(block[1] for block in blocks), self.pull], axis=0)
+        scale = 1 / np.sqrt(np.diag(matrix))
+        covariance: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
+        return np.asarray(covariance @ vector), covariance
+
+    def without(self, k: int, views: Indices) -> Array:
+        """(6 + P, 1 + draws) estimates without some views of capture k."""
+        fewer = self.parts[k].without(views)
+        block = (np.zeros_like(self.prior), np.zeros_like(self.pull))
+        if len(fewer.gram.pairs):
+            block = fewer.information(self.scatter[k], CaptureEvidence.drop(self.twists[k], views))
+        return self.solve(k, block)[0]
+
+    def heldout_ratio(self, x: Array) -> float:
+        """Rms of views left out in groups over that of the same pairs under the estimates x of all views."""
+        outside = np.zeros(2)
+        for k, e in enumerate(self.parts):
+            for fold in e.folds():
+                outside += e.squares(fold, (self.without(k, fold)[:, 0], x[:, 0]))
+        return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
 
 
 def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns) -> Array:
@@ -106,55 +156,13 @@ def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Arr
     return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, columns.prior**-2.0]))
 
 
-def _pull(columns: Columns) -> tuple[Array, Array]:
+def _pull(columns: Columns) -> Array:
     """The effects' prior is about zero, not about their present values."""
-    size = 6 + len(columns.values)
-    pull = np.zeros((size, 1 + DRAWS))
+    pull = np.zeros((6 + len(columns.values), 1 + DRAWS))
     pull[6:, 0] = -columns.values * columns.prior**-2.0
-    return np.zeros((size, size)), pull
-
-
-def _without(
-    blocks: Sequence[tuple[Array, Array]], k: int, evidence: CaptureEvidence, scatter: Repeatability, twists: Array,
-    views: Indices, prior: Array,
-) -> Array:  # fmt: skip
-    """(6 + P, 1 + draws) estimates without some views of capture k."""
-    fewer = evidence.without(views)
-    size = len(prior)
-    nothing = (np.zeros((size, size)), np.zeros((size, twists.shape[1])))
-    block = information(fewer, scatter, drop(twists, views)) if len(fewer.gram.pairs) else nothing
-    return _combine([*blocks[:k], block, *blocks[k + 1 :]], prior)[0]
-
-
-def _combine(blocks: Sequence[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
-    """Estimates and covariance; parameters count in rad and mm, so the matrix is equilibrated first."""
-    matrix = prior + np.sum([block[0] for block in blocks], axis=0)
-    scale = 1 / np.sqrt(np.diag(matrix))
-    covariance: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return np.asarray(covariance @ np.sum([block[1] for block in blocks], axis=0)), covariance
+    return pull
 
 
 def _student(views: int) -> float:
     """Variance of Student's t: the scatter that all sigmas rest on is itself known from so many views only."""
     return (views - 1) / (views - 3) if views > 4 else 3.0
-
-
-def _jackknife_inflation(left_out: Array, covariance: Array) -> float:
-    """How much more the left-out views move the estimates than chance explains, at least 1.
-
-    The mean ratio of the jackknife's covariance to the model's over all directions, over its lower
-    quartile under the model: with a handful of views the jackknife itself reads too large, and taking
-    it at its word would widen sigmas that are right; of two readings the cautious one is taken.
-
-    Args:
-        left_out: (L, 6 + P, 1 + draws) estimates with one view left out; column 0 from the measurement.
-    """
-    count = len(left_out)
-    if count < 4:
-        return 1.0
-    centred = left_out - left_out.mean(axis=0)
-    scale = np.sqrt(np.diag(covariance))
-    precision = np.linalg.inv(covariance / scale[:, None] / scale) / scale[:, None] / scale
-    squares = np.einsum("lid,ij,ljd->d", centred, precision, centred, optimize=True)
-    ratio = (count - 1) / count * squares / len(covariance)
-    return float(max(1.0, ratio[0] / np.quantile(ratio[1:], 0.25)))

@@ -6,15 +6,19 @@ twists δ̂ (`free_poses.py`) are reduced to the directions the overlaps can see
 noise within overlaps, whose errors are correlated). Patterson & Thompson (1971), Harville (1977).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array
-from stitch.observations.surfaces.free_poses import visible_directions
-from stitch.observations.surfaces.gram import Gram, column_space
-from stitch.statistics.variance_components import Evidence, fit_variances
+from stitch.frames import Array, Mask
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
+from stitch.observations.surfaces.gram import Gram
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.parameter_selection import Whitened
+from stitch.statistics.variance_components import MixedModel, fit_variances
 
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
 _TOLD = 1e-6
@@ -66,16 +70,16 @@ def _scatter(left: Array, carried: Array) -> Array:
     return np.asarray(np.einsum("vni,vmi->nm", blocks, blocks))
 
 
-def evidence_of(channel: PoseChannel, further: Array | None = None) -> Evidence:
+def mixed_model(channel: PoseChannel, further: Array | None = None) -> MixedModel:
     """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
     mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
     components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
-    return Evidence(channel.z[None], column_space(mean, _TOLD)[None], components)
+    return MixedModel(channel.z[None], column_space(mean, _TOLD)[None], components)
 
 
 def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:
     """REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
-    return scatter_from(fit_variances(evidence_of(channel, further), both_starts=True).variances)
+    return scatter_from(fit_variances(mixed_model(channel, further), both_starts=True).variances)
 
 
 def scatter_from(variances: Array) -> Repeatability:
@@ -90,3 +94,24 @@ def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
         + scatter.translation**2 * channel.translation
         + scatter.noise_factor * channel.noise
     )
+
+
+def whitened(
+    sessions: Sequence[tuple[Capture, FreePoses, Array]], T_mount: Array, values: Array, free: Mask
+) -> Whitened:
+    """All captures of a rig in units of their pose scatter, stacked.
+
+    Args:
+        sessions: per capture its freed views and the twists (6V, P) of the effects.
+        values: (P,) of the effects at which the views were freed; z is what was seen without them.
+        free: (P,) effects that explain scatter.
+    """
+    out = []
+    for capture, f, extra in sessions:
+        channel = pose_channel(f.overlaps.gram, f.twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
+        further = channel.reduction @ extra
+        half = np.linalg.cholesky(covariance_of(channel, estimate(channel, further[:, free])))
+        stack = np.column_stack([channel.hand_eye, further, channel.z + further @ values])
+        out.append(np.linalg.solve(half, stack))
+    everything = np.concatenate(out)
+    return Whitened(everything[:, :6], everything[:, 6:-1], everything[:, -1])

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.point_effects import PointGram, seen_twists, streamed
+from stitch.observations.surfaces.point_gram import PointGram, seen_twists, streamed
 
 # Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
 # effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.

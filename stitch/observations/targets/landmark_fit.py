@@ -5,7 +5,7 @@ import numpy as np
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.targets.landmarks import Landmarks, initial_landmarks
-from stitch.observations.targets.rows import Rows, evidence_of_rows, rows_of
+from stitch.observations.targets.rows import Rows, mixed_model_of_rows, rows_of
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.variance_components import fit_variances
 
@@ -21,13 +21,13 @@ def fitted_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, Blocks, A
     """
     landmarks = initial_landmarks(own, T_mount)
     rows = rows_of(own, T_mount, landmarks)
-    evidence = evidence_of_rows(rows, rows.landmarks)
-    variances = fit_variances(evidence, both_starts=True).variances
+    mixed = mixed_model_of_rows(rows, rows.landmarks)
+    variances = fit_variances(mixed, both_starts=True).variances
     assert own.sightings is not None
     # One working distance for what nobody sees.
     distance = float(np.median(np.linalg.norm(np.concatenate(own.sightings.sets()), axis=1)))
     precision = np.full(landmarks.size, distance**-2.0)
-    blocks = Blocks(evidence.z, rows.landmarks, evidence.covariance(variances), precision, np.zeros(landmarks.size))
+    blocks = Blocks(mixed.z, rows.landmarks, mixed.covariance(variances), precision, np.zeros(landmarks.size))
     return landmarks.moved(blocks.solve()), blocks, variances
 
 

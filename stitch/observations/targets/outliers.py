@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array, Indices, Mask
-from stitch.observations.targets.rows import Rows, evidence_of_rows
+from stitch.observations.targets.rows import Rows, mixed_model_of_rows
 
 # Six times the usual deviation: one in a thousand million of honest Gaussian errors. Pose errors of an arm whose
 # model lacks something have longer tails: six times the median happens.
@@ -39,9 +39,9 @@ def find_outliers(rows: Rows, variances: Array) -> list[Outlier]:
     sightings = rows.capture.sightings
     assert sightings is not None
     V, S = sightings.used.shape
-    evidence, left = evidence_of_rows(rows, rows.hand_eye), rows.residual[:V]
-    P = np.asarray(np.linalg.inv(evidence.covariance(variances)[:V]), float)
-    free = np.linalg.inv(evidence.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
+    mixed, left = mixed_model_of_rows(rows, rows.hand_eye), rows.residual[:V]
+    P = np.asarray(np.linalg.inv(mixed.covariance(variances)[:V]), float)
+    free = np.linalg.inv(mixed.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
     seen = sightings.used.any(axis=1)
     slots, apart = _slot_deviations(P, left, S)
     slots[~sightings.used] = np.nan

@@ -5,7 +5,6 @@ twist δ of the view about `centre` moves them by lever·δ, the landmarks by th
 are further blocks of three rows: the target less its place in the drawing.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +13,14 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement, Term
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.sightings import Sightings
+from stitch.model.forward import moves_points
 from stitch.model.jacobian import target_shifts, twists
-from stitch.observations.surfaces.point_effects import POINTS
+from stitch.model.model import Model
+from stitch.model.term import Term
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.statistics.variance_components import Evidence
+from stitch.statistics.variance_components import MixedModel
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,12 @@ class Rows:
     noise: Array  # (B, m) variance of the sensor; 0 where a row is absent or none of the sensor's
     fixed: Array  # (B, m) variance that is known: 1 in absent rows, that of the drawing in its own
     positions: int  # the first 3S rows of a view are coordinates
+
+    @property
+    def sightings(self) -> Sightings:
+        """The labelled points that the rows are of."""
+        assert self.capture.sightings is not None
+        return self.capture.sightings
 
     @property
     def used(self) -> Mask:
@@ -115,20 +123,26 @@ def _draw(landmarks: Landmarks, views: int, left: Array, columns: Array, fixed: 
         fixed[block, :3] = landmarks.drawing.sigma[t] ** 2
 
 
-def effect_rows(rows: Rows, measurement: Measurement, terms: Sequence[Term], term: Term) -> Array:
-    """(B, m, P) how the rows answer to the parameters of `term`, at `terms`."""
-    if term.effect.place not in POINTS:
-        moved = twists(measurement, terms, term, rows.T_mount, rows.centre)
+def effect_rows(rows: Rows, measurement: Measurement, model: Model, term: Term) -> Array:
+    """(B, m, P) how the rows answer to the parameters of `term`, at `model`."""
+    if not moves_points([term]):
+        moved = twists(measurement, model, term, rows.centre)
         return rows.by_twists(moved.reshape(len(moved), -1).T)
     poses = rows.capture.poses(rows.T_mount)
-    slopes = frames.rotate(poses, target_shifts(measurement, terms, term, poses))  # (P, V, S, 3)
+    slopes = frames.rotate(poses, target_shifts(measurement, model, term, poses))  # (P, V, S, 3)
     out = np.zeros((*rows.residual.shape, len(slopes)))
     out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
     out[: len(poses)][~rows.used] = 0.0
     return out
 
 
-def evidence_of_rows(rows: Rows, A: Array) -> Evidence:
+def effect_columns(rows: Rows, measurement: Measurement, model: Model) -> Array:
+    """(B, m, P) how the rows answer to all parameters of the effects in use."""
+    found = (effect_rows(rows, measurement, model, term) for term in model.terms)
+    return np.concatenate([np.zeros((*rows.residual.shape, 0)), *found], axis=2)
+
+
+def mixed_model_of_rows(rows: Rows, A: Array) -> MixedModel:
     """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
     V, (B, m) = len(rows.lever), rows.residual.shape
     to_centre = frames.make(np.eye(3), -rows.centre)
@@ -142,4 +156,4 @@ def evidence_of_rows(rows: Rows, A: Array) -> Evidence:
     fixed[:, diagonal, diagonal] = rows.fixed
     # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
     independent = int(np.minimum(rows.used.sum(axis=1), 6).sum()) + max(rows.landmarks.shape[2] - 6, 0)
-    return Evidence(-rows.residual, A, components, fixed, independent)
+    return MixedModel(-rows.residual, A, components, fixed, independent)

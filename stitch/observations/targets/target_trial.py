@@ -28,7 +28,7 @@ class TargetTrial:
         prior = zero if self.precision is None else self.precision
         return Blocks(-self.rows.residual, self.X, self.covariance, prior, zero)
 
-    def solve(self, left_out: Indices | None) -> Array:
+    def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) without some views."""
         return self.blocks.solve(left_out)
 

@@ -7,22 +7,26 @@ which holds for any hand-eye.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from stitch import frames
+from stitch.closed_form import feature_matching
 from stitch.closed_form.axxb import SOLVERS
+from stitch.closed_form.feature_matching import FeaturedSurface
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.system.native import load_open3d
+from stitch.measurement.scan import Scan
+from stitch.system.threads import parallel
 
 # The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
 _ANGLE_TOLERANCE = np.radians(3.0)
 _MINIMUM_MOTIONS = 3
 _FEATURE_SPACINGS = 6.0
 _POINTS = 1500
+# One partner in twelve right leaves five good triples among so many.
+_DRAWS = 10_000
 
 
 def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
@@ -63,20 +67,22 @@ def consistent(A: Array, B: Array) -> tuple[Array, Array]:
 
 
 def feature_motions(capture: Capture) -> tuple[Array, Array]:
-    """Motions between neighbours of the sequence (and its ends) by feature matching."""
-    o3d = load_open3d()
-    o3d.utility.random.seed(0)
+    """(A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
     size = _FEATURE_SPACINGS * capture.spacing
-    clouds = []
-    for scan in capture.scans:
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scan.points))
-        cloud.normals = o3d.utility.Vector3dVector(scan.normals)
-        thin = cloud.voxel_down_sample(max(size / 2, _even_size(scan.points)))
-        search = o3d.geometry.KDTreeSearchParamHybrid(radius=2.5 * size, max_nn=100)
-        clouds.append((thin, o3d.pipelines.registration.compute_fpfh_feature(thin, search)))
+
+    def described(scan: Scan) -> FeaturedSurface:
+        points, normals = feature_matching.thin(scan.points, scan.normals, max(size / 2, _even_size(scan.points)))
+        return feature_matching.describe(points, normals, 2.5 * size)
+
+    surfaces = list(parallel(described, capture.scans))
+
+    def motion(pair: tuple[int, int]) -> Array:
+        target, source = (surfaces[v] for v in pair)
+        T = feature_matching.register(source, target, reach=1.5 * size, draws=_DRAWS)
+        return feature_matching.align(source, target, T, reach=size)
+
     pairs = _neighbours(len(capture.scans))
-    B = [_feature_motion(o3d, clouds[v], clouds[w], size) for v, w in pairs]
-    return robot_motions(capture, pairs), np.array(B).reshape(-1, 4, 4)
+    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs))).reshape(-1, 4, 4)
 
 
 def _neighbours(views: int) -> list[tuple[int, int]]:
@@ -90,23 +96,8 @@ def _even_size(points: Array) -> float:
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
 
 
-def _feature_motion(o3d: Any, target: Any, source: Any, size: float) -> Any:
-    registration = o3d.pipelines.registration
-    result = registration.registration_ransac_based_on_feature_matching(
-        source[0], target[0], source[1], target[1], True, 1.5 * size,
-        registration.TransformationEstimationPointToPoint(False), 3,
-        [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-         registration.CorrespondenceCheckerBasedOnDistance(1.5 * size)],
-        registration.RANSACConvergenceCriteria(10000, 0.99),
-    )  # fmt: skip
-    return registration.registration_icp(
-        source[0], target[0], size, result.transformation,
-        registration.TransformationEstimationPointToPlane(),
-    ).transformation  # fmt: skip
-
-
 def sequence_motions(capture: Capture) -> tuple[Array, Array]:
-    """Motions between consecutive views by KISS-ICP, which expects a sequence in small steps."""
+    """(A, B), each (M, 4, 4): motions between consecutive views by KISS-ICP, made for a sequence in small steps."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.mapping import get_voxel_hash_map
     from kiss_icp.registration import get_registration
@@ -115,6 +106,8 @@ def sequence_motions(capture: Capture) -> tuple[Array, Array]:
     # KISS-ICP's defaults count in metres; a part's size plays the street's role of 100 m.
     size = 2 * float(np.sqrt(capture.scans[0].points.var(axis=0).sum()))
     config = KISSConfig()
+    # Its sums over several threads have no fixed order, so their last digits would change from run to run.
+    config.registration.max_num_threads = 1
     config.mapping.voxel_size = 0.02 * size
     config.data.max_range = 1e6
     B = []

@@ -1,0 +1,160 @@
+"""The verdict: which effect is named, which cannot be told apart, whether something unknown is there, or nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.selection.forward_selection import forward_selection
+from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
+from stitch.diagnosis.thresholds import (
+    ALPHA_UNKNOWN,
+    BEYOND_CHANCE,
+    IMPLAUSIBLE,
+    LOG_BAYES_FACTOR,
+    MANY_VIEWS,
+    ODDS,
+    PRIOR_PHYSICAL,
+    STEADY,
+)
+from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.observations.linear_model import LinearModel
+from stitch.units import METRES
+
+# Errors of one and two periods a turn have a name; those of three and four have not.
+_GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The answer before it is put into words."""
+
+    verdict: str  # adequate | missing_effect | cannot_tell | unknown_effect
+    named: tuple[Ranked, ...]  # the effect, or the group
+    ranked: tuple[Ranked, ...]  # physical, best first, unobservable last
+    empirical: tuple[Ranked, ...]  # best first
+    second: Ranked | None = None  # a further effect that the views show beside the first
+    notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
+
+
+def select(linear: LinearModel, candidates: Sequence[Candidate], length_unit: str) -> Selection:
+    """Name what is missing, or abstain."""
+    ranked, empirical = ranked_all(linear, candidates)
+    contenders = [r for r in ranked if contends(r)]
+    stray = _stray(empirical)
+    adequate = Selection("adequate", (), ranked, empirical)
+    unknown = replace(adequate, verdict="unknown_effect")
+    if stray is None and not any(certain(r) for r in contenders):
+        return unknown if implausible(linear, length_unit) else adequate
+    if not contenders:
+        return unknown
+    best, second, refused = contenders[0], None, dict[str, str]()
+    if linear.measurement.views.count >= MANY_VIEWS:
+        found = forward_selection(linear, candidates, best)
+        refused = found.refused
+        explained = max(found.explained, best.log_posterior)
+        if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):
+            return replace(unknown, notes=tuple(refused.values()))
+        best = found.effects[0] if found.effects else best
+        second = found.effects[1] if len(found.effects) > 1 else None
+    elif stray is not None and stray.log_posterior > best.log_posterior + ODDS:
+        # Two known effects at once may look like none of them: try the best with a second one.
+        second = _second(linear, candidates, best)
+        more = 0.0 if second is None else second.score.log_bayes_factor + np.log(PRIOR_PHYSICAL / len(ranked))
+        if stray.log_posterior > best.log_posterior + more + ODDS:
+            return unknown
+    if _order_open(best, empirical):
+        return unknown
+    likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
+    others = (r for r in likely if r.name != best.name and r.name not in refused)
+    group = (best, *(() if second is not None else others))
+    if len(group) > 1 and linear.measurement.views.count < MANY_VIEWS:
+        two = _both(linear, candidates, best)
+        if two is not None:
+            return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
+    verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
+    return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
+
+
+def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
+    """The best shape without a cause, where it is certain."""
+    for r in empirical[:1]:
+        if r.adjusted < ALPHA_UNKNOWN and r.score.log_bayes_factor > LOG_BAYES_FACTOR:
+            return r
+    return None
+
+
+def implausible(linear: LinearModel, length_unit: str) -> bool:
+    """True if the poses scatter as no arm does."""
+    rotation, translation = np.sqrt(linear.null.variances[:2])
+    return bool(rotation > IMPLAUSIBLE[0] or translation * METRES[length_unit] > IMPLAUSIBLE[1] * METRES["mm"])
+
+
+def validated(
+    selection: Selection, found: dict[str, CrossValidation | None], implausible: bool
+) -> tuple[Selection, tuple[str, ...]]:
+    """An effect that does not help on views left out, or that one view carries, is not named; a second one may be.
+
+    What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
+    beyond chance.
+    """
+    if selection.verdict != "missing_effect":
+        return selection, selection.notes
+    verdicts, notes = list[str](), list(selection.notes)
+    for named in (selection.named[0], selection.second):
+        if named is None:
+            continue
+        refusal = _refused(named, found.get(named.name), implausible)
+        if refusal is None:
+            if named is selection.named[0]:
+                return selection, selection.notes
+            return replace(selection, named=(named,), second=None), tuple(notes)
+        verdicts.append(refusal[0])
+        notes.append(refusal[1])
+    nothing = Selection(verdicts[0], (), selection.ranked, selection.empirical)
+    return nothing, tuple(notes[: len(selection.notes) + 1])
+
+
+def _refused(named: Ranked, left_out: CrossValidation | None, implausible: bool) -> tuple[str, str] | None:
+    """Verdict and reason if an effect does not stand the test of views left out."""
+    if left_out is None:
+        return None
+    if left_out.steadiness < STEADY:
+        note = f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
+        return "unknown_effect" if implausible or named.adjusted < BEYOND_CHANCE else "adequate", note
+    if not left_out.helps:
+        share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
+        note = f"{named.name} would not help on views left out (mean square pose error {share} of now)"
+        return "unknown_effect" if implausible else "adequate", note
+    return None
+
+
+def _order_open(best: Ranked, empirical: Sequence[Ranked]) -> bool:
+    """True for a gear error that over so short a range may be one of an order without a name."""
+    near = (r.name for r in empirical if r.log_posterior > best.log_posterior - ODDS)
+    return best.name in _GEARS and any(name.startswith(_NAMELESS_ORDERS) for name in near)
+
+
+def _both(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked] | None:
+    """Two effects that are both missing, where one alone left several as likely: what one of them took for itself.
+
+    Each must be certain beside the other, and beside the second no other may come near the first.
+    """
+    second = _second(linear, candidates, best)
+    if second is None:
+        return None
+    others = [c for c in candidates if c.name != second.name and not c.empirical]
+    first, *rest = ranked_all(linear.conditioned_on(second.score.form.columns), others)[0]
+    if not certain(first) or any(contends(r) and r.log_posterior > first.log_posterior - ODDS for r in rest):
+        return None
+    beside_first = linear.conditioned_on(first.score.form.columns)
+    again = ranked_one(beside_first, second.score.candidate, tests=len(others))
+    return (first, again) if certain(again) else None
+
+
+def _second(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
+    """The effect that explains most beside the best one, if it is certain."""
+    others = [c for c in candidates if c.name != best.name and not c.empirical]
+    ranked, _ = ranked_all(linear.conditioned_on(best.score.form.columns), others)
+    return next((r for r in ranked if certain(r)), None)

@@ -1,0 +1,41 @@
+"""Every threshold that decides what a diagnosis says: its meaning, its unit and where its value comes from."""
+
+import numpy as np
+
+# Family-wise error over all candidates (5 %, custom), shared between names and the alarm without one.
+ALPHA = 0.05
+ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
+# Log Bayes factor over "nothing is missing" that an alarm needs: 12 to 1, "positive" to "strong" (Kass & Raftery 1995).
+LOG_BAYES_FACTOR = 2.5
+# A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name ("strong", Kass & Raftery 1995).
+ODDS = float(np.log(20.0))
+# Prior shares: nothing is missing, one effect of the library, something without a name.
+PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
+# Probability with which the smallest detectable size is detected (custom in power analysis).
+POWER = 0.8
+
+# Views from which on several missing effects can be told at once, and an effect that others made idle is dropped.
+MANY_VIEWS = 100
+# Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
+AT_ONCE, TRIED = 6, 5
+
+# No arm that is fit for use scatters more than this (rad, mm): several times the repeatability of data sheets
+# (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
+IMPLAUSIBLE = (2.5e-4, 0.12)
+# Smallest share of an effect that must remain when one view is left out.
+STEADY = 0.25
+# A p-value below which an effect that rests on one view is still no chance.
+BEYOND_CHANCE = 1e-5
+# An effect must shorten the distances on views left out by more than a hundredth to stay in a model (mean square).
+WORTH = 0.99**2
+# New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.
+RISE, FALL = 1.05, 0.995
+# An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
+CLEAR, FAINT = 4.0, 2.0
+
+# Effects whose patterns correlate more than this look alike in these views.
+SIMILAR = 0.9
+# λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
+TOLD_APART = 5.4
+# Candidates whose prediction on left-out views is computed; the others explain nothing.
+PREDICTED = 8

@@ -1,0 +1,71 @@
+"""An effect in one session: its parameters there, and what it needs that the session may not have."""
+
+from dataclasses import replace
+
+from stitch.effects.contract import EFFECTS, Effect, Parameter
+from stitch.effects.specs import EVERY_VIEW
+from stitch.errors import InputError
+from stitch.measurement.measurement import Measurement
+
+_EVENT_PLACES = 50
+_WHERE_FROM = {
+    "joints": "joint angles in views.csv and the robot's DH rows or URDF",
+    "torque": "joint angles and the robot's geometry",
+    "velocity": "columns j1_velocity_deg_s … in views.csv",
+    "time": "a column time_s in views.csv",
+    "intensity": "an intensity for every point",
+}
+
+
+def known(name: str) -> Effect:
+    """An effect of the library or of a user's file.
+
+    Raises:
+        InputError: no such effect.
+    """
+    if name not in EFFECTS:
+        raise InputError(f"no effect {name!r}; there are {', '.join(EFFECTS)} (your own: --effects-file)")
+    return EFFECTS[name]
+
+
+def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, ...]:
+    """The parameters of an effect in a session, at zero; where time stands in for a temperature, rates are per hour."""
+    views = measurement.views
+    found = effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
+    timed = bool(effect.prefers) and not any(views.has(name) for name in effect.prefers)
+    return tuple(
+        replace(p, grid=_grid(p, views.count), unit=p.unit.replace("°C", "h") if timed else p.unit) for p in found
+    )
+
+
+def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:
+    if parameter.grid != EVERY_VIEW:
+        return parameter.grid
+    # An event can come before any view but the first two and the last: one view alone shows no event.
+    places = range(2, views - 1)
+    # Among hundreds of views the place of an event matters less than the time to try them all.
+    return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
+
+
+def lacking(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
+    """What an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
+    views = measurement.views
+    known_here = {"intensity": measurement.has_intensity}
+    missing = [need for need in effect.needs if not known_here.get(need, views.has(need))]
+    if effect.prefers and not any(views.has(name) for name in (*effect.prefers, "time")):
+        missing.append("time")
+    return tuple(missing)
+
+
+def require(measurement: Measurement, effect: Effect) -> None:
+    """Refuse an effect that a session cannot have.
+
+    Raises:
+        InputError: names what is missing.
+    """
+    missing = lacking(measurement, effect)
+    if missing:
+        words = [_WHERE_FROM.get(need, f"a column {need} in views.csv") for need in missing]
+        raise InputError(
+            f"effect {effect.name} needs {' and '.join(words)}, which session {measurement.capture.name} does not have"
+        )

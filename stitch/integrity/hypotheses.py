@@ -1,0 +1,174 @@
+"""What people do wrong with the poses of a session, written out: each mistake undone gives other poses.
+
+Poses that are right after one of these changes, and only then, say which mistake was made. Orders of Euler angles are
+those of Diebel (2006), "Representing Attitude": six with three axes, six with two.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.frames import Array, Indices
+from stitch.measurement.robot import forward
+from stitch.measurement.session import Session
+
+ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")
+# Factors between units that people mix up.
+UNITS = {1000.0: "m for mm", 0.001: "mm for m", 25.4: "inches for mm", 1 / 25.4: "mm for inches", 10.0: "cm for mm",
+         0.1: "mm for cm"}  # fmt: skip
+_OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
+_HANDED = "the scans are left-handed: two of their columns are exchanged, or one has the wrong sign"
+# Rows that a list may be shifted by.
+_SHIFTS = (1, -1, 2, -2, 3, -3)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Poses with one mistake undone."""
+
+    kind: str  # as in `stitch check --deep`; "stated" for the poses as they are
+    T_base_flange: Array  # (V, 4, 4)
+    mount: str
+    fix: str
+    rows: tuple[int, ...] = ()  # whose poses change places; empty: all
+    used: tuple[int, ...] | None = None  # scans that still have a pose; None: all
+
+    @property
+    def T_reference_mount(self) -> Array:
+        """(V, 4, 4) as the chain of frames takes them."""
+        return frames.inverse(self.T_base_flange) if self.mount == "eye_to_hand" else self.T_base_flange
+
+
+def hypotheses(session: Session) -> list[Hypothesis]:
+    """The poses as stated, first, and with every mistake undone that can be undone."""
+    T = np.array([view.T_base_flange for view in session.views])
+    mount = session.mount
+    out = [Hypothesis("stated", T, mount, "")]
+    out += _whole(session, T)
+    out += _rows(T, mount)
+    return out
+
+
+def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
+    """Mistakes that change all poses alike."""
+    mount, joints = session.mount, [view.joints for view in session.views]
+    robot = session.robot
+    known = robot is not None and all(q is not None for q in joints)
+    other = f'set mount = "{_OTHER[mount]}" in session.toml'
+    if known:
+        yield Hypothesis("mount", T, _OTHER[mount], other)
+        q = np.array(joints)
+        assert robot is not None
+        for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
+            yield Hypothesis("degrees", forward(robot, q * factor), mount, f"the joint angles are {words}: convert them")
+    else:
+        yield Hypothesis("inverse", frames.inverse(T), mount, _mount_or_inverse(mount))
+    position, R = T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])
+    transposed = frames.make(R.inv().as_matrix(), position)
+    yield Hypothesis("quaternion", transposed, mount, "the quaternions turn the other way: negate qx, qy, qz")
+    for name, q in _quaternions(R.as_quat()):
+        yield Hypothesis("quaternion", frames.make(q.as_matrix(), position), mount, f"the quaternion columns are {name}")
+    for name, turned in _euler(R):
+        yield Hypothesis("euler", frames.make(turned.as_matrix(), position), mount, name)
+    for name, turned in _degrees(R):
+        yield Hypothesis("degrees", frames.make(turned.as_matrix(), position), mount, name)
+    flip = np.diag([-1.0, 1, 1])
+    yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
+    still = np.broadcast_to(np.eye(4), T.shape)
+    yield Hypothesis("frame", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them")
+
+
+def _mount_or_inverse(mount: str) -> str:
+    return (
+        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER[mount]}" in session.toml '
+        "(these scans cannot tell the two apart, the size of the hand-eye can)"
+    )
+
+
+def _quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
+    """Readings (V, 4) x, y, z, w taken for another order."""
+    yield "w, x, y, z, not x, y, z, w", Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    yield "x, y, z, w but were reordered as if w came first", Rotation.from_quat(q[:, [3, 0, 1, 2]])
+
+
+def _euler(R: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Angles that were composed in one order and belong into another; columns by place, and by the axis they name."""
+    for order in (*ORDERS, *(o.lower() for o in ORDERS)):
+        angles = _angles(R, order)
+        for right in (*ORDERS, *(o.lower() for o in ORDERS)):
+            if right != order:
+                yield _order_fix(order, right), Rotation.from_euler(right, angles)
+        if len(set(order.upper())) == 3:
+            for right in ORDERS[:6]:
+                if right != order:
+                    named = np.column_stack([angles[:, order.upper().index(axis)] for axis in right])
+                    yield _order_fix(order, right), Rotation.from_euler(right, named)
+        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(angles)
+    for right in (*ORDERS, *(o.lower() for o in ORDERS)):
+        yield f"the rotation vectors are Euler angles in the order {_named(right)}", Rotation.from_euler(
+            right, R.as_rotvec()
+        )
+
+
+def _order_fix(order: str, right: str) -> str:
+    return f"the Euler angles were turned in the order {_named(order)} and belong into {_named(right)}"
+
+
+def _named(order: str) -> str:
+    """Capitals turn about the axes that turned already (intrinsic)."""
+    return f"{order.lower()}-{'intrinsic' if order.isupper() else 'extrinsic'}"
+
+
+def _degrees(R: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Angles in radians that were taken for degrees."""
+    words = "the angles are radians, and were read as degrees"
+    yield words, Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
+    for order in ORDERS:
+        yield f"{words} ({_named(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
+
+
+def _angles(R: Rotation, order: str) -> Array:
+    with warnings.catch_warnings():
+        # Gimbal lock sets an angle to zero: that reading is one of those to try.
+        warnings.simplefilter("ignore")
+        return np.asarray(R.as_euler(order))
+
+
+def _rows(T: Array, mount: str) -> Iterator[Hypothesis]:
+    """Poses that belong to other rows."""
+    V = len(T)
+    index = np.arange(V)
+    yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order: turn the list around")
+    for by in _SHIFTS:
+        if abs(by) < V - 2:
+            kept = index[(index + by >= 0) & (index + by < V)]
+            yield _shifted(T, mount, by, kept)
+    for a, b in combinations(range(V), 2):
+        order = index.copy()
+        order[[a, b]] = [b, a]
+        yield Hypothesis("exchanged", T[order], mount, "exchange the clouds of these rows", (a, b))
+
+
+def _shifted(T: Array, mount: str, by: int, kept: Indices) -> Hypothesis:
+    where = "below" if by > 0 else "above"
+    fix = f"every cloud belongs to the pose {abs(by)} row{'s' * (abs(by) > 1)} {where} it: shift the column back"
+    return Hypothesis("shifted", np.roll(T, -by, axis=0), mount, fix, (), tuple(int(v) for v in kept))
+
+
+def distinct(found: Sequence[Hypothesis], angle: float, length: float) -> list[Hypothesis]:
+    """Hypotheses whose relative motions differ, the first of each kind kept."""
+    kept: list[Hypothesis] = []
+    signs: list[Array] = []
+    for h in found:
+        relative = frames.inverse(h.T_reference_mount[:1]) @ h.T_reference_mount[1:]
+        sign = np.concatenate([relative[:, :3, :3].reshape(-1) / angle, relative[:, :3, 3].reshape(-1) / length])
+        if h.used is None and any(np.abs(sign - other).max() < 1 for other in signs):
+            continue
+        kept.append(h)
+        signs.append(sign)
+    return kept

@@ -1,0 +1,68 @@
+"""How the scanner moved between views, from the scans alone: what every hypothesis about the poses has to explain.
+
+Neighbours in the list are registered to each other from many starts. A motion counts if the surfaces close; a
+symmetric part closes in several ways, and then one of them may be the wrong one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.integrity.placing import Placement, place, shows_no_surface, surface_of
+from stitch.measurement.capture import Capture
+from stitch.measurement.capture import part_size
+
+# A pair counts if this share of the surface near lies on it, and this share of the scan is near.
+_CLOSES, _SHARED = 0.75, 0.35
+_SIGMAS = 6.0
+# Of the spacing: how far a point lies from its neighbour's tangent plane on a curved surface.
+_CURVED = 0.03
+_STEPS = (1, 2)
+_TURNS_DEG = (0.0, 30.0, 60.0, 90.0, 135.0, 180.0)
+
+
+@dataclass(frozen=True)
+class RelativeScans:
+    """M motions between pairs of views."""
+
+    pairs: tuple[tuple[int, int], ...]
+    T: Array  # (M, 4, 4) that maps view w's scanner frame into view v's
+    tried: int
+
+
+def relative_scans(capture: Capture) -> RelativeScans:
+    """Motions between each view and the next two of the list, without any pose."""
+    size = part_size([capture])
+    views = len(capture.scans)
+    pairs = [(v, v + step) for step in _STEPS for v in range(views - step)]
+    starts = _turns()
+    kept, motions = [], []
+    for v, w in pairs:
+        if shows_no_surface(capture.scans[v]) or shows_no_surface(capture.scans[w]):
+            continue
+        best = _between(capture, v, w, starts, size)
+        if best.closure > _CLOSES and best.near > _SHARED:
+            kept.append((v, w))
+            motions.append(best.T)
+    return RelativeScans(tuple(kept), np.array(motions).reshape(-1, 4, 4), len(pairs))
+
+
+def _between(capture: Capture, v: int, w: int, turns: Array, size: float) -> Placement:
+    scan, other = capture.scans[w], capture.scans[v]
+    tolerance = _SIGMAS * float(np.hypot(scan.noise, other.noise)) / 2 + _CURVED * other.spacing
+    surface = surface_of(capture.scans, np.tile(np.eye(4), (len(capture.scans), 1, 1)), [v], tolerance)
+    own, there = scan.points.mean(axis=0), other.points.mean(axis=0)
+    starts = frames.make(turns, there - turns @ own)
+    return place(scan, surface, starts, size)[0]
+
+
+def _turns() -> Array:
+    """(S, 3, 3) rotations: none, and about twelve axes."""
+    golden = (1 + np.sqrt(5)) / 2
+    axes = np.array([p for a in (-1, 1) for b in (-golden, golden) for p in ((0, a, b), (a, b, 0), (b, 0, a))])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    vectors = [a * np.radians(angle) for angle in _TURNS_DEG[1:] for a in axes]
+    return np.asarray(Rotation.from_rotvec(np.array([np.zeros(3), *vectors])).as_matrix())

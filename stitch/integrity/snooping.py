@@ -1,0 +1,162 @@
+"""Which views do not belong: detection, identification, adaptation (Teunissen 2018, J. Geodesy 92:59).
+
+Overlaps say which views are linked; a view that is not is tried wide, against the surface of the linked ones. Where it
+closes, its pose is wrong and it is known by how much; where it closes nowhere, it is no scan of this part. With every
+view in its place, each one's own displacement is tested under the scatter of the others.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.integrity.blunders import Block, Found, find_blunders
+from stitch.integrity.linkage import Linkage, linkage
+from stitch.integrity.placing import (
+    Placement,
+    judge,
+    place,
+    shows_no_surface,
+    starts_about,
+    starts_anywhere,
+    surface_of,
+)
+from stitch.integrity.view_test import ViewModel, view_model
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.measurement.capture import part_size
+
+# On the surface of the others: four robust sigmas of the overlaps.
+_TOLERANCE_SIGMAS = 4.0
+# A placement is right if at least this share of what linked views have on the others' surface lies on it. Right ones
+# have 0.9 to 1 of it, scans of other parts up to 0.35, scaled by 2.5 % up to 0.7.
+_ACCEPTED = 0.8
+# Views that cannot be seen to belong: the smallest share of a linked view that counts for that comparison.
+_FEW_SHARED = 0.1
+
+
+@dataclass(frozen=True)
+class Misplaced:
+    """A view that does not belong where its pose puts it."""
+
+    view: int
+    kind: str  # displaced | foreign
+    rotation: float  # rad; NaN for a foreign scan
+    distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
+    p_value: float  # family-wise, 0 where it is not even linked
+    T: Array | None  # (4, 4) T_reference_scanner where the surface puts it
+
+
+@dataclass(frozen=True)
+class Snooping:
+    """What linkage and tests say about the views of one capture."""
+
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    misplaced: tuple[Misplaced, ...]
+    block: Block | None
+    disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
+    model: ViewModel
+    found: Found
+    freed: FreePoses  # with the views where they belong
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Views that are not to be fused: misplaced, not linked, or on the smaller side of a re-clamping."""
+        out = {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
+        if self.block is not None:
+            before, after = range(self.block.start), range(self.block.start, self.linkage.views)
+            out |= set(before if len(before) < len(after) else after)
+        return tuple(sorted(out))
+
+    @property
+    def rotation(self) -> float:
+        """Scatter of the flange poses without the blunders, rad."""
+        return float(np.sqrt(self.found.fit.variances[0]))
+
+    @property
+    def translation(self) -> float:
+        """The same of translations, length_unit."""
+        return float(np.sqrt(self.found.fit.variances[1]))
+
+
+def snoop(capture: Capture, T_mount: Array, gate: float, freed: FreePoses | None = None) -> Snooping:
+    """Examine the views of a capture under a hand-eye.
+
+    Args:
+        T_mount: (4, 4) corrected hand-eye.
+        gate: distance between partners at which the correction ended, length_unit.
+        freed: the views freed from there, if that is at hand.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    model_poses = capture.poses(T_mount)
+    freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
+    linked = linkage(freed.overlaps)
+    placed, homeless = _placed(capture, model_poses, freed, linked)
+    if placed:
+        poses = np.array(freed.poses)
+        for v, placement in placed.items():
+            poses[v] = placement.T
+        freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
+    model = view_model(capture, T_mount, freed)
+    found = find_blunders(model, homeless)
+    own = {b.view: b.p_value for b in found.blunders}
+    misplaced = [_misplaced(capture, model_poses[v], freed.poses[v], v, p) for v, p in own.items()]
+    groups = linkage(freed.overlaps).components
+    misplaced += [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if _alone(v, groups)]
+    groups = tuple(g for g in groups if not set(g) <= {m.view for m in misplaced if m.kind == "foreign"})
+    return Snooping(linked, tuple(sorted(misplaced, key=lambda m: m.view)), found.block, groups, model, found, freed)
+
+
+def _alone(view: int, groups: Sequence[tuple[int, ...]]) -> bool:
+    return (view,) in groups
+
+
+def _placed(
+    capture: Capture, model_poses: Array, freed: FreePoses, linked: Linkage
+) -> tuple[dict[int, Placement], list[int]]:
+    """Where the views outside the core belong, and those that belong nowhere; the core grows as they are placed."""
+    core, waiting, placed = list(linked.core), list(linked.unlinked), dict[int, Placement]()
+    if not waiting or len(core) < 2:
+        return placed, waiting
+    tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
+    size, poses = part_size([capture]), np.array(freed.poses)
+    usual = _usual(capture, poses, core, tolerance)
+    while waiting:
+        surface = surface_of(capture.scans, poses, core, tolerance)
+        new = {}
+        for v in waiting:
+            scan = capture.scans[v]
+            if shows_no_surface(scan):
+                continue
+            starts = [starts_about(model_poses[v], scan, size), model_poses, starts_anywhere(surface, scan)]
+            best = place(scan, surface, np.concatenate(starts), size)[0]
+            if best.closure > _ACCEPTED * usual and best.near > _FEW_SHARED:
+                new[v] = best
+        if not new:
+            break
+        for v, placement in new.items():
+            poses[v] = placement.T
+        placed |= new
+        core += list(new)
+        waiting = [v for v in waiting if v not in new]
+    return placed, waiting
+
+
+def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:
+    """Median closure of linked views on the surface of the other ones."""
+    some = core[:: max(len(core) // 6, 1)]
+    closures = [
+        judge(capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)).closure
+        for v in some
+    ]
+    return float(np.median(closures))
+
+
+def _misplaced(capture: Capture, T_model: Array, T: Array, view: int, p_value: float) -> Misplaced:
+    middle = capture.scans[view].points.mean(axis=0)[None]
+    distance = np.linalg.norm(frames.transform(T, middle) - frames.transform(T_model, middle))
+    return Misplaced(view, "displaced", float(frames.angle_between(T_model, T)), float(distance), p_value, T)

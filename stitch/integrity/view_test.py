@@ -1,0 +1,138 @@
+"""Tests of one view's own displacement, or of a block's, under the scatter of the other poses.
+
+The per-view evidence of overlaps is linear: z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view v
+(left twist in the reference frame) and cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹, the
+statistic of an alternative with columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with
+non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances
+
+# Combinations of parameters weaker than this share of the strongest are not seen.
+_SEEN = 1e-6
+
+
+@dataclass(frozen=True)
+class ViewModel:
+    """Linear evidence about the poses of V views: n visible directions."""
+
+    z: Array  # (n,)
+    hand_eye: Array  # (n, 6) response to a common correction of the hand-eye
+    views: Array  # (V, n, 6) response to a left twist of one view about `centre`, rotations in 1/lever
+    carried: Array  # (V, 6, 6) from a twist of the flange to that twist, rotations in 1/lever
+    mounts: Array  # (V, n, 6) response of one view to a correction of its own hand-eye
+    noise: Array  # (n, n) covariance of the sensor noise within overlaps
+    centre: Array  # (3,) reference frame
+    lever: float  # length_unit: rotations about `centre` count as displacements at this distance
+
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return len(self.views)
+
+    def mixed(self, further: Array | None = None) -> MixedModel:
+        """The model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
+        mean = self.hand_eye if further is None else np.column_stack([self.hand_eye, further])
+        blocks = self.views @ self.carried
+        rotation, translation = (np.einsum("vni,vmi->nm", b, b) for b in (blocks[:, :, :3], blocks[:, :, 3:]))
+        components = np.array([rotation, translation, self.noise])[:, None]
+        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], components)
+
+    def fit(self, further: Array | None = None) -> VarianceFit:
+        """Scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""
+        return fit_variances(self.mixed(further))
+
+    def columns(self, freed: Sequence[int]) -> Array | None:
+        """(n, 6k) that let some views stand anywhere."""
+        return np.concatenate([self.views[v] for v in freed], axis=1) if len(freed) else None
+
+
+@dataclass(frozen=True)
+class Test:
+    """One alternative, tested."""
+
+    statistic: float  # T
+    degrees: int
+    p_value: float  # under F, the scatter being estimated from the same data
+    estimate: Array  # (6,) displacement, rotations in 1/lever
+    normal: Array  # (6, 6) N: non-centrality of a displacement δ is δᵀNδ
+
+
+def view_model(capture: Capture, T_mount: Array, freed: FreePoses) -> ViewModel:
+    """The evidence of overlaps and targets about the poses of a capture.
+
+    Args:
+        T_mount: (4, 4) hand-eye of the model poses from which `freed.twists` are counted.
+    """
+    g = freed.overlaps.gram
+    values, vectors, scale = visible_directions(g)
+    left = (vectors.T / scale[None, :]).reshape(len(values), g.views, 6).transpose(1, 0, 2)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    J = frames.adjoint(to_centre @ capture.hand_eye_frames(T_mount))
+    carried = frames.adjoint(to_centre @ capture.T_reference_flange)
+    lever = max(g.lever, 1e-300)
+    unit = np.diag([1 / lever] * 3 + [1.0] * 3)
+    return ViewModel(
+        z=np.einsum("vni,vi->n", left, freed.twists),
+        hand_eye=np.einsum("vni,vij->nj", left, J),
+        views=left @ unit,
+        carried=np.linalg.inv(unit) @ carried,
+        mounts=left @ J,
+        noise=np.diag(g.variance / values),
+        centre=g.centre,
+        lever=lever,
+    )
+
+
+@dataclass(frozen=True)
+class Projector:
+    """P of one null hypothesis: a fitted covariance and a free mean."""
+
+    P: Array  # (n, n)
+    pushed: Array  # (n,) P z
+    degrees: int  # n less the columns of the mean
+
+
+def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) -> Projector:
+    """P for variances that were fitted, with further columns (n, K) in the mean."""
+    mixed = model.mixed(further)
+    A = mixed.A[0]
+    C = mixed.covariance(fit.variances)[0]
+    both = np.linalg.solve(C, np.column_stack([A, np.eye(len(C))]))
+    CA, inverse = both[:, : A.shape[1]], both[:, A.shape[1] :]
+    P = inverse - CA @ np.linalg.solve(A.T @ CA, CA.T)
+    return Projector(P, P @ model.z, len(C) - A.shape[1])
+
+
+def test(under: Projector, columns: Array) -> Test:
+    """The alternative with `columns` (n, 6) under a null hypothesis."""
+    N, u = columns.T @ under.P @ columns, columns.T @ under.pushed
+    inverse, degrees = _inverse(N)
+    statistic = float(u @ inverse @ u)
+    nu = under.degrees - degrees
+    if degrees == 0 or nu < 1:
+        return Test(0.0, degrees, 1.0, np.zeros(len(N)), N)
+    # The scatter is estimated with the view in it: T/ν is a beta variable, told as the F of the left-out estimate.
+    rest = max(under.degrees - statistic, 1e-9 * under.degrees)
+    p = float(stats.f.sf(statistic / degrees / (rest / nu), degrees, nu))
+    return Test(statistic, degrees, p, inverse @ u, N)
+
+
+def _inverse(N: Array) -> tuple[Array, int]:
+    """Pseudo-inverse and rank of a symmetric matrix whose units may differ."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    keep = values > _SEEN * max(values[-1], 1e-300)
+    scaled = vectors[:, keep] * scale[:, None]
+    return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())

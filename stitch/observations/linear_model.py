@@ -1,0 +1,192 @@
+"""The one linear form that all of diagnosis reads, whatever was observed.
+
+    z = A·α + noise,   cov(noise) = Σ_i λ_i C_i
+
+z are the numbers that were seen (channel), A what hand-eye, landmarks and effects in use do to them. An observation
+says how its own coordinates (responses: twists of the views, or rows of targets) become numbers of the channel, how
+a model with further columns is tried, and which views may be left out. A further kind of observation implements
+`Observation` and a function that returns a `LinearModel`; nothing of diagnosis changes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.measurement import Measurement
+from stitch.model.model import Model
+from stitch.model.term import Term
+from stitch.observations.response import PointSums, Response
+from stitch.statistics.folds import JointEnd
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
+from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances, whitener
+
+
+class Trial(Protocol):
+    """A model with some columns, in the linear approximation."""
+
+    def solve(self, left_out: Indices | None = None) -> Array:
+        """Coefficients by least squares, without some views."""
+        ...
+
+    def squares(self, coefficients: Array) -> Array:
+        """(units,) sums of squares of what remains, in the terms of residual_rms."""
+        ...
+
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
+        """Sum of squares by which left-out views lie off, in units of their scatter."""
+        ...
+
+    def influential_views(self, coefficients: Array) -> Indices:
+        """Views of which one alone could carry the coefficients."""
+        ...
+
+
+class Observation(Protocol):
+    """What was observed of one session under its model, in its own coordinates."""
+
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Per term how the observation answers to its parameters."""
+        ...
+
+    def reduce(self, response: Array) -> Array:
+        """(n, P) numbers of the channel of a response (·, P)."""
+        ...
+
+    def expand(self, columns: Array) -> Array:
+        """(·, P) a response that has these numbers (n, P) of the channel."""
+        ...
+
+    def trial(
+        self, linear: "LinearModel", response: Array, points: PointSums | None = None, precision: Array | None = None
+    ) -> Trial:
+        """A model with the columns of a response (·, k); `points` belong to its last ones; (k,) prior around zero."""
+        ...
+
+    def touched(self, views: Indices) -> Mask:
+        """(units,) which squares of a trial some views have a part in."""
+        ...
+
+    def folds(self) -> list[Indices]:
+        """Groups of views to leave out."""
+        ...
+
+    def ends(self, joints: Array) -> list[JointEnd]:
+        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
+        ...
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) what numbers (n,) of the channel displace at the part, reference frame, without a common motion."""
+        ...
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """One session under its model: what was seen beside hand-eye, landmarks and effects in use."""
+
+    measurement: Measurement
+    model: Model
+    observation: Observation
+    design: Array  # (·, a) response to hand-eye, landmarks and effects in use
+    mixed: MixedModel  # the same in the channel, with the components of the covariance
+    null: VarianceFit  # fitted without further columns
+
+    @cached_property
+    def satterthwaite(self) -> Satterthwaite:
+        """How well the null's scatter is known."""
+        return satterthwaite(self.mixed, self.null)
+
+    def responses(self, terms: Sequence[Term]) -> list[Response]:
+        """Per term how the observation answers to its parameters."""
+        return self.observation.responses(self.measurement, self.model, terms)
+
+    def reduce(self, response: Array) -> Array:
+        """(n, P) numbers of the channel of a response (·, P)."""
+        return self.observation.reduce(response)
+
+    def in_blocks(self, columns: Array) -> Array:
+        """(B, m, P) columns (n, P) as the variance components take them."""
+        return columns.reshape(*self.mixed.z.shape, columns.shape[1])
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(B, m, m) of the channel under the null."""
+        return self.mixed.covariance(self.null.variances)
+
+    @cached_property
+    def _half(self) -> Array:
+        """(B, m, m) inverse Cholesky factors of the null's covariance."""
+        return whitener(self.mixed, self.null.variances)
+
+    def whiten(self, columns: Array) -> Array:
+        """(n, P) columns of the channel in units of the null's scatter."""
+        return np.asarray((self._half @ self.in_blocks(columns)).reshape(columns.shape))
+
+    @cached_property
+    def white_design(self) -> Array:
+        """(n, a) `design` in units of the null's scatter."""
+        return self.whiten(self.reduce(self.design))
+
+    @cached_property
+    def white_z(self) -> Array:
+        """(n,) what was seen in those units, with all that the model explains."""
+        return self.whiten(self.mixed.z.reshape(-1, 1))[:, 0]
+
+    @cached_property
+    def white_residual(self) -> Array:
+        """(n,) what was seen in those units, without what the model explains."""
+        return self.residual(self.mixed.z.reshape(-1, 1))[:, 0]
+
+    @cached_property
+    def _explained(self) -> Array:
+        """(n, r) orthonormal basis of `white_design`."""
+        return column_space(self.white_design)
+
+    def residual(self, columns: Array) -> Array:
+        """(n, P) whitened columns of the channel, what the model explains projected out."""
+        white = self.whiten(columns)
+        return np.asarray(white - self._explained @ (self._explained.T @ white))
+
+    def conditioned_on(self, columns: Array) -> "LinearModel":
+        """The linear model with further free columns (n, p) of the channel."""
+        mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
+        null = fit_variances(mixed, start=self.null.variances)
+        design = np.hstack([self.design, self.observation.expand(columns)])
+        return replace(self, design=design, mixed=mixed, null=null)
+
+    def trial(self, response: Array, points: PointSums | None = None, precision: Array | None = None) -> Trial:
+        """A model with the columns of a response (·, k)."""
+        return self.observation.trial(self, response, points, precision)
+
+    @cached_property
+    def present(self) -> Trial:
+        """The model as it is."""
+        return self.trial(self.design)
+
+    def touched(self, views: Indices) -> Mask:
+        """(units,) which squares of a trial some views have a part in."""
+        return self.observation.touched(views)
+
+    def folds(self) -> list[Indices]:
+        """Groups of views to leave out."""
+        return self.observation.folds()
+
+    def ends(self) -> list[JointEnd]:
+        """Ends of joints' ranges that may be left out."""
+        return self.observation.ends(self.measurement.views.joints)
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) what numbers (n,) of the channel displace at the part, reference frame."""
+        return self.observation.at_part(numbers)
+
+    def displaced(self) -> Array:
+        """(V, 3) how far every view sits from where the model puts it, at the part, reference frame."""
+        explained = self.reduce((self.design @ self.present.solve())[:, None])[:, 0]
+        return self.at_part(self.mixed.z.ravel() - explained)
+
+    def __repr__(self) -> str:
+        return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"

@@ -1,0 +1,93 @@
+"""The linear model of overlapping surfaces: views freed by their overlaps, read through the visible directions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.model.model import Model
+from stitch.model.term import Term, stacked
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.response import PointSums, Response
+from stitch.observations.surfaces.capture_evidence import jacobian
+from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.pose_channel import PoseChannel, mixed_model, pose_channel
+from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.observations.surfaces.surface_trial import SurfaceTrial
+from stitch.observations.surfaces.view_responses import view_columns, view_responses
+from stitch.statistics.folds import JointEnd, grouped_folds
+from stitch.statistics.identifiability import independent
+from stitch.statistics.variance_components import fit_variances
+
+# Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
+_UNSEEN = 0.25
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """V freed views; a response counts twists (6V, P), the channel their n visible directions."""
+
+    capture: Capture  # without the effects in use
+    freed: FreePoses
+    channel: PoseChannel
+
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Twists (6V, P) of each term, and the sums of point effects."""
+        return view_responses(measurement, model, terms, self.freed)
+
+    def reduce(self, response: Array) -> Array:
+        """(n, P) visible directions of twists (6V, P)."""
+        return np.asarray(self.channel.reduction @ response)
+
+    def expand(self, columns: Array) -> Array:
+        """(6V, P): the pseudo-inverse carries numbers of the channel back to twists."""
+        return np.asarray(np.linalg.pinv(self.channel.reduction) @ columns)
+
+    def trial(
+        self, linear: LinearModel, response: Array, points: PointSums | None = None, precision: Array | None = None
+    ) -> SurfaceTrial:
+        """A model with the columns of twists (6V, k)."""
+        return SurfaceTrial(linear, self.freed, response, points, precision)
+
+    def touched(self, views: Indices) -> Mask:
+        """(pairs,) with one of the views."""
+        return np.asarray(np.isin(self.freed.overlaps.gram.pairs, views).any(axis=1))
+
+    def folds(self) -> list[Indices]:
+        """Groups of views to leave out."""
+        return grouped_folds(self.capture.T_reference_mount, self.freed.overlaps.gram.lever)
+
+    def ends(self, joints: Array) -> list[JointEnd]:
+        """None: what overlaps leave belongs to pairs of views."""
+        return []
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
+        out = self.expand(numbers).reshape(-1, 6)[:, 3:]
+        return np.asarray(out - out.mean(axis=0))
+
+
+def surface_model(measurement: Measurement, model: Model, capture: Capture, freed: FreePoses) -> LinearModel:
+    """Reduce freed views to a linear model.
+
+    Args:
+        capture: without the effects of the model.
+        freed: its views moved by the overlaps alone, from the model's poses.
+    """
+    g, frames_of_mount = freed.overlaps.gram, capture.hand_eye_frames(model.T_mount)
+    channel = pose_channel(g, freed.twists, frames_of_mount, capture.T_reference_flange)
+    extra = view_columns(measurement, model, freed)
+    sizes = np.array([p.typical for p in stacked(model.terms)])
+    field = channel.reduction @ field_scatter(measurement, freed)
+    alone = replace(mixed_model(channel), fixed=(field @ field.T)[None])
+    half = np.linalg.cholesky(alone.covariance(fit_variances(alone, both_starts=True).variances)[0])
+    white = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.reduction @ extra))
+    own, further = white
+    seen = independent(own, further, sizes, _UNSEEN)
+    mixed = replace(mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
+    design = np.hstack([jacobian(frames_of_mount, g.centre), extra[:, seen]])
+    null = fit_variances(mixed, both_starts=True)
+    return LinearModel(measurement, model, Surfaces(capture, freed, channel), design, mixed, null)

@@ -1,0 +1,55 @@
+"""How the views answer to parameters of effects: left twists of every view, as the overlaps would see them.
+
+Effects of robot, mount and part move views as a whole. Effects of points change what the overlaps
+measure; what they look like to the poses is H⁺BᵀWg, with g the change of the distance e per unit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.frames import Array, Indices
+from stitch.measurement.measurement import Measurement
+from stitch.model.forward import moves_points
+from stitch.model.jacobian import shifts, target_shifts, twists
+from stitch.model.model import Model
+from stitch.model.term import Term
+from stitch.observations.response import Response
+from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.point_gram import PointGram, seen_twists, streamed
+
+
+def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term], freed: FreePoses) -> list[Response]:
+    """Per term the twists (6V, P) of the views, and the sums over pairs of those that change the points."""
+    of_points = [term for term in terms if moves_points([term])]
+    sums = _point_gram(measurement, model, of_points, freed) if of_points else None
+    seen = seen_twists(sums, freed) if sums else None
+    out, at = [], 0
+    for term in terms:
+        if sums is not None and seen is not None and moves_points([term]):
+            own = slice(at, at + len(term.parameters))
+            out.append(Response(seen[:, own], sums.of(own)))
+            at = own.stop
+        else:
+            found = twists(measurement, model, term, freed.overlaps.gram.centre)
+            out.append(Response(np.asarray(found.reshape(len(found), -1).T), None))
+    return out
+
+
+def view_columns(measurement: Measurement, model: Model, freed: FreePoses) -> Array:
+    """(6V, P) twists of the views for all parameters of the effects in use."""
+    found = [r.columns for r in view_responses(measurement, model, model.terms, freed)]
+    return np.hstack([np.zeros((6 * len(freed.poses), 0)), *found])
+
+
+def _point_gram(measurement: Measurement, model: Model, terms: Sequence[Term], freed: FreePoses) -> PointGram:
+    """Sums over the correspondences for all parameters of point effects."""
+
+    def of_points(v: int, index: Indices) -> Array:
+        pose = freed.poses[v]
+        return np.concatenate([shifts(measurement, model, term, v=v, pose=pose, index=index) for term in terms])
+
+    def of_targets() -> Array:
+        return np.concatenate([target_shifts(measurement, model, term, freed.poses) for term in terms])
+
+    return streamed(freed, measurement.capture.noise_factor, of_points, of_targets)

@@ -1,0 +1,60 @@
+"""What the labelled points of one session say under a fitted model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.model.model import Model
+from stitch.observations.targets.landmarks import Landmarks
+from stitch.observations.targets.rows import Rows
+
+
+@dataclass(frozen=True)
+class TargetFit:
+    """Model, places of the targets and scatter of the poses; lengths in length_unit, angles in rad."""
+
+    model: Model
+    inflation: float  # factor on the covariance that views left out ask for, ≥ 1
+    landmarks: Landmarks
+    landmarks_covariance: Array  # (U, U)
+    variances: Array  # (3,) of rotation scatter, translation scatter, factor on the sensor's noise
+    rows: Rows  # at the solution
+    heldout: Array  # (V, S) distances of targets predicted without their own views; NaN where none was seen
+    history: tuple[float, ...]  # 3D rms per iteration
+
+    @property
+    def rms(self) -> float:
+        """3D root mean square over all targets of all views."""
+        return rms_of(self.rows.distances(self.rows.residual))
+
+    @property
+    def heldout_rms(self) -> float:
+        """The same for targets predicted without their own views."""
+        return rms_of(self.heldout)
+
+    @property
+    def noise_floor(self) -> float:
+        """What the sensor's own noise would leave of it if every pose were perfect."""
+        noise = self.rows.noise[: len(self.rows.lever), : self.rows.positions]
+        return float(np.sqrt(3 * np.mean(noise[noise > 0])))
+
+    @property
+    def target_rms(self) -> Array:
+        """(K,) rms distance of the views from every target; NaN for one that nobody sees."""
+        s, distances = self.rows.sightings, self.rows.distances(self.rows.residual)
+        return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)])
+
+    @property
+    def landmark_sigmas(self) -> Array:
+        """(K, 3) of the targets' places."""
+        K = len(self.landmarks.positions)
+        return np.sqrt(np.maximum(np.diag(self.landmarks_covariance)[: 3 * K], 0)).reshape(K, 3)
+
+    def __repr__(self) -> str:
+        return f"TargetFit({len(self.landmarks.positions)} targets, rms {self.rms:.3g}, {self.model!r})"
+
+
+def rms_of(distances: Array) -> float:
+    """Root mean square, NaN left out."""
+    return float(np.sqrt(np.nanmean(distances**2)))

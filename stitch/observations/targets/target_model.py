@@ -1,0 +1,93 @@
+"""The linear model of labelled points and probes: rows beside hand-eye and landmarks; every view is a block."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.measurement import Measurement
+from stitch.model.forward import corrected
+from stitch.model.model import Model
+from stitch.model.term import Term, stacked
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.response import PointSums, Response
+from stitch.observations.targets.landmarks import Drawing, Landmarks, initial_landmarks
+from stitch.observations.targets.rows import Rows, effect_columns, effect_rows, mixed_model_of_rows, rows_of
+from stitch.observations.targets.target_trial import TargetTrial
+from stitch.statistics.folds import JointEnd, grouped_folds, joint_ends
+from stitch.statistics.identifiability import independent
+from stitch.statistics.parameter_selection import UNSEEN
+from stitch.statistics.variance_components import fit_variances, whitener
+
+
+@dataclass(frozen=True)
+class Targets:
+    """A response counts rows: n = B·m of them, those of absent targets at zero."""
+
+    rows: Rows
+    landmarks: Landmarks
+
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Rows (n, P) of each term."""
+        found = [effect_rows(self.rows, measurement, model, term) for term in terms]
+        return [Response(c.reshape(self.rows.residual.size, c.shape[2])) for c in found]
+
+    def reduce(self, response: Array) -> Array:
+        """(n, P): the rows themselves."""
+        return response
+
+    def expand(self, columns: Array) -> Array:
+        """(n, P): the rows themselves."""
+        return columns
+
+    def trial(
+        self, linear: LinearModel, response: Array, points: PointSums | None = None, precision: Array | None = None
+    ) -> TargetTrial:
+        """A model with the columns of rows (n, k)."""
+        return TargetTrial(self.rows, linear.covariance, linear.in_blocks(response), precision)
+
+    def touched(self, views: Indices) -> Mask:
+        """(V,) the views themselves."""
+        return np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
+
+    def folds(self) -> list[Indices]:
+        """Groups of views to leave out."""
+        return grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)
+
+    def ends(self, joints: Array) -> list[JointEnd]:
+        """Both ends of every joint's range, of the views that show a target."""
+        return joint_ends(joints, np.flatnonzero(self.rows.used.any(axis=1)))
+
+    def at_part(self, numbers: Array) -> Array:
+        """(V, 3) mean displacement of the targets that a view shows; zero for one that shows none."""
+        V = len(self.rows.lever)
+        shown = self.rows.used[:, : self.rows.positions : 3]
+        moved = numbers.reshape(self.rows.residual.shape)[:V, : self.rows.positions].reshape(V, -1, 3)
+        return np.asarray(moved.sum(axis=1) / np.maximum(shown.sum(axis=1), 1)[:, None])
+
+
+def target_model(measurement: Measurement, model: Model, drawing: Drawing | None) -> LinearModel:
+    """Linearise the labelled points of a session about its model.
+
+    Args:
+        measurement: with the sightings that count.
+    """
+    own = corrected(measurement, model)
+    landmarks = initial_landmarks(own, model.T_mount, drawing)
+    rows = rows_of(own, model.T_mount, landmarks)
+    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
+    extra = effect_columns(rows, measurement, model)
+    parameters = stacked(model.terms)
+    sizes = np.array([p.typical for p in parameters])
+    # Parameters that the fit left at zero are not in the model.
+    used = np.array([p.value != 0 and not p.discrete for p in parameters], bool)
+    whole = mixed_model_of_rows(rows, np.concatenate([base, extra[..., used]], axis=2))
+    half = whitener(whole, fit_variances(whole, both_starts=True).variances)
+    n = rows.residual.size
+    own_columns, further = ((half @ c).reshape(n, c.shape[2]) for c in (base, extra))
+    seen = used & independent(own_columns, further * used, sizes, 1 / UNSEEN)
+    A = np.concatenate([base, extra[..., seen]], axis=2)
+    mixed = mixed_model_of_rows(rows, A)
+    null = fit_variances(mixed, both_starts=True)
+    return LinearModel(measurement, model, Targets(rows, landmarks), A.reshape(n, -1), mixed, null)

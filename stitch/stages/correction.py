@@ -1,0 +1,21 @@
+"""What the correction of a model from overlapping surfaces found."""
+
+from dataclasses import dataclass
+
+from stitch.frames import Array
+from stitch.measurement.capture import Capture
+from stitch.model.model import Model
+from stitch.observations.surfaces.hand_eye import HandEye
+from stitch.observations.surfaces.overlaps import Overlaps
+
+
+@dataclass(frozen=True)
+class Correction:
+    """The model of a rig; overlaps, freed poses and captures in the order of its sessions."""
+
+    model: Model
+    hand_eye: HandEye  # its statistics
+    overlaps: tuple[Overlaps, ...]
+    freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
+    history: tuple[float, ...]  # rms per iteration
+    captures: tuple[Capture, ...]  # without the effects in use

@@ -1,0 +1,115 @@
+"""The one fit of hand-eye, effects and whatever else is unknown: linearise, choose what is fitted, solve, repeat.
+
+What was observed says how: overlapping surfaces of all sessions of a rig (`fit_surfaces.py`), or labelled points
+(`fit_targets.py`).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from stitch.effects.groups import one_by_one
+from stitch.frames import Mask
+from stitch.model.model import Model
+from stitch.model.term import Term, stacked
+from stitch.statistics.identifiability import independent
+from stitch.statistics.parameter_selection import UNSEEN, Whitened, supported
+
+# Iterations in which it is still open what is fitted.
+_CHOOSING = 2
+# The prior of a fitted parameter about zero, in plausible sizes: it keeps the unseen finite, moves nothing else.
+WEAK = 10.0
+
+
+class Step(Protocol):
+    """One step of a fit."""
+
+    @property
+    def model(self) -> Model:
+        """The model after the step."""
+        ...
+
+    @property
+    def moved(self) -> float:
+        """The largest move of an unknown in its sigmas."""
+        ...
+
+    @property
+    def rms(self) -> float:
+        """What remained before the step, length_unit."""
+        ...
+
+
+StepT = TypeVar("StepT", bound=Step)
+StepT_co = TypeVar("StepT_co", bound=Step, covariant=True)
+
+
+class Linearised(Protocol[StepT_co]):
+    """What was observed, linearised about a model."""
+
+    def choose(self, before: Any) -> Any:
+        """What is fitted, given what was so far: None at first."""
+        ...
+
+    def solve(self, choice: Any) -> StepT_co:
+        """The step of all unknowns."""
+        ...
+
+
+class Problem(Protocol[StepT]):
+    """What was observed, ready to be linearised about any model."""
+
+    @property
+    def maximum_iterations(self) -> int: ...
+    @property
+    def converged(self) -> float:
+        """Moves below so many sigmas end the fit."""
+        ...
+
+    def linearise(self, model: Model, previous: StepT | None) -> Linearised[StepT]:
+        """About a model, with what the step before knows beside it."""
+        ...
+
+
+def iterate(problem: Problem[StepT], model: Model) -> tuple[StepT, list[float]]:
+    """The last step from a model that is near, converged or the last allowed, and the rms before every step.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    step: StepT | None = None
+    choice: Any = None
+    history: list[float] = []
+    while step is None or (len(history) < problem.maximum_iterations and step.moved >= problem.converged):
+        linearised = problem.linearise(model, step)
+        if choice is None or len(history) < _CHOOSING:
+            choice = linearised.choose(choice)
+        step = linearised.solve(choice)
+        model = step.model
+        history.append(step.rms)
+    return step, history
+
+
+def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], Whitened]) -> Mask:
+    """(P,) parameters that the views support and can tell apart.
+
+    Args:
+        before: (P,) what explained scatter so far.
+        whitened: the observation in units of the scatter that is left when some parameters explain theirs.
+    """
+    sizes = np.array([p.typical for p in stacked(terms)])
+    groups, effects, at = list[list[int]](), list[int](), 0
+    for number, term in enumerate(terms):
+        own = one_by_one(term.effect, term.parameters)
+        groups += [[at + i for i in group] for group in own]
+        effects += [number] * len(own)
+        at += len(term.parameters)
+    if not groups:
+        return before
+    free = before
+    for _ in range(_CHOOSING):
+        # What is found explains scatter, and less scatter shows more.
+        free = supported(whitened(free), sizes, groups, effects)
+    seen = whitened(free)
+    return np.logical_and(free, independent(seen.base, seen.further * free, sizes, 1 / UNSEEN))

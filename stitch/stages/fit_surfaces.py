@@ -1,0 +1,153 @@
+"""Hand-eye and effects from overlapping surfaces: match anew, free the views, generalised least squares."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.frames import Array, Mask
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.model.forward import corrected
+from stitch.model.model import Model
+from stitch.model.term import split, stacked
+from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.observations.surfaces.pose_channel import whitened
+from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.observations.surfaces.view_responses import view_columns
+from stitch.stages.correction import Correction
+from stitch.stages.fit import WEAK, fitted_parameters, iterate
+from stitch.statistics.parameter_selection import Whitened, omitted_rms
+
+
+@dataclass(frozen=True)
+class _Choice:
+    fitted: Mask  # (P,)
+    omitted: Array  # (P,) rms that parameters at zero may well have
+    repeating: list[Array]  # per session (6V, K) of errors that all views have in common
+
+
+@dataclass(frozen=True)
+class _Step:
+    model: Model
+    moved: float
+    rms: float
+    hand_eye: HandEye
+    fitted: Mask
+    freed: list[FreePoses]
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Freed views of all sessions about a model; P parameters of effects."""
+
+    measurements: Sequence[Measurement]
+    model: Model
+    captures: tuple[Capture, ...]
+    freed: list[FreePoses]
+    columns: list[Array]  # per session (6V, P)
+
+    @property
+    def values(self) -> Array:
+        """(P,) of the effects at which the views were freed."""
+        return np.array([p.value for p in stacked(self.model.terms)], float)
+
+    @property
+    def sizes(self) -> Array:
+        """(P,) plausible ones."""
+        return np.array([p.typical for p in stacked(self.model.terms)], float)
+
+    def choose(self, before: _Choice | None) -> _Choice:
+        # What the scanner repeats hardly changes with the last micrometres.
+        repeating = field_scatters(self.measurements, self.freed)
+        fitted = np.zeros(len(self.values), bool) if before is None else before.fitted
+        fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
+        omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted)
+        return _Choice(fitted, np.where(self._held, 0.0, omitted), repeating)
+
+    def solve(self, choice: _Choice) -> _Step:
+        fitted, before = choice.fitted, self.values
+        # A parameter at zero that is not zero errs alike in every view, as the scanner does.
+        repeating = [np.hstack([r, c * choice.omitted]) for r, c in zip(choice.repeating, self.columns, strict=True)]
+        columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
+        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating)
+        values = before.copy()
+        # What the views cannot see stays at zero; the time of an event stays where it was found.
+        values[~self._held] = 0.0
+        values[fitted] = found.values
+        moved = float(np.max(np.abs(values - before)[fitted] / found.values_sigma, initial=0.0))
+        return _Step(
+            model=Model(found.T_mount, split(self.model.terms, values), found.covariance),
+            moved=moved,
+            rms=float(np.median([f.overlaps.gram.rms for f in self.freed])),
+            hand_eye=found,
+            fitted=fitted,
+            freed=self.freed,
+        )
+
+    @property
+    def _held(self) -> Mask:
+        return np.array([bool(p.grid) for p in stacked(self.model.terms)], bool)
+
+    def _whitened(self, free: Mask) -> Whitened:
+        channels = [(c, f, extra) for c, f, extra in zip(self.captures, self.freed, self.columns, strict=True)]
+        return whitened(channels, self.model.T_mount, self.values, free)
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """The overlapping surfaces of all sessions of a rig."""
+
+    measurements: Sequence[Measurement]
+    gates: Sequence[float]  # per session the first distance between partners, length_unit
+    maximum_iterations: int = 6
+    converged: float = 0.05
+
+    def linearise(self, model: Model, previous: _Step | None) -> _Linearised:
+        captures, freed = _free(self.measurements, model, self.gates)
+        columns = [view_columns(m, model, f) for m, f in zip(self.measurements, freed, strict=True)]
+        return _Linearised(self.measurements, model, captures, freed, columns)
+
+
+def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Sequence[float]) -> Correction:
+    """Hand-eye and effects that all sessions of a rig share.
+
+    Args:
+        model: effects in use with the values to begin with.
+        gates: per session the first distance between partners, length_unit.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    last, history = iterate(_Surfaces(measurements, gates), model)
+    sigmas = np.full(len(last.fitted), np.nan)
+    sigmas[last.fitted] = np.sqrt(np.diag(last.hand_eye.values_covariance))
+    values = np.array([p.value for p in stacked(last.model.terms)], float)
+    model = replace(last.model, terms=split(last.model.terms, values, sigmas))
+    captures, freed = _free(measurements, model, [f.overlaps.gate for f in last.freed])
+    overlaps = [_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True)]
+    return Correction(
+        model=model,
+        hand_eye=last.hand_eye,
+        overlaps=tuple(overlaps),
+        freed=tuple(f.poses for f in freed),
+        history=tuple(history),
+        captures=captures,
+    )
+
+
+def _free(
+    measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+) -> tuple[tuple[Capture, ...], list[FreePoses]]:
+    captures = tuple(corrected(measurement, model) for measurement in measurements)
+    return captures, [free_poses(c, c.poses(model.T_mount), gate) for c, gate in zip(captures, gates, strict=True)]
+
+
+def _final_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
+    """Correspondences of the model's own poses; the gate follows what they leave."""
+    samples = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
+    overlaps = collect(capture, capture.poses(T_mount), gate, samples)
+    return collect(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples)

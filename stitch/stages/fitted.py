@@ -1,0 +1,74 @@
+"""What a fit of one rig found, whatever was observed."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.model import Model
+from stitch.model.model_toml import ModelFile
+from stitch.model.term import Term
+from stitch.runs.recorder import Recorder
+from stitch.runs.run import StageResult
+from stitch.stages.coarse import Coarse
+from stitch.stages.correction import Correction
+from stitch.stages.finish import Finished
+from stitch.stages.outlier_removal import FittedSession
+
+# From a measurement, its model and the gate to the terms that effects begin with.
+TermsAt = Callable[[Measurement, Model, float], Sequence[Term]]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The common model of a rig, and its sessions as they count."""
+
+    model: Model
+    sessions: list[FittedSession]
+    captures: list[Capture]  # without the effects in use
+    correction: Correction | None = None  # of surfaces
+
+
+class Course(Protocol):
+    """How a run goes with what was observed; a further kind of observation is one more module with these functions."""
+
+    def start(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> Coarse:
+        """The hand-eye to begin with."""
+        ...
+
+    def begin(self, measurement: Measurement, begun: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+        """How well the views agree under it."""
+        ...
+
+    def fit(
+        self,
+        sessions: Sequence[Session],
+        measurements: Sequence[Measurement],
+        begun: Coarse,
+        terms_at: TermsAt | None,
+        recorder: Recorder,
+    ) -> Fitted:
+        """Hand-eye and effects from the coarse hand-eye on."""
+        ...
+
+    def refit(
+        self, sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+    ) -> Fitted:
+        """Hand-eye and the effects of a model fitted anew from where it stands."""
+        ...
+
+    def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
+        """The sessions under a model of another run as it is."""
+        ...
+
+    def finish(
+        self, session: Session, fitted: Fitted, index: int, before: StageResult, recorder: Recorder, seconds: float
+    ) -> Finished:
+        """Single views registered, and fused."""
+        ...
+
+    def notes(self, session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[str, ...]:
+        """What a user should know before trusting the result."""
+        ...

@@ -1,0 +1,131 @@
+"""The result of a run in plain sentences."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.targets.outliers import Outlier
+from stitch.observations.targets.target_fit import TargetFit
+from stitch.stages.coarse import Coarse
+from stitch.units import MICROMETRES
+
+# Residuals within a quarter of the noise floor's square are noise; above, something else is there.
+_NEAR_FLOOR = 1.1
+# Sigmas that were widened by more than this factor on the variance are worth a note.
+_WIDENED = 2.5
+# Two answers of the search whose scores differ by less than this ratio are equally good.
+_CLOSE = 1.1
+_LISTED = 12
+
+
+def surface_sentence(residual: float, registered: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
+    """What one hand-eye leaves between the surfaces, what the noise would leave, and where the difference sits."""
+    to_um = MICROMETRES[length_unit]
+    left, noise = (f"{x * to_um:.3g} µm" for x in (residual, floor))
+    if residual < _NEAR_FLOOR * floor:
+        return f"One hand-eye closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."
+    return (
+        f"One hand-eye leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
+        f"{_scatter(scatter, registered, to_um)}."
+    )
+
+
+def target_sentence(found: TargetFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
+    """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
+    to_um, floor = MICROMETRES[length_unit], found.noise_floor
+    left, out, noise = (f"{x * to_um:.4g} µm" for x in (found.rms, found.heldout_rms, floor))
+    if found.rms < _NEAR_FLOOR * floor:
+        return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
+    return (
+        f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; the "
+        f"sensor's own noise would leave {noise}. The robot's poses {_scatter(scatter, registered, to_um)}."
+    )
+
+
+def _scatter(scatter: Repeatability, registered: float, to_um: float) -> str:
+    return (
+        f"scatter by {scatter.translation * to_um:.3g} µm and {scatter.rotation * 1e3:.2g} mrad; moving each view by "
+        f"its own correction leaves {registered * to_um:.3g} µm"
+    )
+
+
+def correct_note(before: float, after: float) -> str:
+    """Why the correction may leave a larger rms than it found."""
+    if after > before:
+        return "views weighed by the robot's scatter: the hand-eye is more certain, single overlaps fit less tightly"
+    return ""
+
+
+def coarse_note(start: Coarse) -> str:
+    """Where the hand-eye came from, and how far the second answer was."""
+    if not start.candidates:
+        return start.source
+    best = start.candidates[0]
+    tried = sum(c.reached for c in start.candidates)
+    found = f"found from {best.source}; {best.reached} of {tried} starts ended there"
+    if len(start.candidates) == 1:
+        return f"{found}, no other answer"
+    return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
+
+
+def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
+    """What a user should know before trusting the hand-eye."""
+    notes = []
+    if start.candidates and start.runner_up_ratio < _CLOSE:
+        notes.append(
+            f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}): "
+            "give scanner.pose, or add views with other orientations."
+        )
+    if inflation > _WIDENED:
+        notes.append(
+            f"Few views, or views that leave the hand-eye {np.sqrt(inflation):.1f} times less certain than independent "
+            "pose errors would: its sigma was widened by that factor."
+        )
+    return tuple(notes)
+
+
+def target_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+    """Outliers by name, targets seen once, clouds that were not used, and a covariance that had to be widened."""
+    notes = _left_out(found, outliers, session)
+    if any(view.cloud is not None for view in session.views):
+        notes.append("Some views have no cloud: only the labelled points were fitted.")
+    if found.inflation > _WIDENED:
+        notes.append(
+            f"Views near each other err alike: all sigmas are {np.sqrt(found.inflation):.1f} times those of "
+            "independent pose errors."
+        )
+    return tuple(notes)
+
+
+def mixed_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+    """Outliers by name, targets seen once, and what is not used of labelled points beside clouds."""
+    notes = _left_out(found, outliers, session)
+    if session.nominal is not None:
+        notes.append("Nominal positions (targets.csv) are not used beside clouds; the targets' places were free.")
+    if found.landmarks.orientation is not None:
+        notes.append("Of the probe in frames.csv only the place counts beside clouds, not its turn.")
+    return tuple(notes)
+
+
+def _left_out(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
+    to_um = MICROMETRES[session.length_unit]
+    notes = []
+    if outliers:
+        named_outliers = [
+            f"{named(o, session)} ({o.distance * to_um:.3g} µm, {o.times:.0f} times the usual)" for o in outliers
+        ]
+        more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""
+        notes.append(f"Not used, because they contradict the rest: {', '.join(named_outliers[:_LISTED])}{more}.")
+    sightings = found.rows.sightings
+    once = [name for name, n in zip(sightings.targets, sightings.seen, strict=True) if n < 2]
+    if once:
+        notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(once)}.")
+    return notes
+
+
+def named(outlier: Outlier, session: Session) -> str:
+    """An outlier by the names of its view and target."""
+    view = session.views[outlier.view].name
+    return f"view {view}" if outlier.target is None else f"{outlier.target} in view {view}"

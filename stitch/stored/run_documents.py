@@ -1,0 +1,91 @@
+"""result.json and ledger.json of a run folder, checked: a person may have edited them, or a disk cut them short."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from jsonschema import Draft202012Validator
+from jsonschema.exceptions import best_match
+
+from stitch.errors import InputError
+from stitch.reading.text_file import read_text, shortened
+
+_TEXT = {"type": "string"}
+_NUMBER = {"type": "number"}
+_MAYBE = {"type": ["number", "null"]}  # JSON has no NaN
+_COUNT = {"type": "integer", "minimum": 0}
+
+
+def _list(items: dict[str, Any], length: int | None = None) -> dict[str, Any]:
+    exact = {} if length is None else {"minItems": length, "maxItems": length}
+    return {"type": "array", "items": items} | exact
+
+
+def _table(required: dict[str, Any], **optional: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": required | optional, "required": list(required)}
+
+
+_MATRIX = _list(_list(_NUMBER, 4), 4)
+_STAGE = {"name": _TEXT, "rms": _MAYBE, "correspondences": _COUNT, "iterations": _COUNT, "seconds": _NUMBER}
+_VIEW = {"view": _TEXT, "pose": _MATRIX, "correction": _list(_NUMBER, 6), "rms": _MAYBE}
+_PARAMETER = _table({"value": _NUMBER})
+RESULT = _table(
+    {
+        "session": {"type": "string", "pattern": "^[^\\u0000]+$"},
+        "hand_eye": _MATRIX,
+        "residual_rms": _NUMBER,
+        "heldout_rms": _MAYBE,
+        "noise_floor": _NUMBER,
+        "effects": {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _PARAMETER}},
+        "stages": _list(_table(_STAGE, note=_TEXT)),
+        "views": _list(_table(_VIEW)),
+        "unobservable": _list(_TEXT),
+        "repeatability": _table({"rotation": _MAYBE, "translation": _MAYBE}),
+        "verdict": _TEXT,
+        "notes": _list(_TEXT),
+        "convergence": {"type": "object", "additionalProperties": _list(_MAYBE)},
+    },
+    outliers=_list(_table({"view": _TEXT, "target": {"type": ["string", "null"]}})),
+    cloud_noise_factor=_NUMBER,
+)
+_STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
+LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}))
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """result.json of a run folder.
+
+    Raises:
+        InputError: missing, no JSON, or an entry of another kind than stitch writes; names the entry.
+    """
+    document = _checked(folder / "result.json", RESULT)
+    assert isinstance(document, dict)
+    return document
+
+
+def read_ledger(folder: Path) -> list[dict[str, Any]]:
+    """ledger.json of a run folder, a step per change of the model.
+
+    Raises:
+        InputError: as `read_result`.
+    """
+    steps = _checked(folder / "ledger.json", LEDGER)
+    assert isinstance(steps, list)
+    return steps
+
+
+def _checked(file: Path, schema: dict[str, Any]) -> Any:
+    told = read_text(file, "name a run folder that `stitch run` wrote")
+    try:
+        document = json.loads(told, parse_constant=_refused)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: damaged ({shortened(str(error))}); run `stitch run` again") from None
+    error = best_match(Draft202012Validator(schema).iter_errors(document))
+    if error is not None:
+        place = ".".join(str(step) for step in error.absolute_path) or "the document"
+        raise InputError(f"{file}: damaged ({place}: {shortened(error.message, 160)}); run `stitch run` again")
+    return document
+
+
+def _refused(word: str) -> float:
+    raise ValueError(f"{word} is no number")

@@ -1,0 +1,24 @@
+"""Two paths exchange their places in one step that nothing can interrupt."""
+
+import ctypes
+import os
+import sys
+from pathlib import Path
+
+_HERE = -100  # AT_FDCWD of Linux
+_EXCHANGE = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
+
+
+def exchange(first: Path, second: Path) -> bool:
+    """Exchange two existing paths of one file system; False where the system or the file system cannot.
+
+    Source: renameat2(2) of Linux, renamex_np(2) of macOS.
+    """
+    a, b = os.fsencode(first), os.fsencode(second)
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if sys.platform == "darwin":
+            return libc.renamex_np(a, b, ctypes.c_uint(_EXCHANGE)) == 0
+        return libc.renameat2(_HERE, a, _HERE, b, ctypes.c_uint(_EXCHANGE)) == 0
+    except (AttributeError, OSError, TypeError):
+        return False

@@ -1,0 +1,91 @@
+"""What in a run folder is the run's, and may be replaced; everything else there is a person's own."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from stitch.errors import InputError
+from stitch.system.whole_folder import Ours
+
+_FORMAT = "stitch-run/1"
+# Every file that a command writes into a run folder. What is not listed here is never removed.
+FILES = {
+    "model.toml", "result.json", "ledger.json", "stitched.ply", "mesh.ply", "residuals.parquet", "recording.rrd",
+    "report.html", "compare.json", "diagnosis.json", "diagnosis.rrd", "robot.toml", "robot.urdf",
+}  # fmt: skip
+_PICTURES = {
+    "budget", "suspects", "candidates", "added_variable", "shape", "aliases", "views", "compare",
+}  # fmt: skip
+
+
+def ours(path: Path) -> Ours:
+    """Whether a path inside the run folder `path` was written by stitch."""
+    inner = set(_inner(path))
+
+    def is_ours(inside: Path) -> bool:
+        if inside.parts[0] in inner:
+            inside = inside.relative_to(inside.parts[0])
+        match inside.parts:
+            case (name,):
+                return name in FILES or (name.startswith(".") and name.endswith(".new") and name[1:-4] in FILES)
+            case ("pictures", _):
+                return inside.stem in _PICTURES and inside.suffix in (".png", ".svg")
+        return False
+
+    return is_ours
+
+
+def sessions_in(path: Path) -> list[str] | None:
+    """Paths of the sessions of a run folder as it states them; None for a folder that is no run."""
+    if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
+        return None
+    told = [_session(file) for file in (path / "result.json", *(path / name / "result.json" for name in _inner(path)))]
+    found = [session for session in told if session is not None]
+    return found or None
+
+
+def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
+    """Refuse a place for a run of `sessions` where something would be lost.
+
+    Raises:
+        InputError: `path` lies in a session, holds one, holds the present folder, is no run, or is one of other
+            sessions and not to be replaced by `force`.
+    """
+    target, here = path.resolve(), Path.cwd()
+    if target in (here, *here.parents):
+        raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
+    own = [session.resolve() for session in sessions]
+    for folder in (target, *target.parents):
+        if folder in own or (folder / "session.toml").is_file():
+            raise InputError(f"{path}: lies in the session {folder}, which is only read; name another folder with -o")
+    for session in own:
+        if target in session.parents:
+            raise InputError(f"{path}: the session {session} lies in it; name another folder with -o")
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if (before := sessions_in(target)) is None:
+        raise InputError(f"{path}: exists and is not a run folder; name another with -o")
+    if not force and {str(Path(s).resolve()) for s in before} != {str(s) for s in own}:
+        raise InputError(
+            f"{path}: holds the run of {', '.join(before)}; name another with -o, or replace it with --force"
+        )
+
+
+def _inner(path: Path) -> list[str]:
+    """Names of the runs in the folder of a rig, which has no result of its own."""
+    if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():
+        return []
+    return sorted(file.parent.name for file in path.glob("*/result.json") if _session(file) is not None)
+
+
+def _session(file: Path) -> str | None:
+    if not file.is_file():
+        return None
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        return None
+    session = document.get("session")
+    return session if isinstance(session, str) and "\0" not in session else None

@@ -1,0 +1,245 @@
+"""Programs of four controllers, against rotations written out by hand; broken programs and tables."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from stitch import frames
+from stitch.cli import main as cli
+from stitch.controllers.importer import import_file
+from stitch.controllers.taught import fixed_xyz, quaternion_w_first, rotation_vector, zyx
+from stitch.errors import InputError, NoResultError
+from stitch.reading.dh_rows import robot_from_dh
+from stitch.reading.views_csv import read_views
+
+
+def about(axis, degrees):
+    """Elementary rotation matrices from cosines and sines."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return {
+        "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+        "y": np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
+        "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
+    }[axis]
+
+
+FANUC = """/PROG  SCAN1
+/ATTR
+COMMENT\t\t= "sphere";
+/MN
+   1:J P[1] 100% FINE    ;
+/POS
+P[1:"above"]{
+   GP1:
+\tUF : 1, UT : 2,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX =  -195.800  mm,\tY =  1363.305  mm,\tZ =   524.812  mm,
+\tW =  -179.111 deg,\tP =     -.087 deg,\tR =    20.366 deg
+};
+P[2]{
+   GP1:
+\tUF : 1, UT : 2,\t
+\tJ1=    10.000 deg,\tJ2=   -20.500 deg,\tJ3=    30.000 deg,
+\tJ4=     0.000 deg,\tJ5=   -45.000 deg,\tJ6=    90.000 deg
+   GP2:
+\tUF : 1, UT : 2,\t
+\tJ1=    99.000 deg
+};
+/END
+"""
+
+
+KUKA_DAT = """&ACCESS RVP
+DEFDAT SCAN PUBLIC
+;FOLD
+DECL E6POS XP1={X 1025.0,Y -12.5,Z 1480.0,A 10.0,B 20.0,C 30.0,S 2,T 35,E1 0.0,E2 0.0,E3 0.0,E4 0.0,E5 0.0,E6 0.0}
+DECL FDAT FP1={TOOL_NO 1,BASE_NO 0,IPO_FRAME #BASE,POINT2[] " "}
+GLOBAL E6AXIS XHOME={A1 0.0,A2 -90.0,A3 90.0,A4 0.0,A5 0.0,A6 1.5E1,E1 0.0}
+ENDDAT
+"""
+
+
+KUKA_SRC = """DEF SCAN ( )
+;FOLD PTP HOME Vel=100 % DEFAULT
+PTP XHOME
+;LIN XNOWHERE
+LIN XP1
+PTP {A1 5.0,A2 -80.0,A3 80.0,A4 0.0,A5 10.0,A6 0.0}
+SLIN {X 1.0,Y 2.0,Z 3.0,A 90.0,B 0.0,C 0.0}
+END
+"""
+
+
+ABB = """MODULE Scan
+  ! CONST robtarget pOld:=[[0,0,0],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  CONST robtarget p10:=[[600,-5.5,800],[0.707107,0,0.707107,0],[0,-1,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  LOCAL PERS robtarget p20 := [[1,2,3],
+     [0.965926,0.258819,0,0],[0,0,0,0],[9E+09,9E+09,9E+09,9E+09,9E+09,9E+09]];
+  TASK PERS jointtarget home:=[[0,10,-20,30,-40,50],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  CONST robtarget many{2}:=[[[1,0,0],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],[[2,0,0],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]];
+  PROC main()
+    MoveL p10, v100, fine, tool0;
+    MoveAbsJ [[1,2,3,4,5,6],[9E9,9E9,9E9,9E9,9E9,9E9]]\\NoEOffs, v100, fine, tool0;
+    MoveJ [[7,8,9],[0,0,1,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]], v100, z10, tool0;
+  ENDPROC
+ENDMODULE
+"""
+
+
+UR = """def scan():
+  global Waypoint_1_p=p[-.1, .2, .3, 2.221441469, -2.221441469, 0.0]
+  global Waypoint_1_q=[0.5, -1.5, 1.0, -1.0, -1.57, 0.1]
+  payload = [1, 2, 3]
+  corner = p[x0, 0, 0, 0, 0, 0]
+  # movel(p[9,9,9,0,0,0])
+  movej(Waypoint_1_q, a=1.4, v=1.05)
+  movel(p[0.4, 0.0, 0.25, 0, 0, 1.5707963268], a=1.2, v=0.25)
+  movej([0, -1.57, 0, -1.57, 0, 0])
+end
+"""
+
+
+def rows(tmp_path, name, text, **options):
+    """Views as the session's own reader sees them, by name."""
+    file = tmp_path / name
+    file.write_text(text)
+    imported = import_file(file, **options)
+    views = tmp_path / "views.csv"
+    views.write_text(imported.text)
+    robot = None
+    if "j1_deg" in imported.text:
+        robot = robot_from_dh(
+            "r", "standard", [{"a": 0, "alpha_deg": 90, "d": 100, "theta_deg": 0}] * 6, None, np.zeros(3), "mm"
+        )
+    return {row.name: row for row in read_views(views, robot)}, imported
+
+
+def test_orientations_by_hand():
+    assert fixed_xyz(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(
+        about("z", 30) @ about("y", 20) @ about("x", 10)
+    )
+    assert zyx(np.array([1, 2, 3, 10, 20, 30.0]))[:3, :3] == pytest.approx(
+        about("z", 10) @ about("y", 20) @ about("x", 30)
+    )
+    half = np.sqrt(0.5)
+    assert quaternion_w_first(np.array([0, 0, 0, half, 0, half, 0]))[:3, :3] == pytest.approx(about("y", 90))
+    turn = rotation_vector(np.array([0.1, 0, 0, 0, 0, np.pi / 2]))
+    assert turn[:3, :3] == pytest.approx(about("z", 90)) and turn[0, 3] == pytest.approx(100)
+    flip = rotation_vector(np.array([0, 0, 0, np.pi * half, -np.pi * half, 0]))
+    assert flip[:3, :3] == pytest.approx(np.array([[0, -1, 0], [-1, 0, 0], [0, 0, -1.0]]))
+
+
+def test_fanuc(tmp_path):
+    views, imported = rows(tmp_path, "SCAN1.LS", FANUC)
+    T = views["above"].T_base_flange
+    assert T[:3, 3] == pytest.approx([-195.8, 1363.305, 524.812])
+    assert T[:3, :3] == pytest.approx(about("z", 20.366) @ about("y", -0.087) @ about("x", -179.111), abs=1e-8)
+    assert np.degrees(views["P2"].joints) == pytest.approx([10, -20.5, 30, 0, -45, 90])
+    assert "UF 1, UT 2" in imported.warnings[0]
+
+
+def test_frame_and_tool_lead_to_the_flange(tmp_path):
+    views, imported = rows(tmp_path, "S.ls", FANUC, frame="1000,0,0,0,0,90", tool="0,0,150,0,0,0")
+    taught = frames.make(
+        about("z", 20.366) @ about("y", -0.087) @ about("x", -179.111), np.array([-195.8, 1363.305, 524.812])
+    )
+    frame, tool = frames.make(about("z", 90), np.array([1000.0, 0, 0])), frames.make(np.eye(3), np.array([0, 0, 150.0]))
+    assert views["above"].T_base_flange == pytest.approx(frame @ taught @ np.linalg.inv(tool), abs=1e-5)
+    assert imported.warnings == ()
+
+
+def test_kuka(tmp_path):
+    views, _ = rows(tmp_path, "scan.dat", KUKA_DAT)
+    T = views["XP1"].T_base_flange
+    assert T[:3, 3] == pytest.approx([1025, -12.5, 1480])
+    assert T[:3, :3] == pytest.approx(about("z", 10) @ about("y", 20) @ about("x", 30), abs=1e-8)
+    assert np.degrees(views["XHOME"].joints) == pytest.approx([0, -90, 90, 0, 0, 15])
+    views, _ = rows(tmp_path, "scan.src", KUKA_SRC)
+    assert list(views) == ["XHOME", "XP1", "line6", "line7"]
+    assert views["XP1"].T_base_flange == pytest.approx(T, abs=1e-6)
+    assert np.degrees(views["line6"].joints) == pytest.approx([5, -80, 80, 0, 10, 0])
+    assert views["line7"].T_base_flange[:3, :3] == pytest.approx(about("z", 90), abs=1e-8)
+
+
+def test_abb(tmp_path):
+    views, imported = rows(tmp_path, "Scan.mod", ABB, unit="mm")
+    assert list(views) == ["p10", "p20", "home", "many_1", "many_2", "line10", "line11"]
+    assert views["p10"].T_base_flange == pytest.approx(
+        frames.make(about("y", 90), np.array([600, -5.5, 800.0])), abs=1e-5
+    )
+    assert views["p20"].T_base_flange[:3, :3] == pytest.approx(about("x", 30), abs=1e-5)
+    assert np.degrees(views["home"].joints) == pytest.approx([0, 10, -20, 30, -40, 50])
+    assert np.degrees(views["line10"].joints) == pytest.approx([1, 2, 3, 4, 5, 6])
+    assert views["line11"].T_base_flange[:3, :3] == pytest.approx(about("y", 180), abs=1e-8)
+    assert "q1 = w" in imported.convention and "p" not in views
+
+
+def test_ur_script(tmp_path):
+    file = tmp_path / "scan.script"
+    file.write_text(UR)
+    table = list(csv.DictReader(io.StringIO(import_file(file).text)))
+    assert [row["view"] for row in table] == ["Waypoint_1", "line8", "line9"]
+    assert [float(table[0][c]) for c in "xyz"] == pytest.approx([-100, 200, 300])
+    assert float(table[0]["j5_deg"]) == pytest.approx(np.degrees(-1.57))
+    q = [float(table[1][c]) for c in ("qx", "qy", "qz", "qw")]
+    assert q == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)], abs=1e-8)
+    assert table[2]["x"] == "" and float(table[2]["j2_deg"]) == pytest.approx(np.degrees(-1.57))
+
+
+def test_ur_recording_in_metres(tmp_path):
+    header = " ".join(["timestamp", *(f"actual_q_{i}" for i in range(6)), *(f"actual_TCP_pose_{i}" for i in range(6))])
+    file = tmp_path / "record.csv"
+    file.write_text(header + "\n0.008 0 0 0 0 0 1 0.1 0.2 0.3 0 0 0\n0.016 0 0 0 0 0 2 0.4 0.5 0.6 0 0 0.5\n")
+    table = list(csv.DictReader(io.StringIO(import_file(file, unit="m").text)))
+    assert [float(table[1][c]) for c in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
+    assert float(table[1]["j6_deg"]) == pytest.approx(np.degrees(2))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.ls", FANUC.replace("1363.305", "********"), r"a.ls line 7: P\[1\] Y is '\*+'; teach the point"),
+        ("a.ls", FANUC.split("/POS")[0], r"a.ls: no /POS section"),
+        ("a.ls", FANUC.replace("UT : 2,\t\tC", "UT : 3,\t\tC").replace("J1=    10.000 deg", "X=1 mm,Y=2 mm,Z=3 mm,W=0 deg,P=0 deg,R=0 deg"),
+         r"line 13: P2 is taught in UF 1, UT 2, above in UF 1, UT 3"),
+        ("lone.src", KUKA_SRC, r"lone.src line 3: XHOME is declared nowhere; put lone.dat beside"),
+        ("a.dat", KUKA_DAT.replace("A 10.0,B", "B"), r"a.dat line 4: XP1 has neither X, Y, Z, A, B, C nor A1"),
+        ("a.mod", ABB.replace("0.965926", "0.5"), r"a.mod line 4: p20: quaternion of length"),
+        ("a.mod", ABB.replace("[[600,-5.5,800]", "[[600,-5.5]"), r"a.mod line 3: p10 is neither"),
+        ("a.script", "movel(p[x,0,0,0,0,0])\n", r"a.script line 1: the target is computed"),
+        ("a.csv", "a,b\n1,2\n", r"a.csv line 1: no columns x, y, z"),
+        ("a.csv", "x,y,z\n1,2,oops\n", r"a.csv line 2: z is 'oops'"),
+        ("a.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", r"a.csv line 2: quaternion of length 1.4142"),
+        ("a.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0,1\n", r"a.csv line 1: rx, ry, rz may be degrees or a rotation vector"),
+        ("a.txt", "x", r"unknown kind '.txt'"),
+        ("a.ls", "", r"empty"),
+    ],
+)  # fmt: skip
+def test_bad_files_name_line_and_mend(name, text, message, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message):
+        import_file(tmp_path / name)
+
+
+def test_bad_options_and_programs_without_points(tmp_path):
+    (tmp_path / "p.ls").write_text(FANUC)
+    with pytest.raises(InputError, match="--tool 1,2: write 6 numbers"):
+        import_file(tmp_path / "p.ls", tool="1,2")
+    with pytest.raises(InputError, match="--unit inch"):
+        import_file(tmp_path / "p.ls", unit="inch")
+    (tmp_path / "e.mod").write_text("MODULE a\nENDMODULE\n")
+    with pytest.raises(NoResultError, match="no taught points"):
+        import_file(tmp_path / "e.mod")
+
+
+def test_command_writes_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+    (tmp_path / "p.mod").write_text(ABB)
+    target = tmp_path / "views.csv"
+    for code in (0, 2):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["import", str(tmp_path / "p.mod"), "-o", str(target)])
+        assert ended.value.code == code
+    assert "7 rows of views.csv" in (text := capsys.readouterr().err) and "exists already" in text
+    assert target.read_text().startswith("view,j1_deg,")

@@ -1,0 +1,73 @@
+"""A cell as a whole: with nothing hidden stitching leaves the noise put in, with a hidden effect visibly more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.quiet_scenes import clean, simulated
+from data_synth.write import write_session
+from stitch import pipeline
+from stitch.measurement.capture import capture
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
+from stitch.reading.session_folder import load_session
+from stitch.system.threads import library_threads_off
+
+VIEWS = 8
+
+
+HIDDEN = ("joint_compliance", "part_slip")
+
+
+def leaves(folder, hidden: dict[str, float], scene: str = "blade"):
+    """Rms of the correct stage, rms under the true poses, the run."""
+    measured = simulated(clean(scene, rays=130), hidden, 1, VIEWS)
+    write_session(folder / "s", measured, "s")
+    session = load_session(folder / "s")
+    run = pipeline.run(session)
+    own = capture(session)
+    with library_threads_off():
+        true = collect(own, measured.T_reference_scanner, run.overlaps.gate,
+                       [sample(scan, FINE_SAMPLES) for scan in own.scans]).gram.rms  # fmt: skip
+    return run.stages[1].rms, true, run, measured
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    return leaves(tmp_path_factory.mktemp("still"), {})
+
+
+def test_nothing_hidden_leaves_the_noise_that_was_put_in(still):
+    rms, true, run, measured = still
+    assert [stage.name for stage in run.stages] == ["coarse", "correct", "register", "fuse"]
+    # Six numbers fitted to thousands of distances: they take away less than a permille of the square.
+    assert rms == pytest.approx(true, rel=0.03)
+    assert rms == pytest.approx(run.noise_floor, rel=0.10)
+    # Two surfaces, each with the scanner's noise across it: less than along the ray by the slant,
+    # times the square of the range over the standoff (the plan moves by 12 %).
+    noise = measured.scene.scanner.noise * np.sqrt(2)
+    assert 0.6 * noise < rms < 1.25 * noise
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_a_hidden_effect_is_visible(still, tmp_path, name):
+    rms, _, run, _ = leaves(tmp_path, {name: 1.0})
+    # The hand-eye takes what it can of the effect; 0.1 mm on noise of 0.02 mm cannot hide.
+    assert rms > 1.3 * still[0]
+    assert rms > 1.2 * run.noise_floor
+
+
+def test_true_poses_are_still_the_best_where_the_robot_scatters(still, tmp_path):
+    """Repeatability as set spreads the views about their reported poses by as much."""
+    scene = replace(clean("blade", rays=40), repeatability=(20e-6, 0.05))
+    measured = simulated(scene, {}, 3, 16)
+    reported = np.linalg.inv(measured.T_base_flange) @ measured.T_mount
+    from stitch import frames
+
+    # T_reference_scanner = scatter⁻¹ · reported, and scatter acts on the flange: its twist is seen in the flange.
+    twists = frames.log(reported @ frames.inverse(measured.T_reference_scanner))
+    spread = np.sqrt((twists**2).mean(axis=0))
+    # 48 numbers each: their rms is known to 1/√96.
+    assert np.sqrt((spread[:3] ** 2).mean()) == pytest.approx(20e-6, rel=4 / np.sqrt(96))
+    assert np.sqrt((spread[3:] ** 2).mean()) == pytest.approx(0.05, rel=4 / np.sqrt(96))

@@ -1,0 +1,43 @@
+"""The smallest size that shows, against closed forms and drawn noise."""
+
+import numpy as np
+import pytest
+from scipy.stats import f as f_distribution
+from scipy.stats import norm
+
+from stitch.diagnosis.selection.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
+from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.statistics.satterthwaite import satterthwaite
+from stitch.statistics.variance_components import Evidence, VarianceFit, fit_variances
+
+
+def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
+    """With so many tests that the p-value decides: |θ| √I = z(1 − α/2K) + z(0.8)."""
+    tests = 1_000_000
+    least = least_noncentrality(np.array([[1.0]]), 1.0, tests, 10**9, 1e4)
+    assert np.sqrt(least) == pytest.approx(norm.isf(ALPHA_NAME / 2 / tests) + norm.ppf(0.8), rel=5e-3)
+
+
+def test_the_smallest_size_shows_in_eight_of_ten():
+    """Drawn with few views: the likelihoods and the F test themselves, not the approximation."""
+    rng, draws, tests, n, p = np.random.default_rng(3), 250, 20, 36, 3
+    components = np.array([np.diag((np.arange(n) < n - 4).astype(float)), np.eye(n) * 1e-6, np.zeros((n, n))])
+    components[2][-4:, -4:] = np.eye(4)
+    columns = rng.normal(size=(n, p)) * (np.arange(n) < n - 4)[:, None]
+    A = np.ones((n, 1))
+    free = columns - A @ np.linalg.lstsq(A, columns, rcond=None)[0]
+    plausible = Evidence(np.zeros((1, n)), A[None], components[:, None])
+    unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
+    degrees_of_freedom = satterthwaite(plausible, unit).of(free[None])
+    least = least_noncentrality(free * 2.0, 1.0, tests, n - 1 - p, degrees_of_freedom)
+    theta = np.ones(p) * np.sqrt(least) / np.linalg.norm(free.sum(axis=1))
+    shown = 0
+    for _ in range(draws):
+        z = columns @ theta + rng.standard_normal(n)
+        drawn = Evidence(z[None], A[None], components[:, None])
+        gain = 0.5 * (fit_variances(drawn).deviance - fit_variances(drawn, columns[None], np.full(p, 2.0)).deviance)
+        fitted, rest = np.linalg.lstsq(np.hstack([A, columns]), z, rcond=None)[:2]
+        square = np.sum((free @ fitted[1:]) ** 2) / p / (rest[0] / (n - 1 - p))
+        shown += gain > LOG_BAYES_FACTOR and f_distribution.sf(square, p, n - 1 - p) < ALPHA_NAME / tests
+    # Four standard errors of a share of 250 draws.
+    assert shown / draws == pytest.approx(0.8, abs=0.1)

@@ -1,0 +1,50 @@
+"""Errors of gears: what is learned where a joint was driven, judged at the ends that were left out."""
+
+import numpy as np
+
+from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.diagnosis.score import score
+from stitch.diagnosis.selection.ranking import certain, rank
+from stitch.diagnosis.validation.extrapolation import extrapolation
+from stitch.effects.contract import EFFECTS
+from stitch.pipeline import run
+from stitch.stored.load_state import state_of
+
+
+def stands(session, name):
+    """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
+    evidence = evidence_of_state(state_of(run(session)))
+    own = rank([score(evidence, candidate_of(evidence, EFFECTS[name]))])[0][0]
+    return certain(own), extrapolation(evidence, own.score)
+
+
+def test_a_gear_error_of_a_joint_that_was_driven_everywhere_helps_at_left_out_ends_too():
+    def gears(q):
+        return 8e-4 * np.array([0, np.sin(2 * q[1] + 0.4), 0, 0, 0, 0])
+
+    named, found = stands(labelled_cell(11, views=100, targets=TARGETS[:2], gears=gears)[0], "gear_harmonic")
+    assert named and found.helps and found.share < 0.3
+
+
+def test_gear_errors_fitted_to_noise_are_not_named():
+    for seed in range(4):
+        named, found = stands(labelled_cell(20 + seed, views=100, targets=TARGETS[:2])[0], "gear_harmonic")
+        assert not (named and found.helps)
+
+
+def test_gear_errors_that_imitate_another_error_are_told_by_left_out_ends():
+    # Bumps in two joints' angles: among the measured poses two periods a turn explain a good part of them.
+    refused = 0
+    for seed in range(4):
+        bumps = np.random.default_rng(seed).uniform(-1.2, 1.2, 6)
+
+        def gears(q, bumps=bumps):
+            return 1.5e-3 * np.array([0, *np.exp(-((q[1:3] - bumps[1:3]) ** 2) / 0.02), 0, 0, 0])
+
+        named, found = stands(labelled_cell(20 + seed, views=200, targets=TARGETS[:2], gears=gears)[0], "gear_harmonic")
+        assert named
+        refused += not found.helps
+    # Of bumps near the middle two periods a turn may be a fair picture.
+    assert refused >= 3

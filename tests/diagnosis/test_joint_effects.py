@@ -1,0 +1,78 @@
+"""Effects of joints and part diagnosed from labelled points of a cell whose truth is known."""
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
+from stitch.diagnosis.diagnose import diagnose
+from stitch.diagnosis.selection.backward_elimination import eliminated_effect
+from stitch.pipeline import run
+from stitch.stepwise import suggest
+from stitch.stored.load_state import state_of
+
+
+def test_a_hidden_joint_offset_is_named_and_found():
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(2, views=40, offset=offset)
+    before = run(session)
+    found = before.diagnose()
+    assert "joint_offset" in found.effects, found.sentence
+    after = before.add("joint_offset")
+    assert after.heldout_rms < 0.2 * before.heldout_rms
+    values = dict(
+        zip([p.name for p in after.measurement.parameters(after.terms[0].effect)], after.terms[0].values, strict=True)
+    )
+    for name, true in zip(("d2", "d3", "d5"), offset[[1, 2, 4]], strict=True):
+        assert values[name] == pytest.approx(true, abs=2e-4)
+
+
+def test_offsets_and_gravity_together_are_found_by_their_names(few_effects):
+    # Gravity on the flange's mass turns joint 2 by what the flange reaches out: 2 µrad a millimetre.
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(9, views=100, offset=offset, sag=2e-6, targets=TARGETS[:2])
+    found, lines, _ = suggest(state_of(run(session)), 3)
+    assert set(found.effects) == {"joint_offset", "joint_compliance"}, lines
+    assert found.heldout_rms < 0.1
+
+
+def test_an_effect_that_another_made_idle_is_dropped():
+    session, *_ = labelled_cell(12, views=100, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), targets=TARGETS[:2])
+    state = state_of(run(session, effects=["gear_eccentricity", "joint_offset"]))
+    name, reason = eliminated_effect(state, {"gear_eccentricity", "joint_offset"})
+    assert name == "gear_eccentricity", reason
+    assert eliminated_effect(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
+
+
+def test_an_honest_cell_is_adequate():
+    session, *_ = labelled_cell(5, views=40)
+    found = run(session).diagnose()
+    assert found.verdict == "adequate", found.sentence
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_growth_is_found_wherever_the_part_is_held(mount):
+    """No session says which point of a part stands still; the flange and the robot's base need not be near it."""
+    still = TARGETS[0] + [80.0, -40.0, -90.0] + (0 if mount == "eye_to_hand" else TABLE)
+    session, *_ = labelled_cell(4, mount=mount, grown=Growth(2e-4, still))
+    found = run(session)
+    assert diagnose(state_of(found)).effects == ("part_growth",)
+    found = run(session, effects=["part_growth"])
+    values, sigmas = found.terms[0].values, found.sigmas[0]
+    true = 2e-4 * np.append(1.0, found.measurement.target_views[0].origin - still)
+    assert (sigmas < [1e-5, 2e-3, 2e-3, 2e-3]).all()  # mm: a quarter of the motion of the middle
+    assert (np.abs(values - true) < 4 * sigmas).all()
+
+
+def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
+    """Offsets of the smallest detectable size, put into the same measurements joint by joint."""
+    session, *_ = labelled_cell(5)
+    found = run(session)
+    suspect = next(s for s in diagnose(state_of(found)).candidates if s.name == "joint_offset")
+    sizes = [min(suspect.detectable.get(f"d{i + 1}", np.inf), 1e-3) for i in range(6)]
+    middle = np.mean([v.sighting.points.mean(axis=0) for v in session.views], axis=0)
+    pushed = []
+    for size, own in zip(sizes, np.eye(6), strict=True):
+        T = np.linalg.inv(found.T_mount) @ run(labelled_cell(5, offset=size * own)[0]).T_mount
+        pushed.append(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
+    seen = [np.isfinite(suspect.detectable.get(f"d{i + 1}", np.inf)) for i in range(6)]
+    assert suspect.hand_eye == pytest.approx(np.max(np.array(pushed)[seen]), rel=0.2)

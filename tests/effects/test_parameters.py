@@ -1,0 +1,33 @@
+"""Parameters of effects: units, and effects that a session cannot have."""
+
+import pytest
+from stitch.model.terms import known, require
+
+from data_synth.fixtures.in_memory import session_of
+from stitch.effects import EFFECTS
+from stitch.errors import InputError
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import measurement_of
+
+
+def chain_for(measured):
+    session = session_of(measured)
+    return measurement_of(session, capture(session))
+
+
+def test_parameters_are_in_the_unit_of_the_session():
+    effect = EFFECTS["mount_drift"]
+    mm, m = (effect.parameters(6, (), unit) for unit in ("mm", "m"))
+    assert [p.unit for p in mm] == ["rad/h"] * 3 + ["mm/h"] * 3
+    assert m[3].unit == "m/h"
+    assert m[3].typical == pytest.approx(mm[3].typical / 1000)
+    kappa = EFFECTS["part_sag"].parameters(6, (), "m")[0]
+    assert kappa.unit == "1/m"
+    assert kappa.typical == pytest.approx(1000 * EFFECTS["part_sag"].parameters(6, (), "mm")[0].typical)
+
+
+def test_unknown_and_impossible_effects_are_refused(still_cells):
+    with pytest.raises(InputError, match="no effect 'elbow'"):
+        known("elbow")
+    with pytest.raises(InputError, match="velocity_deg_s"):
+        require(chain_for(still_cells["eye_to_hand"]), EFFECTS["latency"])

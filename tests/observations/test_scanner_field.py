@@ -1,0 +1,49 @@
+"""Errors that repeat in every view: how large they are, and what they do to the hand-eye's sigmas."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.scene import load_scene
+from data_synth.simulate import simulate
+from stitch import frames, pipeline
+from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.stored.load_state import state_of
+
+SEEDS = 2
+
+
+def chi_squares(share: float) -> tuple[list[float], list[float]]:
+    """Per seed χ² of the hand-eye's error and the sigma of its place (mm); smooth errors of `share` of the noise."""
+    scene = load_scene("drill-plate")
+    scanner = replace(scene.scanner, columns=50, rows=50, field_error=share * scene.scanner.noise)
+    squares, sigmas = [], []
+    for seed in range(SEEDS):
+        measured = simulate(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
+        found = pipeline.run(session_of(measured))
+        xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
+        squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))
+        sigmas.append(float(np.sqrt(np.trace(found.mount_covariance[3:, 3:]))))
+    return squares, sigmas
+
+
+def test_sigmas_hold_whatever_the_scanner_repeats():
+    """As large as the noise, or none: the error is within its covariance, and small errors do not widen it as large."""
+    large, small = chi_squares(1.0), chi_squares(0.0)
+    for squares, _ in (large, small):
+        assert sum(squares) < chi2.ppf(0.999, 6 * SEEDS)
+    assert np.mean(large[1]) > 1.5 * np.mean(small[1])
+
+
+def test_what_incidence_shows_is_not_laid_on_the_field():
+    """A carried scanner on a coarse surface: grazing points pretend a bias, while its field has no error at all."""
+    scene = load_scene("blade-table")
+    scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
+    measured = simulate(replace(scene, scanner=scanner), {}, 3, views=10)
+    evidence = evidence_of_state(state_of(pipeline.run(session_of(measured))))
+    shown, unit = (field_scatter(evidence.measurement, evidence.freed, share) for share in (None, 1.0))
+    shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
+    assert np.max(shares[:-1]) < 0.2

@@ -1,0 +1,82 @@
+"""Closed form of the hand-eye and rows of labelled points, against a cell written down apart from the library."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.effects.contract import EFFECTS
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import Term, measurement_of
+from stitch.model.forward import corrected, shift_targets
+from stitch.model.jacobian import target_shifts
+from stitch.observations.targets.closed_form import closed_form
+from stitch.observations.targets.landmarks import initial_landmarks
+from stitch.observations.targets.rows import effect_rows, rows_of
+
+
+def off(T, true):
+    """Angle (rad) and distance between two poses."""
+    return np.linalg.norm(Rotation.from_matrix(T[:3, :3].T @ true[:3, :3]).as_rotvec()), np.linalg.norm(
+        T[:3, 3] - true[:3, 3]
+    )
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_closed_form_is_exact_without_errors(mount):
+    session, T_mount, *_ = labelled_cell(mount=mount, scatter=(0, 0), noise=1e-12)
+    angle, distance = off(closed_form(capture(session)), T_mount)
+    assert angle < 1e-9 and distance < 1e-6
+
+
+def test_closed_form_of_a_probe_is_exact_without_errors():
+    session, T_mount, *_ = labelled_cell(scatter=(0, 0), noise=1e-12, probe=True)
+    views = [replace(v, sighting=replace(v.sighting, rotation=np.linalg.inv(T_mount)[:3, :3] @ v.T_base_flange[:3, :3]))
+             for v in session.views]  # fmt: skip
+    angle, distance = off(closed_form(capture(replace(session, views=tuple(views)))), T_mount)
+    assert angle < 1e-9 and distance < 1e-6
+
+
+def test_rows_are_the_slopes_of_what_is_left():
+    session, T_mount, *_ = labelled_cell(1, views=6, scatter=(0, 0), noise=1e-9)
+    measurement = measurement_of(session, capture(session))
+    for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
+        effect = EFFECTS[name]
+        if measurement.lacks(effect):
+            continue
+        zero = Term(effect, np.zeros(len(measurement.parameters(effect))))
+        landmarks = initial_landmarks(measurement.capture, T_mount)
+        rows = rows_of(measurement.capture, T_mount, landmarks)
+        slopes = effect_rows(rows, measurement, (), zero)
+        for i, parameter in enumerate(measurement.parameters(effect)):
+            step = 0.01 * parameter.typical
+            both = [rows_of(corrected(measurement, [replace(zero, values=s * step * np.eye(len(zero.values))[i])], T_mount),
+                            T_mount, landmarks).residual for s in (1, -1)]  # fmt: skip
+            numeric = (both[0] - both[1]) / (2 * step)
+            scale = max(np.abs(numeric).max(), 1e-12)
+            np.testing.assert_allclose(
+                slopes[..., i] / scale, numeric / scale, atol=2e-4, err_msg=f"{name} {parameter.name}"
+            )
+
+
+def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
+    # The last joint's offset must not borrow from what is left, however large that is.
+    session, T_mount, *_ = labelled_cell(1, views=12, scatter=(1e-3, 1.0))
+    measurement = measurement_of(session, capture(session))
+    term = Term(EFFECTS["joint_offset"], np.zeros(6))
+    rows = rows_of(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
+    column = effect_rows(rows, measurement, (), term)[..., 5].ravel()
+    landmarks = rows.landmarks.reshape(rows.residual.size, -1)
+    left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
+    assert np.abs(left).max() < 1e-6 * np.abs(column).max()
+
+
+def test_slopes_of_shifts_are_linear_in_small_steps():
+    session, T_mount, *_ = labelled_cell(1, views=4)
+    measurement = measurement_of(session, capture(session))
+    term = Term(EFFECTS["range_scale"], np.zeros(1))
+    poses = measurement.capture.poses(T_mount)
+    moved = shift_targets(measurement, [replace(term, values=np.array([1e-4]))], poses)
+    np.testing.assert_allclose(moved, 1e-4 * target_shifts(measurement, (), term, poses)[0], rtol=1e-3)

@@ -1,0 +1,161 @@
+"""The stages on scans of cells of known truth."""
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import captured_blade, disturbed
+from data_synth.fixtures.quiet_scenes import mesh_of
+from stitch import frames
+from stitch.errors import NoResultError
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect
+from stitch.stages.coarse import coarse, part_size
+from stitch.stages.correct import correct
+from stitch.stages.fuse import fuse, view_residuals
+from stitch.stages.observability import unobservable
+from stitch.stages.register import register, sign_weights
+from stitch.system.native import load_open3d
+
+
+def at_part(capture: Capture, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle of the part in the scanner frame, and the (3, 6) map from ξ to its displacement."""
+    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
+    return middle, np.hstack([-frames.skew(middle), np.eye(3)])
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_hand_eye_error_is_what_the_covariance_predicts(mount):
+    """From 5° and 30 mm, 4 seeds a mount: rms error at the part below 1.2 of the prediction, sigmas honest."""
+    errors, predicted, z = [], [], []
+    for seed in range(4):
+        measured, capture = captured_blade(seed, mount=mount, pixels=130)
+        start = disturbed(measured.T_mount, seed)
+        found = correct([capture], start, 0.35 * part_size([capture])).hand_eye
+        xi = frames.log(frames.inverse(measured.T_mount) @ found.T_mount)
+        _, J = at_part(capture, found.T_mount)
+        errors.append(np.sum((J @ xi) ** 2))
+        predicted.append(np.trace(J @ found.covariance @ J.T))
+        z.append(xi / np.sqrt(np.diag(found.covariance)))
+    ratio = np.sqrt(np.mean(errors) / np.mean(predicted))
+    assert ratio < 1.2
+    # 4 seeds x about 6 independent numbers: a ratio under 0.6 would mean sigmas twice too large.
+    assert ratio > 0.6
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_register_reaches_the_noise_and_finds_the_pose_errors():
+    measured, capture = captured_blade(1, repeatability=(3e-4, 0.1))
+    found = correct([capture], measured.T_mount, 5.0)
+    registration = register(
+        capture, capture.poses(found.hand_eye.T_mount), found.hand_eye.repeatability[0], found.overlaps[0].gate
+    )
+    noise = np.sqrt(2) * np.median([scan.noise for scan in capture.scans])
+    assert registration.overlaps.gram.rms < 1.15 * noise
+    # Poses may differ from the truth by one common motion: compare view to view.
+    relative = frames.inverse(registration.poses[:1]) @ registration.poses[1:]
+    truth = frames.inverse(measured.T_reference_scanner[:1]) @ measured.T_reference_scanner[1:]
+    before = capture.poses(found.hand_eye.T_mount)
+    model = frames.inverse(before[:1]) @ before[1:]
+    middle, _ = at_part(capture, found.hand_eye.T_mount)
+
+    def off(T):
+        return np.sqrt(np.mean((frames.transform(T, middle[None]) - frames.transform(truth, middle[None])) ** 2))
+
+    assert off(relative) < 0.25 * off(model)
+
+
+def test_perfect_poses_leave_the_noise_that_was_put_in():
+    measured, capture = captured_blade(2, repeatability=(0.0, 0.0))
+    found = correct([capture], disturbed(measured.T_mount, 2, 0.5, 3.0), 10.0)
+    truth = collect(
+        capture, capture.poses(measured.T_mount), found.overlaps[0].gate, [sample(s, 3000) for s in capture.scans]
+    )
+    assert found.overlaps[0].gram.rms == pytest.approx(truth.gram.rms, rel=0.03)
+
+
+def test_several_captures_share_one_hand_eye():
+    """Two sessions of one rig know the hand-eye better than either."""
+    cells = [captured_blade(seed, views=8, spread=(0.0, 0.0)) for seed in (3, 4)]
+    captures = [capture for _, capture in cells]
+    start = disturbed(cells[0][0].T_mount, 1, 2.0, 10.0)
+    both = correct(captures, start, 15.0).hand_eye
+    single = [correct([capture], start, 15.0).hand_eye for capture in captures]
+    assert np.trace(both.covariance[3:, 3:]) < min(np.trace(s.covariance[3:, 3:]) for s in single) * 1.1
+    xi = frames.log(frames.inverse(cells[0][0].T_mount) @ both.T_mount)
+    assert xi @ np.linalg.solve(both.covariance, xi) < 25.0  # χ² with 6 degrees: 1 in 3,000
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_a_hand_eye_is_found_from_nothing(mount):
+    measured, capture = captured_blade(5, mount=mount, pixels=110)
+    found = coarse([capture])
+    assert found.runner_up_ratio > 1.1
+    fine = correct([capture], found.T_mount, found.gate).hand_eye
+    xi = frames.log(frames.inverse(measured.T_mount) @ fine.T_mount)
+    _, J = at_part(capture, fine.T_mount)
+    assert np.linalg.norm(J @ xi) < 0.1
+
+
+def test_turning_the_last_joint_alone_hides_two_directions():
+    measured, capture = captured_blade(6, views=10, tilt=0.0)
+    # Views that turn about exactly one axis of the flange.
+    phrases = unobservable([turning_only(capture, measured.T_mount)], measured.T_mount)
+    assert len(phrases) == 2
+    assert phrases[0] == "translation along the axis about which all views were turned"
+    assert phrases[1] == "rotation about the axis about which all views were turned"
+
+
+def turning_only(capture: Capture, T_mount: np.ndarray) -> Capture:
+    """The same scans on a flange that only turns about its z axis."""
+    from dataclasses import replace
+
+    turns = frames.exp(np.array([[0, 0, np.radians(20 * i), 0, 0, 0] for i in range(len(capture.scans))]))
+    flange = capture.T_reference_mount[0]
+    return replace(capture, T_reference_mount=turns @ flange)
+
+
+def test_all_directions_are_seen_by_a_tilting_set():
+    measured, capture = captured_blade(7, views=8)
+    assert unobservable([capture], measured.T_mount) == ()
+
+
+def test_fused_cloud_lies_on_the_part():
+    measured, capture = captured_blade(8, repeatability=(0.0, 0.0))
+    fused = fuse(capture, measured.T_reference_scanner)
+    in_part = fused.points
+    inner = fused.count >= 3
+    o3d = load_open3d()
+    surface = o3d.t.geometry.RaycastingScene()
+    mesh = mesh_of("blade")
+    surface.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    distance = surface.compute_distance(in_part[inner].astype(np.float32)).numpy()
+    # Averaging three views or more: the noise of 20 µm falls below 20/√3.
+    assert np.median(distance) < 0.02 / np.sqrt(3)
+    assert np.isnan(fused.residual[fused.count == 1]).all()
+    assert fused.count.max() <= len(capture.scans)
+
+
+def test_view_residuals_show_a_shifted_view():
+    measured, capture = captured_blade(9, repeatability=(0.0, 0.0))
+    poses = measured.T_reference_scanner.copy()
+    poses[3] = poses[3] @ frames.exp(np.array([0, 0, 0, 0, 0, 0.3]))
+    residuals = view_residuals(capture, poses, 4.0)
+    spread = [np.nanmedian(np.abs(r[s.usable])) for r, s in zip(residuals, capture.scans, strict=True)]
+    assert int(np.argmax(spread)) == 3
+    assert [len(r) for r in residuals] == [len(s.points) for s in capture.scans]
+
+
+def test_sign_weights_follow_each_side_and_spare_the_middle():
+    rng = np.random.default_rng(0)
+    d = np.concatenate([rng.normal(0, 0.02, 5000), [1.0, -1.0]])
+    w = sign_weights(d, np.ones(len(d)))
+    assert w[-2:].max() < 1e-6
+    assert w[:-2].min() > 0
+    assert np.average(d, weights=w) == pytest.approx(0, abs=2e-3)
+
+
+def test_no_overlap_is_a_result_with_a_reason():
+    measured, capture = captured_blade(0, views=4)
+    with pytest.raises(NoResultError, match="overlap"):
+        correct([capture], measured.T_mount @ frames.exp(np.array([2.0, 0, 0, 0, 0, 4000.0])), 0.5)

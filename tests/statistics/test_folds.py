@@ -1,0 +1,26 @@
+"""Folds of cross-validation: which views are left out together."""
+
+import numpy as np
+
+from stitch.statistics.folds import grouped_folds, joint_ends
+
+
+def test_ends_of_joints_are_fifths_of_what_was_driven():
+    rng = np.random.default_rng(0)
+    joints = np.column_stack([rng.permutation(200), np.zeros(200)])
+    seen = np.arange(0, 200, 2)
+    low, high = joint_ends(joints, seen)  # none of the joint that stands still
+    assert (low.joint, low.upper, high.upper) == (0, False, True)
+    assert np.isin(low.views, seen).all() and 19 <= len(low.views) <= 21
+    assert joints[low.views, 0].max() < np.quantile(joints[seen, 0], 0.21)
+    assert joints[high.views, 0].min() > np.quantile(joints[seen, 0], 0.79)
+    assert joint_ends(joints, seen[:60]) == []
+
+
+def test_folds_leave_out_neighbours():
+    T = np.tile(np.eye(4), (20, 1, 1))
+    T[:, 0, 3] = np.arange(20) % 5 * 100.0
+    folds = grouped_folds(T, 100.0)
+    assert sorted(np.concatenate(folds[:5])) == list(range(20))
+    assert all(np.ptp(f) == 3 for f in folds[:5])  # four in a row by time
+    assert all(len(set(T[f, 0, 3])) == 1 for f in folds[5:])  # one place each by pose

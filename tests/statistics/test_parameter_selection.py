@@ -1,0 +1,62 @@
+"""Which parameters of an effect are fitted, and how large those left out may be."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from stitch.statistics.identifiability import independent
+from stitch.statistics.parameter_selection import omitted_rms, supported
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(-6, 6))
+def test_units_do_not_decide_what_is_visible(seed, exponent):
+    """Counting a parameter in another unit, with its size, changes nothing."""
+    rng = np.random.default_rng(seed)
+    base, columns = rng.standard_normal((40, 4)), rng.standard_normal((40, 6))
+    columns[:, 5] = columns[:, 0] + 1e-9 * rng.standard_normal(40)
+    sizes = rng.uniform(0.5, 2.0, 6)
+    unit = 10.0**exponent
+    chosen = independent(base, columns, sizes, 0.3)
+    assert np.array_equal(chosen, independent(base, columns / unit, sizes * unit, 0.3))
+    assert chosen.sum() == 5  # of two that say the same, one
+
+
+def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
+    """White noise, six groups, one of them true at ten sigmas: another one by chance at most 1 in 20."""
+    groups, others = [[0, 1], [2, 3], [4, 5], [6], [7], [8]], 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        own, further = rng.standard_normal((60, 6)), rng.standard_normal((60, 9))
+        z = further[:, 2] * 1.5 + own @ rng.standard_normal(6) + rng.standard_normal(60)
+        chosen = supported(own, further, z, np.full(9, 0.5), groups, [0] * 6)
+        assert chosen[2] and chosen[3]
+        others += chosen.sum() > 2
+    # 5 groups whose log evidence exceeds 2.5 by chance in some 0.4 % each.
+    assert binomtest(others, 200, 0.05, alternative="greater").pvalue > 0.01
+
+
+def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
+    rng = np.random.default_rng(0)
+    chosen = supported(
+        rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60), np.full(3, 0.1),
+        [[0], [1], [2]], [0, 0, 1],
+    )  # fmt: skip
+    assert chosen[2] and chosen[:2].sum() == 1
+
+
+def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
+    """Amplitudes that are there in half the cases, drawn from their prior: mean squares told and true agree."""
+    rng, told, true = np.random.default_rng(3), [], []
+    for _ in range(4000):
+        own, further, size = rng.standard_normal((12, 2)), 0.4 * rng.standard_normal((12, 1)), rng.uniform(0.2, 3)
+        amplitude = size * rng.standard_normal() * rng.integers(0, 2)
+        z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
+        told.append(omitted_rms(own, further, z, np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
+        true.append(amplitude**2 / size**2)
+    apart = np.array(told) - true
+    assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
+    # Beside a column that is fitted and says the same nothing is known of it but its size.
+    same = omitted_rms(own, np.tile(further, 2), z, np.full(2, 0.3), np.array([True, False]))
+    np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)

@@ -1,0 +1,45 @@
+"""Variance components against what was drawn and the Gaussian integral."""
+
+import numpy as np
+import pytest
+
+from stitch.statistics.variance_components import Evidence, at_variances, fit_variances
+
+
+def test_variances_are_found_again():
+    """Components of known size: the mean estimate over 40 draws within three standard errors."""
+    rng = np.random.default_rng(0)
+    n, found = 90, []
+    a, b = rng.standard_normal((2, n, n)) / np.sqrt(n)
+    C = np.array([a @ a.T, b @ b.T, np.eye(n)])[:, None]
+    A = rng.standard_normal((1, n, 5))
+    truth = np.array([4.0, 2.0, 1.0])
+    half = np.linalg.cholesky(np.einsum("c,cij->ij", truth, C[:, 0]))
+    for _ in range(40):
+        z = half @ rng.standard_normal(n) + A[0] @ rng.normal(0, 30, 5)
+        found.append(fit_variances(Evidence(z[None], A, C)).variances)
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))
+    # The prior off the boundary lifts the first two by about a standard deviation of one estimate at most.
+    assert (mean - truth < 3 * error + np.std(found, axis=0)).all()
+    assert (truth - mean < 3 * error).all()
+
+
+def test_evidence_is_the_gaussian_integral():
+    """Integrating θ out by hand gives the same likelihood as the covariance V + G S Gᵀ."""
+    rng = np.random.default_rng(1)
+    n = 30
+    C = np.array([np.diag(rng.uniform(0.5, 1, n)) for _ in range(3)])[:, None]
+    z, A, G = rng.standard_normal((1, n)), rng.standard_normal((1, n, 2)), rng.standard_normal((1, n, 3))
+    prior = np.array([0.5, 1.0, 2.0])
+    variances = np.array([1.0, 0.7, 1.3])
+    plain, wide = (at_variances(Evidence(z, A, c), variances) for c in (C, C))
+    with_G = at_variances(Evidence(z, A, C), variances, G, prior)
+    V = np.einsum("c,cij->ij", variances, C[:, 0])
+    values = []
+    for K in (V, V + (G[0] * prior**2) @ G[0].T):
+        W = np.linalg.inv(K)
+        M = A[0].T @ W @ A[0]
+        P = W - W @ A[0] @ np.linalg.solve(M, A[0].T @ W)
+        values.append(np.linalg.slogdet(K)[1] + np.linalg.slogdet(M)[1] + z[0] @ P @ z[0])
+    assert with_G.deviance - plain.deviance == pytest.approx(values[1] - values[0], abs=1e-8)
+    assert wide.deviance == plain.deviance

@@ -1,0 +1,32 @@
+"""A run of labelled points read back from its folder."""
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from stitch.pipeline import run as stitched
+from stitch.reading.session_folder import load_session
+from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import stored_run
+from stitch.writing.result_document import model_of
+from stitch.writing.run_folder import write_run
+
+
+def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
+    """One of them is a gross error, and must stay out."""
+    session, *_ = labelled_cell(5, views=24)
+    session.views[7].sighting.points[2] += [3.0, -2.0, 1.0]
+    loaded = load_session(write_labelled(tmp_path / "s", session))
+    found = stitched(loaded, effects=["joint_offset"])
+    assert len(found.outliers) == 1
+    (tmp_path / "r").mkdir()
+    write_run(found, tmp_path / "r")
+    again = stored_run(tmp_path / "r", load_state(tmp_path / "r"))
+    for name in ("positions", "orientation"):
+        np.testing.assert_array_equal(getattr(again.labelled.landmarks, name), getattr(found.labelled.landmarks, name))
+    np.testing.assert_allclose(again.labelled.target_rms, found.labelled.target_rms, rtol=1e-9)
+    np.testing.assert_array_equal(again.labelled.heldout, found.labelled.heldout)
+    assert again.labelled.rms == pytest.approx(found.residual_rms, rel=1e-9)
+    for same in (again, stitched(loaded, model_of(found))):
+        np.testing.assert_array_equal(same.sigmas, found.sigmas)

@@ -1,0 +1,189 @@
+"""Run folders through their commands: what is written agrees with itself, and nothing stale or half-made stays."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.write import write_session
+from stitch.cli import change as change_command
+from stitch.cli.main import main
+from stitch.errors import NoResultError
+from stitch.model.model_toml import read_model
+from stitch.pipeline import run_rig
+from stitch.reading.session_folder import load_session
+from stitch.runs.run import Step
+from stitch.stored.load_state import load_state, state_of
+from stitch.stored.stored_run import stored_run
+from stitch.writing.run_folder import write_run
+from viz import run_page, sections
+
+EFFECT = "scanner_thermal_scale"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, stitch_command):
+    """Two sessions of one cell; `r` is a run of the first, named its effect twice, `q` one of the second by r's model."""
+    folder = tmp_path_factory.mktemp("runs")
+    for seed, name in enumerate("so"):
+        write_session(folder / name, measured_blade(seed, views=5, pixels=70), name)
+    stitch_command("run", folder / "s", "-o", folder / "r", "--no-recording", "--effects", f"{EFFECT},{EFFECT}")
+    stitch_command("run", folder / "o", "-o", folder / "q", "--no-recording", "--hand-eye", folder / "r")
+    return folder
+
+
+def told(run):
+    return json.loads((run / "result.json").read_text())
+
+
+def page(run):
+    """The page without its pictures and the times that were taken."""
+    text = re.sub(r'src="data:[^"]*"', "", (run / "report.html").read_text())
+    return re.sub(r'<td>[\d.]+</td>(<td class="wide">)', r"\1", text)
+
+
+def files(run):
+    return {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+
+
+def test_a_model_that_is_used_as_it_is_stays_as_it_is(folder):
+    first, second = told(folder / "r"), told(folder / "q")
+    assert second["effects"] == first["effects"] and first["effects"][EFFECT]["k"]["sigma"] > 0
+    assert read_model(folder / "q").effects == read_model(folder / "r").effects
+    assert second["hand_eye"] == first["hand_eye"] and second["hand_eye_sigma"] == first["hand_eye_sigma"]
+    assert [told(folder / run)["stages"][0]["note"] for run in "rq"] == [
+        "given in session.toml", "of another run, used as it is",
+    ]  # fmt: skip
+
+
+def test_an_effect_named_twice_counts_once(folder):
+    assert json.loads((folder / "r" / "ledger.json").read_text())[0]["effects"] == [EFFECT]
+    ledger = change_command.change(load_state(folder / "q"), ["range_scale", "range_scale"]).ledger
+    assert ledger[-1].effects == ("range_scale",)
+
+
+@pytest.mark.parametrize("name", ["r", "q"])
+def test_a_page_made_anew_is_the_page_of_the_run(folder, name, stitch_command):
+    run = folder / name
+    before, text = files(run), page(run)
+    (run / "report.html").unlink()
+    stitch_command("report", run, "--no-diagnosis")
+    assert page(run) == text
+    assert f"{1e3 * told(run)['residual_rms']:.1f}" in text and f"{told(run)['hand_eye'][0][3]:.4f}" in text
+    assert {k: v for k, v in files(run).items() if k != "report.html"} == {
+        k: v for k, v in before.items() if k != "report.html"
+    }
+
+
+def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
+    runs = run_rig([load_session(folder / name) for name in "so"])
+    write_run(runs[1], tmp_path)
+    again = stored_run(tmp_path, load_state(tmp_path))
+    np.testing.assert_array_equal(again.T_mount, runs[0].T_mount)
+    assert again.residual_rms == runs[1].residual_rms and again.heldout_rms == runs[1].heldout_rms
+
+
+def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path, capsys):
+    run = tmp_path / "r"
+    run.mkdir()
+    for name, data in files(folder / "r").items():
+        (run / name).write_bytes(data)
+    k = repr(told(run)["effects"][EFFECT]["k"]["value"])
+    (run / "model.toml").write_text((run / "model.toml").read_text().replace(k, "1e-5"))
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(run)])
+    line = capsys.readouterr().err.strip()
+    assert stop.value.code == 2 and "\n" not in line and "model.toml: changed after the run" in line
+    assert files(run)["report.html"] == files(folder / "r")["report.html"]
+
+
+STALE = ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recording.rrd", "robot.toml", "robot.urdf")
+
+
+@pytest.fixture
+def changing(folder, tmp_path, monkeypatch):
+    """A copy of `q` with everything beside it that commands make of a model; changes take no time."""
+    run = tmp_path / "q"
+    (run / "pictures").mkdir(parents=True)
+    for name, data in files(folder / "q").items():
+        (run / name).write_bytes(data)
+    for name in (*STALE, "pictures/budget.png"):
+        (run / name).write_text("of the old model")
+    result = replace(stored_run(run, load_state(run)), ledger=())
+    monkeypatch.setattr(change_command, "change", lambda state, effects, recorder: result)
+    return run, result
+
+
+def test_nothing_of_the_old_model_stays_beside_the_new_one(changing, stitch_command):
+    run, _ = changing
+    stitch_command("drop", run, EFFECT, "--no-recording")
+    assert {path.name for path in run.iterdir()} == {
+        "model.toml", "result.json", "ledger.json", "stitched.ply", "residuals.parquet", "report.html",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("error", [NoResultError("no"), KeyboardInterrupt()])
+def test_a_change_that_fails_leaves_the_run_as_it_was(changing, monkeypatch, error):
+    run, _ = changing
+    before = files(run)
+
+    def fails(state, effects, recorder):
+        scratch = next(run.parent.glob(f".{run.name}.stitch-*"))
+        (scratch / "recording.rrd").write_text("half")
+        raise error
+
+    monkeypatch.setattr(change_command, "change", fails)
+    with pytest.raises(SystemExit) as stop:
+        main(["drop", str(run), EFFECT, "--no-recording"])
+    assert stop.value.code
+    assert files(run) == before and not list(run.parent.glob(f".{run.name}.*"))
+
+
+def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch, stitch_command):
+    """The fit is made once more for the recording; history and result speak of the same one."""
+    run, result = changing
+    step, last = Step((), 0.1, 0.1, 0.1, np.eye(4)), Step((), 0.1, result.heldout_rms, 0.1, result.T_mount)
+    fitted = replace(result, ledger=(step, step))
+    monkeypatch.setattr(change_command, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
+    monkeypatch.setattr(change_command, "suggest", lambda state, at_most: (fitted, [], None))
+    monkeypatch.setattr(change_command, "write_diagnosis", lambda found, state, run: {})
+    stitch_command("add", run, "--suggested")
+    steps = json.loads((run / "ledger.json").read_text())
+    assert len(steps) == len(fitted.ledger)
+    assert steps[-1]["hand_eye"] == told(run)["hand_eye"] and steps[-1]["heldout_rms"] == told(run)["heldout_rms"]
+
+
+def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, stitch_command):
+    run, result = changing
+    monkeypatch.setattr(change_command, "suggest", lambda state, at_most: (None, [], None))
+    monkeypatch.setattr(change_command, "write_diagnosis", lambda found, state, run: {})
+    assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
+    assert state_of(result).T_mount.tolist() == told(run)["hand_eye"]
+
+
+def test_a_page_or_picture_that_fails_leaves_the_old_one(changing, monkeypatch):
+    run, result = changing
+    before = files(run)
+    write = type(run).write_text
+
+    def breaks(path, text, **options):
+        write(path, text[: len(text) // 2], **options)
+        raise OSError("disk full")
+
+    class Broken:
+        def savefig(self, file, **options):
+            if options["format"] == "png":
+                file.write_bytes(b"half")
+                raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(run), "write_text", breaks)
+        with pytest.raises(OSError, match="disk full"):
+            run_page.write_report(result, run / "report.html")
+    with pytest.raises(OSError, match="disk full"):
+        sections._save(run / "pictures", {"budget": Broken()})
+    assert files(run) == before
+    assert [path.name for path in (run / "pictures").iterdir()] == ["budget.png"]

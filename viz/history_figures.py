@@ -1,0 +1,36 @@
+"""The error over the history of the model, as a figure."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from stitch.runs.run import LedgerStep
+from stitch.units import MICROMETRES
+from viz.colours import BLUE, GREEN
+from viz.drawing import above, plain
+
+
+def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
+    """Residual, held-out residual and noise floor over the model's history."""
+    um = MICROMETRES[length_unit]
+    figure = Figure(figsize=(7, 2.9), layout="constrained")
+    axes = figure.subplots()
+    place = np.arange(len(ledger))
+    inside = axes.bar(place - 0.2, [s.residual_rms * um for s in ledger], 0.38, color=BLUE, label="in the fit")
+    outside = axes.bar(place + 0.2, [s.heldout_rms * um for s in ledger], 0.38, color=GREEN, label="on views left out")
+    for bars in (inside, outside):
+        axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
+    floors = np.array([s.noise_floor * um for s in ledger])
+    axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
+    axes.set_xticks(place, [change_of(ledger, i) for i in place])
+    axes.set_ylabel("rms between views (µm)")
+    above(axes)
+    return plain(figure)
+
+
+def change_of(ledger: tuple[LedgerStep, ...], i: int) -> str:
+    """What step i brought or took: + joint_compliance."""
+    if i == 0:
+        return ", ".join(ledger[0].effects) or "hand-eye alone"
+    new = [f"+ {e}" for e in ledger[i].effects if e not in ledger[i - 1].effects]
+    gone = [f"− {e}" for e in ledger[i - 1].effects if e not in ledger[i].effects]
+    return "\n".join([*new, *gone]) or "fitted again"
