@@ -12,7 +12,7 @@ PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
 
 export RERUN_ANALYTICS ?= off
 
-.PHONY: install demo test check lock clean
+.PHONY: install demo test lint check lock clean
 
 install: $(STAMP)
 
@@ -38,11 +38,16 @@ demo: install
 test: install
 	$(PYTHON) -m pytest
 
-check: install
+# Style, format, types and which room may import which.
+lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports --no-logo
+
+check: lint
 	$(PYTHON) -m pytest --cov
+	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=90
 
 # Pins every package with hashes. What other indexes or settings of this machine might write into it is refused.
 lock:
@@ -52,4 +57,4 @@ lock:
 	@! grep -nE '://| @ |^-' constraints.txt || { echo "constraints.txt names an address" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage build *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build *.egg-info

@@ -11,17 +11,17 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.fit import fit
-from stitch.cells.base_to_base.projection import project
 from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_points
+from stitch.cells.base_to_base.stand_fit import fit
+from stitch.cells.base_to_base.stand_projection import project
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 TRUE = {1: [4.0, -1.0, 1.0], 2: [6.0, -4.0, 1.0]}
 JOINTS = {1: (0.6283, 0.4488), 2: (1.0472, 0.6283)}
-SLIDE, ANGLE, LENGTH = (
-    {1: 3.8822, 2: 5.9093}, {1: [0.6826, 0.7897], 2: [1.1305, 1.1772]}, {1: [4.0, 4.4084], 2: [5.0, 5.5555]},
-)  # fmt: skip
+SLIDE = {1: 3.8822, 2: 5.9093}
+ANGLE = {1: [0.6826, 0.7897], 2: [1.1305, 1.1772]}
+LENGTH = {1: [4.0, 4.4084], 2: [5.0, 5.5555]}
 PUBLISHED = {
     (1, 0.1): (1.0e-4, 1.4e-4),
     (1, 0.5): (1.7e-4, 2.2e-4),
@@ -50,11 +50,22 @@ def exact_stand(experiment: int, joints: tuple[float, float]) -> Stand:
 
 
 def stand_of(P: np.ndarray, R: np.ndarray, slide: float, angle: np.ndarray, length: np.ndarray) -> Stand:
+    touched = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
     return Stand(
-        "m", Touched(("P1", "P2"), P, np.tile(np.eye(3) * 1e-8, (2, 1, 1))), np.array([np.nan, 0.0]),
-        Touched(("R1", "R2"), R, np.tile(np.eye(3) * 1e-8, (2, 1, 1))), np.full(2, slide), np.asarray(angle),
-        np.asarray(length), 1.0, 1e-6, 1e-6, 1e-6, 1e-4, 1e-4,
-    )  # fmt: skip
+        length_unit="m",
+        rail=Touched(("P1", "P2"), P, touched),
+        rail_slide=np.array([np.nan, 0.0]),
+        rod=Touched(("R1", "R2"), R, touched),
+        slide=np.full(2, slide),
+        angle=np.asarray(angle),
+        length=np.asarray(length),
+        turn=1.0,
+        sigma_slide=1e-6,
+        sigma_angle=1e-6,
+        sigma_length=1e-6,
+        sigma_level_stand=1e-4,
+        sigma_level_base=1e-4,
+    )
 
 
 def noisy(stand: Stand, joints: tuple[float, float], lam: float, rng: np.random.Generator) -> Stand:
@@ -69,8 +80,9 @@ def noisy(stand: Stand, joints: tuple[float, float], lam: float, rng: np.random.
     P = cylinder_points(u(np.array([p, -p])), 1.45 + dr, 1.3 + dz)
     R = cylinder_points(u(np.array([-r, r])), np.full(2, 0.7), np.full(2, 0.3))
     spread = lam * 1e-3 / np.sqrt(12)
-    return replace(stand, rail=replace(stand.rail, points=P, covariance=covariance(P, p * spread, spread * np.pi / 2)),
-                   rod=replace(stand.rod, points=R, covariance=covariance(R, r * spread, 1e-6)))  # fmt: skip
+    rail = replace(stand.rail, points=P, covariance=covariance(P, p * spread, spread * np.pi / 2))
+    rod = replace(stand.rod, points=R, covariance=covariance(R, r * spread, 1e-6))
+    return replace(stand, rail=rail, rod=rod)
 
 
 def covariance(points: np.ndarray, sigma_joint1: float, sigma_other: float) -> np.ndarray:
@@ -104,18 +116,19 @@ def draw(experiment: int, lam: float, draws: int) -> dict[str, np.ndarray]:
 
 def tables(draws: int) -> str:
     lines = [
-        f"Errors under the source's noise, {draws} draws; rotation in µrad / translation in µm.", "",
+        f"Errors under the source's noise, {draws} draws; rotation in µrad / translation in µm.",
+        "",
         "| experiment | λ | solution | rms | median | 95 % | published, one draw | draws below that |",
         "|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for (experiment, lam), published in PUBLISHED.items():
         for name, found in draw(experiment, lam, draws).items():
             rms, median, high = np.sqrt((found**2).mean(0)), np.median(found, 0), np.quantile(found, 0.95, 0)
             cells = [f"{a * 1e6:.0f} / {b * 1e6:.0f}" for a, b in (rms, median, high, published)]
             cells.append(" / ".join(f"{share:.0%}" for share in (found <= published).mean(axis=0)))
             lines.append(f"| {experiment} | {lam} | {name} | {' | '.join(cells)} |")
-    lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", "",
-              "| λ | solution | rotation / rad | translation / m | published |", "|---|---|---|---|---|"]  # fmt: skip
+    lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", ""]
+    lines += ["| λ | solution | rotation / rad | translation / m | published |", "|---|---|---|---|---|"]
     for lam, points in TABLE_3.items():
         P, R = np.array(points[:2]), np.array(points[2:])
         stand = stand_of(P, R, SLIDE[1], np.array(ANGLE[1]), np.array(LENGTH[1]))
@@ -123,9 +136,9 @@ def tables(draws: int) -> str:
             rotation, translation = errors(T, 1)
             p = PUBLISHED[1, lam]
             lines.append(f"| {lam} | {name} | {rotation:.5f} | {translation:.5f} | {p[0]:.5f} / {p[1]:.5f} |")
-    lines += ["", "Distance R1 to R2 with the rod readings and joint angles as printed:", "",
-              "| rod of | joints of | by rod / m | by joints / m | difference / m | translation found |",
-              "|---|---|---|---|---|---|"]  # fmt: skip
+    lines += ["", "Distance R1 to R2 with the rod readings and joint angles as printed:", ""]
+    lines.append("| rod of | joints of | by rod / m | by joints / m | difference / m | translation found |")
+    lines.append("|---|---|---|---|---|---|")
     for rod, joints in ((1, 1), (2, 2), (2, 1)):
         lines.append(_closing(rod, joints))
     return "\n".join(lines)

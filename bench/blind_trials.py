@@ -27,16 +27,16 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
-from stitch.diagnosis.diagnose import diagnose
+from stitch.pipeline import diagnose
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.diagnosis.initial_values import linear_of_state
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.pipeline import change, run
 from stitch.runs.run import Run
 from stitch.stepwise import suggest
-from stitch.stored.load_state import State, state_of
+from stitch.runs.state import State, state_of
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]
@@ -73,7 +73,7 @@ def cell_without(scene: str, seed: int, chance: int | None = None) -> EmptyCell:
     """The cell of a scene and a seed, with nothing hidden; `chance` as in `measure`."""
     measured = measure(scene, seed, {}, chance=chance)
     calm = run(session_of(measured))
-    return EmptyCell(measured.plan, evidence_of_state(state_of(calm)))
+    return EmptyCell(measured.plan, linear_of_state(state_of(calm)))
 
 
 def _chance(job: Row) -> int:
@@ -86,7 +86,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     # What follows a covariate shows as well as that one's course of the day, which is drawn too.
     own = any(law in OUTSIDE or law in CLIMATE for law in laws)
     cell = cell_without(job["scene"], job["seed"], _chance(job) if own else None)
-    true = drawn(job["scene"], cell.plan, cell.evidence.measurement, laws, _chance(job))
+    true = drawn(job["scene"], cell.plan, cell.linear.measurement, laws, _chance(job))
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law
@@ -102,7 +102,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
 def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measured, Run, Diagnosis, Row]:
     measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())), _chance(job))
     first = run(session_of(measured))
-    found = diagnose(state_of(first))
+    found = diagnose(first)
     ranked = [s.name for s in found.candidates if s.ranked.score.observable]
     row = {
         "hidden": {name: measured.hidden[name] for name in hidden}, "verdict": found.verdict,
@@ -174,7 +174,7 @@ def _outside(job: Row) -> Row:
     if found.verdict == "unknown_effect":
         name = user_effect(job["effect"])
         try:
-            again = diagnose(state_of(first))
+            again = diagnose(first)
             added = change(state_of(first), [name])
         finally:
             del EFFECTS[name]

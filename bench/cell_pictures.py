@@ -8,8 +8,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from stitch.cells.base_to_base import read_stand, solve
-from stitch.cells.drilling.job import solve_job as solve_drilling
-from stitch.cells.drilling.reading import read_job as read_drilling
+from stitch.cells.drilling.drill_job import read_job as read_drilling
+from stitch.cells.drilling.drill_solution import solve_job as solve_drilling
 from stitch.cells.panel import read_job as read_panel
 from stitch.cells.panel import solve_job as solve_panel
 from stitch.cells.window import read_seam_job, solve_seam

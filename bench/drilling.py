@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_synth.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
+from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import render_plate
+from stitch.cells.drilling.camera_effects import select_effects
 from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.drilling.experiment import calibrate, run_group
-from stitch.cells.drilling.hidden_effects import name_effects
+from stitch.cells.drilling.drill_procedure import calibrate, run_group
 from stitch.cells.drilling.hole_frame import drive_pose
 from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
 from stitch.cells.drilling.servo import look
@@ -49,10 +49,11 @@ def drilling_table(seeds: int) -> list[str]:
     steps = np.concatenate([run[1] for run in runs])
     lines = [
         f"{seeds} cells, eight holes each. Position and direction are true errors, which only a simulation knows; "
-        "the 2D error is what the camera shows, as in the source.", "",
+        "the 2D error is what the camera shows, as in the source.",
+        "",
         "| | quantity | smallest | mean | largest | worst hole of a cell, 95 % of cells | source |",
         "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for i, (stage, published) in enumerate(PUBLISHED.items()):
         for j, quantity in enumerate(QUANTITIES):
             values = found[:, i, :, j]
@@ -62,20 +63,24 @@ def drilling_table(seeds: int) -> list[str]:
                 f"{high:.2f} | {published[j]} |"
             )
     good = ((found[:, 1, :, 0].max(axis=1) <= 0.30) & (found[:, 1, :, 1].max(axis=1) <= 0.21)).mean()
-    lines += ["", f"Cells with all eight holes within 0.30 mm and 0.21°: {100 * good:.1f} %. The servo loop took "
-              f"{steps.mean():.1f} moves a reference hole, {steps.max()} at most. Leave-one-out error of the "
-              f"homography: {np.mean([run[2] for run in runs]):.3f} mm."]  # fmt: skip
-    return lines
+    text = (
+        f"Cells with all eight holes within 0.30 mm and 0.21°: {100 * good:.1f} %. The servo loop took "
+        f"{steps.mean():.1f} moves a reference hole, {steps.max()} at most. Leave-one-out error of the homography: "
+        f"{np.mean([run[2] for run in runs]):.3f} mm."
+    )
+    return [*lines, "", text]
 
 
 def effects_table(seeds: int) -> list[str]:
     lines = [
-        "", f"Hidden effects, {seeds} cells each: nine plate holes and one hole seen at 75 places and heights. 2D "
-        "error on fresh places in the work plane, mean in mm.", "",
+        "",
+        f"Hidden effects, {seeds} cells each: nine plate holes and one hole seen at 75 places and heights. 2D "
+        "error on fresh places in the work plane, mean in mm.",
+        "",
         "| true k1 | true plate height / mm | named k1 | named plate height | k1 found | plate height found / mm | "
         "2D by homography | 2D with what was named |",
         "|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for k1, plate in ((0.0, 0.0), (-0.004, 0.0), (0.0, 0.4), (-0.004, 0.4)):
         lines.append(effects_row(k1, plate, seeds))
     return lines
@@ -87,10 +92,10 @@ def effects_row(k1: float, plate: float, seeds: int) -> str:
         cell = DrillingCell(seed, Sizes(k1=k1, plate_height=plate))
         (xyz, uv), (at, seen) = cell.plate(), cell.check_holes()
         on_plate = np.arange(len(xyz) + len(at)) < len(xyz)
-        naming = name_effects(Observations(np.vstack([xyz, at]), np.vstack([uv, seen]), on_plate, IMAGE))
-        named = {t.effect: t.value for t in naming.trials if t.accepted}
+        selected = select_effects(Observations(np.vstack([xyz, at]), np.vstack([uv, seen]), on_plate, IMAGE))
+        named = {t.effect: t.value for t in selected.trials if t.accepted}
         at, seen = cell.check_holes((0.0,))
-        errors = [to_plane(fit_homography(xyz[:, :2], uv), seen), naming.camera.plane(seen, at[:, 2])]
+        errors = [to_plane(fit_homography(xyz[:, :2], uv), seen), selected.camera.plane(seen, at[:, 2])]
         means = [np.linalg.norm(error - at[:, :2], axis=1).mean() for error in errors]
         rows.append([named.get("k1", np.nan), named.get("plate_height", np.nan), *means])
     values = np.array(rows)
@@ -116,9 +121,12 @@ def image_table(seeds: int) -> list[str]:
         H = fit_homography(NINE, found)
         errors.append(np.linalg.norm(to_plane(H, truth) - NINE, axis=1))
         left_out.append(np.linalg.norm(leave_one_out(NINE, found), axis=1))
-    return ["", f"Nine holes found by OpenCV in {seeds} rendered images of {IMAGE[0]} x {IMAGE[1]} pixels: the "
-            f"hand-eye is off by {np.mean(errors):.4f} mm on average and {np.max(errors):.4f} mm at most; "
-            f"leave-one-out {np.mean(left_out):.4f} mm on average."]  # fmt: skip
+    text = (
+        f"Nine holes found by OpenCV in {seeds} rendered images of {IMAGE[0]} x {IMAGE[1]} pixels: the hand-eye is off "
+        f"by {np.mean(errors):.4f} mm on average and {np.max(errors):.4f} mm at most; leave-one-out "
+        f"{np.mean(left_out):.4f} mm on average."
+    )
+    return ["", text]
 
 
 def main() -> None:

@@ -8,20 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from panel_drift import drift_table
 from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready_without_panel, shape_run
 
 from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
 from stitch.cells.panel.errors_along import along
-from stitch.cells.panel.experiment import run_pose
-from stitch.cells.panel.figures import draw_errors, draw_shape
 from stitch.cells.panel.global_model import calibrate
+from stitch.cells.panel.laser_tracker import Tracker
 from stitch.cells.panel.legs import Legs, find_leg_offset, true_flanges
-from stitch.cells.panel.motion import follow
-from stitch.cells.panel.shape import SHAPING
-from stitch.cells.panel.tracker import Tracker
+from stitch.cells.panel.panel_loops import run_pose
+from stitch.cells.panel.shape_control import SHAPING
 from stitch.errors import NoResultError
+from viz.cells.panel_error_figures import errors_figure, shape_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES = ROOT / "docs" / "panel.md", ROOT / "docs" / "pictures"
@@ -38,27 +38,37 @@ def pose_table(draws: int) -> list[str]:
         after.append(pose_error(r.cell))
         forces.append(np.linalg.norm(r.cell.state()[2][:, 3:], axis=1).max())
     b, a = np.abs(before), np.abs(after)
-    lines = [f"Pose after one adjustment, {draws} cells; absolute errors against the truth.", "",
-             "| | x / mm | y / mm | z / mm | about x / ° | about y / ° | about z / ° |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        f"Pose after one adjustment, {draws} cells; absolute errors against the truth.",
+        "",
+        "| | x / mm | y / mm | z / mm | about x / ° | about y / ° | about z / ° |",
+        "|---|---|---|---|---|---|---|",
+    ]
     order = [3, 4, 5, 0, 1, 2]
-    rows = (("before, largest", b.max(0), "{:.2f}"), ("after, rms", np.sqrt((a**2).mean(0)), "{:.4f}"),
-            ("after, largest", a.max(0), "{:.4f}"))  # fmt: skip
+    rows = [("before, largest", b.max(0), "{:.2f}"), ("after, rms", np.sqrt((a**2).mean(0)), "{:.4f}")]
+    rows.append(("after, largest", a.max(0), "{:.4f}"))
     lines += [f"| {name} | {' | '.join(f.format(v) for v in values[order])} |" for name, values, f in rows]
-    lines += ["| published, largest of 3 | 0.047 | 0.069 | 0.036 | 0.008 | 0.008 | 0.008 |", "",
-              f"Largest change of force at a clamp after the adjustment: {np.median(forces):.1f} N in the median cell, "
-              f"{max(forces):.1f} N in the worst."]  # fmt: skip
-    return lines
+    text = (
+        f"Largest change of force at a clamp after the adjustment: {np.median(forces):.1f} N in the median cell, "
+        f"{max(forces):.1f} N in the worst."
+    )
+    return [*lines, "| published, largest of 3 | 0.047 | 0.069 | 0.036 | 0.008 | 0.008 | 0.008 |", "", text]
 
 
 def shape_table(draws: int) -> list[str]:
-    lines = [f"Shape until all control points are within {TOLERANCE} mm, {draws} cells each.", "",
-             "| driven axes | before, largest / mm | after 1 / mm | after 2 / mm | corrections needed | "
-             "largest force at the end / N | largest force in the plane / N |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
-    for name, compliant, axes in (("z and about x, y; the rest gives way", True, SHAPING),
-                                  ("z and about x, y; the rest is held", False, SHAPING),
-                                  ("all six", False, np.ones(6, bool))):  # fmt: skip
+    lines = [
+        f"Shape until all control points are within {TOLERANCE} mm, {draws} cells each.",
+        "",
+        "| driven axes | before, largest / mm | after 1 / mm | after 2 / mm | corrections needed | "
+        "largest force at the end / N | largest force in the plane / N |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    cases = (
+        ("z and about x, y; the rest gives way", True, SHAPING),
+        ("z and about x, y; the rest is held", False, SHAPING),
+        ("all six", False, np.ones(6, bool)),
+    )
+    for name, compliant, axes in cases:
         runs = [shape_run(seed, compliant, axes) for seed in range(draws)]
         at = [max(run.deviations[min(k, len(run.deviations) - 1)].max() for run in runs) for k in range(3)]
         force = max(np.linalg.norm(run.forces[-1][:, 3:], axis=1).max() for run in runs)
@@ -70,10 +80,13 @@ def shape_table(draws: int) -> list[str]:
 
 
 def leg_table(draws: int) -> list[str]:
-    lines = [f"A hidden offset of leg 4 of robot C, {POSES} calibration poses, {draws} cells.", "",
-             "| offset / mm | robot found | leg found | offset found, mean ± spread / mm | its own sigma / mm | "
-             "false alarms in other robots | base error before / mm | after / mm |",
-             "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        f"A hidden offset of leg 4 of robot C, {POSES} calibration poses, {draws} cells.",
+        "",
+        "| offset / mm | robot found | leg found | offset found, mean ± spread / mm | its own sigma / mm | "
+        "false alarms in other robots | base error before / mm | after / mm |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for size in (0.0, 0.2, 0.3, 0.5, 1.0):
         found, right, values, sigmas, wrong, errors = 0, 0, [], [], 0, []
         for seed in range(draws):
@@ -106,57 +119,19 @@ def _base_errors(cell, reading, model, offset) -> tuple[float, float]:
     return tuple(float(np.linalg.norm(v)) for v in off)
 
 
-def drift_table() -> list[str]:
-    """Expected and true error of the farthest slave after the source's two motions."""
-    lines = ["Slaves against the master after the source's motions: rms over 200 draws of the model against what 20 "
-             "simulated cells do, worst slave and axis.", "",
-             "| motion | legs repeat / µm | expected / mm | in the cells / mm | expected / ° | in the cells / ° |",
-             "|---|---|---|---|---|---|"]  # fmt: skip
-    for name, turn, step, leg in (("100 mm", False, 100.0, 0.0), ("2°", True, np.radians(2.0), 0.0),
-                                  ("100 mm", False, 100.0, 0.004), ("2°", True, np.radians(2.0), 0.004)):  # fmt: skip
-        expected, real = [], []
-        for seed in range(20):
-            r = ready_without_panel(seed)
-            r.cell.sizes = replace(r.cell.sizes, leg=leg)
-            r.cell.drive(r.T_base_flange)
-            if seed == 0:
-                e = along(r.stage.models, r.T_base_flange, MASTER, np.array([step]), turn)
-                expected = [e.position.max(), np.degrees(e.angle.max())]
-            bases = np.array([m.T_world_base for m in r.stage.models])
-            change = np.zeros((3, 6, 6))
-            for axis in range(3):
-                before = r.cell.clamps()
-                motion = np.zeros(6)
-                motion[axis if turn else 3 + axis] = step
-                T = r.T_base_flange[MASTER].copy()
-                T[:3, :3] = frames.exp(motion)[:3, :3] @ T[:3, :3]
-                T[:3, 3] += frames.exp(motion)[:3, 3]
-                r.cell.drive(follow(bases, r.T_base_flange, MASTER, T))
-                after = r.cell.clamps()
-                relative = [frames.inverse(c[MASTER]) @ c for c in (before, after)]
-                change[axis] = frames.log(frames.inverse(relative[0]) @ relative[1])
-                r.cell.drive(r.T_base_flange)
-            real.append(change)
-        rms = np.sqrt((np.array(real) ** 2).mean(0))
-        worst = [np.linalg.norm(part, axis=-1).max() for part in (rms[..., 3:], np.degrees(rms[..., :3]))]
-        numbers = f"{expected[0]:.3f} | {worst[0]:.3f} | {expected[1]:.4f} | {worst[1]:.4f}"
-        lines.append(f"| {name} | {leg * 1e3:g} | {numbers} |")
-    return lines
-
-
 def pictures() -> None:
     PICTURES.mkdir(exist_ok=True)
     r = ready_without_panel(0)
     args = r.stage.models, r.T_base_flange, MASTER
     shift = along(*args, np.linspace(0, 100, 11), turn=False)
     turn = along(*args, np.radians(np.linspace(0, 2, 11)), turn=True)
-    draw_errors([PICTURES / "panel-errors.png"], NAMES, MASTER, shift, turn)
+    errors_figure(NAMES, MASTER, shift, turn).savefig(PICTURES / "panel-errors.png", dpi=110)
     try:
         run = shape_run(0, True, SHAPING, tolerance=0.25)
     except NoResultError:
         run = shape_run(0, True, SHAPING)
     forces = np.array([np.linalg.norm(f[:, 3:], axis=1).max() for f in run.forces])
-    draw_shape(PICTURES / "panel-shape.png", NAMES, run.deviations, TOLERANCE, forces)
+    shape_figure(NAMES, run.deviations, TOLERANCE, forces).savefig(PICTURES / "panel-shape.png", dpi=110)
 
 
 def main() -> None:

@@ -7,12 +7,13 @@ import numpy as np
 from data_synth import panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
-from stitch.cells.panel.experiment import ShapeRun, Stage, run_pose, run_shape
 from stitch.cells.panel.global_model import Readings, calibrate
+from stitch.cells.panel.laser_tracker import Tracker
 from stitch.cells.panel.layout import Layout, contacts
-from stitch.cells.panel.motion import preposition
+from stitch.cells.panel.panel_loops import ShapeRun, Stage, run_pose, run_shape
+from stitch.cells.panel.panel_motion import preposition
 from stitch.cells.panel.rigid_fit import rigid_fit
-from stitch.cells.panel.tracker import Tracker
+from stitch.cells.panel.shape_control import ControlPoints
 
 LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
 POSES, MASTER, TOLERANCE = 40, 1, 0.6
@@ -64,6 +65,5 @@ def shape_run(seed: int, compliant: bool, axes: np.ndarray, tolerance: float = T
     r = ready(seed)
     stand = run_pose(r.cell, r.stage, panel_job.pose_targets(), r.T_base_flange)
     r.cell.compliant = compliant
-    points, clamp = panel_job.control_points()
-    contact = contacts(LAYOUT).T_panel_contact
-    return run_shape(r.cell, r.stage, points, clamp, contact, stand, tolerance, axes)
+    control = ControlPoints(*panel_job.control_points(), contacts(LAYOUT).T_panel_contact)
+    return run_shape(r.cell, r.stage, control, stand, tolerance=tolerance, axes=axes)

@@ -17,7 +17,7 @@ from blind_trials import LIBRARY, cell_without, pin
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.diagnose import checked
 from stitch.diagnosis.diagnosis import CandidateEffect
-from stitch.diagnosis.selection.select import implausible, select
+from stitch.diagnosis.selection.verdict import implausible, select
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
 from stitch.observations.surfaces.pose_evidence import PoseEvidence
@@ -61,7 +61,7 @@ def main() -> None:
     for scene in options.scenes.split(","):
         cell = cell_without(scene, 0)
         candidates, rng = candidates_of(cell.evidence)[0], np.random.default_rng(1)
-        true = drawn(scene, cell.plan, cell.evidence.measurement, LIBRARY, 0)
+        true = drawn(scene, cell.plan, cell.linear.measurement, LIBRARY, 0)
         for candidate in candidates:
             size = smallest(cell.evidence, candidate.name, true[candidate.name]) if candidate.name in true else None
             if size is None:

@@ -17,7 +17,7 @@ from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
 from stitch.stepwise import suggest
-from stitch.stored.load_state import state_of
+from stitch.runs.state import state_of
 from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]

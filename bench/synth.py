@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import igl
 import numpy as np
 
 from data_synth.nature import LAWS
@@ -60,18 +61,14 @@ def quiet(name: str) -> Scene:
 
 def misfit(measured: Measured) -> tuple[float, float]:
     """µm from the part under the reported poses and the true hand-eye: rms and largest view's rms."""
-    import open3d as o3d
-
     scene, mesh = measured.scene, measured.mesh
-    surface = o3d.t.geometry.RaycastingScene()
-    surface.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
     T = measured.T_base_flange
     T_reference_scanner = (frames.inverse(T) if scene.mount == "eye_to_hand" else T) @ measured.T_mount
     T_part_scanner = frames.inverse(scene.T_reference_part) @ T_reference_scanner
     squares = []
     for cloud, pose in zip(measured.clouds, T_part_scanner, strict=True):
         y = frames.transform(pose, cloud.points)
-        face = surface.compute_closest_points(y.astype(np.float32))["primitive_ids"].numpy()
+        _, face, _ = igl.point_mesh_squared_distance(y, np.array(mesh.vertices), np.array(mesh.faces))
         off = np.einsum("ij,ij->i", y - mesh.triangles[face, 0], mesh.face_normals[face])
         squares.append(np.mean(off**2))
     return 1e3 * float(np.sqrt(np.mean(squares))), 1e3 * float(np.sqrt(np.max(squares)))

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_synth import window, window_views
+from data_synth import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window import Weld
+from data_synth.window_scans import Weld, warp
 from stitch import frames
 from stitch.cells.window.cad import surface
+from stitch.cells.window.cad_fit import fit
+from stitch.cells.window.cad_start import find_start
 from stitch.cells.window.deviation import deviations
-from stitch.cells.window.fit import fit
+from stitch.cells.window.joined_scans import join
 from stitch.cells.window.regions import Box, Regions
-from stitch.cells.window.scans import join
 from stitch.cells.window.seam import Limits, Station, measure_seam
-from stitch.cells.window.start import find_start
 from stitch.measurement.scan import prepare_view
 from viz.cells.window_fit import deviation_map
 
@@ -41,8 +41,8 @@ def joined(clouds, poses):
 
 def scanned(mesh, kind: str, T: np.ndarray, seed: int, part: slice = slice(None), edges: slice = slice(None)):
     """Overview scans and close scans along the edges."""
-    overview, poses = window.scan_outside(mesh, T, NOISE, seed, (3, 1) if kind == "pane" else (3, 3))
-    close, near = window.scan_edges(mesh, T, Pane() if kind == "pane" else CarDoor(), kind, NOISE, seed + 50)
+    overview, poses = window_scans.scan_outside(mesh, T, NOISE, seed, (3, 1) if kind == "pane" else (3, 3))
+    close, near = window_scans.scan_edges(mesh, T, Pane() if kind == "pane" else CarDoor(), kind, NOISE, seed + 50)
     return joined(overview[part] + close[edges], np.concatenate([poses[part], near[edges]]))
 
 
@@ -55,26 +55,31 @@ def furthest(T: np.ndarray, true: np.ndarray, mesh) -> float:
 def fit_table(door, pane, draws: int) -> list[str]:
     big = Weld(size=6.0, reach=200.0)
     upper = Regions(expected=(Box("window frame", np.array([-9.0, -200, 600]), np.array([1300.0, 100, 1100])),))
+    bulged, badly_bulged, everything = warp(door, Weld()), warp(door, big), (slice(None), slice(None))
     cases = [
-        ("pane", pane, "pane", pane, slice(None), slice(None), None),
-        ("door", door, "door", door, slice(None), slice(None), None),
-        ("door, front third of it scanned", door, "door", door, slice(0, 4), slice(0, 5), None),
-        ("door, welding bulge 3 mm, σ 130 mm", door, "door", window.warp(door, Weld()), slice(None), slice(None), None),
-        ("door, welding bulge 6 mm, σ 200 mm", door, "door", window.warp(door, big), slice(None), slice(None), None),
-        ("the same, window frame expected", door, "door", window.warp(door, big), slice(None), slice(None), upper),
+        ("pane", "pane", pane, everything, None),
+        ("door", "door", door, everything, None),
+        ("door, front third of it scanned", "door", door, (slice(0, 4), slice(0, 5)), None),
+        ("door, welding bulge 3 mm, σ 130 mm", "door", bulged, everything, None),
+        ("door, welding bulge 6 mm, σ 200 mm", "door", badly_bulged, everything, None),
+        ("the same, window frame expected", "door", badly_bulged, everything, upper),
     ]
-    surfaces = {"pane": surface(pane), "door": surface(door)}
-    lines = [f"Furthest that the pose's error moves any point of the part, {draws} turns of it; noise {NOISE} mm.", "",
-             "| part | start / mm | after the fit, largest / mm | rms of distances / mm | share that counts |",
-             "|---|---|---|---|---|"]  # fmt: skip
-    for name, cad_mesh, kind, mesh, part, edges, regions in cases:
+    cad_meshes = {"pane": pane, "door": door}
+    surfaces = {kind: surface(mesh) for kind, mesh in cad_meshes.items()}
+    lines = [
+        f"Furthest that the pose's error moves any point of the part, {draws} turns of it; noise {NOISE} mm.",
+        "",
+        "| part | start / mm | after the fit, largest / mm | rms of distances / mm | share that counts |",
+        "|---|---|---|---|---|",
+    ]
+    for name, kind, mesh, (part, edges), regions in cases:
         rows = []
         for seed in range(draws):
             T = truth(seed)
             scan = scanned(mesh, kind, T, seed, part, edges)
             start = find_start(scan, surfaces[kind]).T_base_part
             found = fit(scan, surfaces[kind], start, regions)
-            off = (furthest(start, T, cad_mesh), furthest(found.T_base_part, T, cad_mesh))
+            off = (furthest(pose, T, cad_meshes[kind]) for pose in (start, found.T_base_part))
             rows.append([*off, found.rms, found.inliers])
             if name.startswith("door, welding bulge 3") and seed == 0:
                 write_map(scan, surfaces["door"], found.T_base_part)
@@ -102,23 +107,25 @@ def seam_table(door, draws: int) -> list[str]:
         push = np.concatenate([rng.normal(size=3) * 1e-3, rng.normal(size=3) * 0.5])
         pane.apply_transform(centre @ frames.exp(push) @ frames.inverse(centre))
         T = truth(seed)
-        scan = joined(*window.scan_seam([door, pane], T, middle, across, out, NOISE, seed))
+        scan = joined(*window_scans.scan_seam([door, pane], T, (middle, across, out), NOISE, seed))
         measured = measure_seam(scan, T, places, Limits())
-        true = np.array([window.true_seam(pane, door, s.T_part_station) for s in places])
+        true = np.array([window_scans.true_seam(pane, door, s.T_part_station) for s in places])
         errors.append([[m.flush - t[0], m.gap - t[1]] for m, t in zip(measured, true, strict=True)])
         sigmas.append([[m.sigma_flush, m.sigma_gap] for m in measured])
         shown = list(zip(measured, true, strict=True))
     e, s = np.array(errors).reshape(-1, 2), np.array(sigmas).reshape(-1, 2)
-    lines = [f"Seam, {draws} panes set a little wrong, eight stations each.", "",
-             "| | flush / mm | gap / mm |", "|---|---|---|"]  # fmt: skip
     rows = {
-        "error, rms": np.sqrt((e**2).mean(0)), "error, largest": np.abs(e).max(0), "stated sigma, mean": s.mean(0),
+        "error, rms": np.sqrt((e**2).mean(0)),
+        "error, largest": np.abs(e).max(0),
+        "stated sigma, mean": s.mean(0),
         "error over stated sigma, rms": np.sqrt(((e / s) ** 2).mean(0)),
-    }  # fmt: skip
+    }
+    lines = [f"Seam, {draws} panes set a little wrong, eight stations each.", ""]
+    lines += ["| | flush / mm | gap / mm |", "|---|---|---|"]
     for name, values in rows.items():
         lines.append(f"| {name} | {values[0]:.4f} | {values[1]:.4f} |")
-    lines += ["", "The last pane (limits: flush 0 ± 1.5, gap 16 ± 2 mm):", "",
-              "| station | flush / mm | true | gap / mm | true | verdict |", "|---|---|---|---|---|---|"]  # fmt: skip
+    lines += ["", "The last pane (limits: flush 0 ± 1.5, gap 16 ± 2 mm):", ""]
+    lines += ["| station | flush / mm | true | gap / mm | true | verdict |", "|---|---|---|---|---|---|"]
     for m, t in shown:
         lines.append(f"| {m.station} | {m.flush:+.3f} | {t[0]:+.3f} | {m.gap:.3f} | {t[1]:.3f} | {m.verdict} |")
     return lines

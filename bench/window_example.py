@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_synth import window, window_job, window_views
+from data_synth import window_job, window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import Pane
 from stitch import frames
@@ -65,8 +65,8 @@ def main() -> None:
     pane.__init__(np.asarray(small.vertices), np.asarray(small.triangles))
     pane.export(EXAMPLE / "pane.stl")
     T, nominal = truth(1), truth(1) @ frames.exp(np.array([0.01, -0.006, 0.004, 6.0, -4.0, 9.0]))
-    overview, poses = window.scan_outside(pane, T, NOISE, 1, (3, 1), rays=60)
-    close, near = window.scan_edges(pane, T, Pane(), "pane", NOISE, 2, count=8, rays=60)
+    overview, poses = window_scans.scan_outside(pane, T, NOISE, 1, (3, 1), rays=60)
+    close, near = window_scans.scan_edges(pane, T, Pane(), "pane", NOISE, 2, count=8, rays=60)
     window_job.write_scans(EXAMPLE / "pane.csv", overview + close, np.concatenate([poses, near]))
     path = np.array([nominal @ frames.make(np.eye(3), [x, 200.0, 750.0]) for x in (300, 600, 900)])
     window_job.write_path(EXAMPLE / "path.csv", path)
@@ -74,7 +74,7 @@ def main() -> None:
     middle, across, out = window_views.stations(Pane())
     door, set_wrong = car_door.build(), car_door.build_pane()
     set_wrong.apply_translation([0.8, 0.6, -0.5])
-    clouds, poses = window.scan_seam([door, set_wrong], T, middle, across, out, NOISE, 3, rays=100)
+    clouds, poses = window_scans.scan_seam([door, set_wrong], T, (middle, across, out), NOISE, 3, rays=100)
     clouds = [points[(np.abs(points[:, :2]) < 24).all(axis=1)] for points in clouds]
     window_job.write_scans(EXAMPLE / "seam.csv", clouds, poses)
     window_job.write_stations(EXAMPLE / "stations.csv", middle, across, out)

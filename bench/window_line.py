@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from data_synth.window import true_seam
 from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
+from data_synth.window_scans import true_seam
 from stitch import frames
 from stitch.cells.csv_table import read_columns
 from stitch.cells.pose_table import from_columns
@@ -103,10 +103,14 @@ def judge(folder: Path, line: WindowLine, T_cell_window: np.ndarray) -> Outcome:
     )
     drawn = np.array([true_seam(line.window_mesh, line.body_mesh, T) for T in places])
     return Outcome(
-        float(np.linalg.norm(off)), furthest(found["window"], T_cell_window, line.window_mesh),
-        furthest(found["body"], line.T_cell_body, line.body_mesh),
-        furthest(T_body_window, np.eye(4), line.window_mesh), measured - true, sigma, true - drawn,
-    )  # fmt: skip
+        hand_eye=float(np.linalg.norm(off)),
+        window=furthest(found["window"], T_cell_window, line.window_mesh),
+        body=furthest(found["body"], line.T_cell_body, line.body_mesh),
+        placed=furthest(T_body_window, np.eye(4), line.window_mesh),
+        seam=measured - true,
+        sigma=sigma,
+        asked=true - drawn,
+    )
 
 
 def fitted(file: Path) -> np.ndarray:
@@ -123,11 +127,12 @@ def furthest(T: np.ndarray, true: np.ndarray, mesh) -> float:
 def budget(seeds: int, keep: Path | None) -> list[str]:
     lines = [
         f"{seeds} lines for each row; mm. Rms over the lines, and the largest. A pose counts by the point of its part "
-        "that it moves furthest.", "",
+        "that it moves furthest.",
+        "",
         "| switched on | hand-eye at 500 mm | window in the rack | body | window set against its design place | "
         "flush and gap set, rms of 8 places | seam measured against its truth, rms | largest |",
         "|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for name, (sphere, scans, moves) in SOURCES.items():
         found = []
         for seed in range(seeds):

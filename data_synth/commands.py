@@ -1,7 +1,6 @@
 """`stitch synth` writes a session with a hidden effect; `stitch reveal` judges who was asked to find it."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,10 +39,7 @@ def synth(
         # The part's mesh lies beside it under the same name.
         raise InputError(f"--truth {target}: name a file that ends in .json")
     measured = make(scene, hidden_of(hide or []), seed, views)
-    scratch = out.with_name(f".{out.name}.writing")
-    shutil.rmtree(scratch, ignore_errors=True)
-    write_session(scratch, measured, out.name)
-    scratch.rename(out)
+    write_session(out, measured, out.name)
     write_truth(target, measured, seed)
     points = sum(len(cloud.points) for cloud in measured.clouds)
     summary = f"{len(measured.clouds)} views, {points:,} points → {out}\ntruth → {target}"

@@ -1,12 +1,13 @@
 """Writes a drilling cell as the files that `stitch drill` reads; truth stays with the cell."""
 
-import csv
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_synth.drilling import GROUPS, HEIGHT, IMAGE, DrillingCell
+from data_synth.csv_rows import POSE, write_rows
+from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, DrillingCell
 from stitch import frames
 
 _JOB = f"""# A drilling job: where must the robot be sent so that the holes come where they belong?
@@ -44,7 +45,7 @@ def write_job(folder: Path, cell: DrillingCell) -> np.ndarray:
     ]
     _table(folder / "holes.csv", "hole group kind x y z i j k", holes)
     names = sorted({name for references, _ in GROUPS.values() for name in references})
-    _table(folder / "placed.csv", "hole x y z a_deg b_deg c_deg u v height", [_placed(cell, name) for name in names])
+    _table(folder / "placed.csv", f"hole {POSE} u v height", [_placed(cell, name) for name in names])
     return _marker_paths(folder, cell)
 
 
@@ -83,9 +84,6 @@ def _marker_paths(folder: Path, cell: DrillingCell) -> np.ndarray:
     return T
 
 
-def _table(file: Path, header: str, rows: object) -> None:
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(header.split())
-        for row in rows:  # type: ignore[attr-defined]
-            writer.writerow([value if isinstance(value, str) else f"{value:.6f}" for value in row])
+def _table(file: Path, header: str, rows: Iterable[Iterable[object]]) -> None:
+    texts = [[value if isinstance(value, str) else f"{value:.6f}" for value in row] for row in rows]
+    write_rows(file, header, texts)

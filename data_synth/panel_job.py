@@ -1,21 +1,26 @@
 """A panel cell's measurements as the files that `stitch panel` reads."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from data_synth import hexapod
+from data_synth.csv_rows import POSE, pose_numbers, write_rows
 from data_synth.panel_cell import LENGTH, NAMES, RADIUS, PanelCell
 from stitch import frames
 
 Array = NDArray[np.float64]
 
-LAYOUT = {"radius": RADIUS, "clamp_width": 360.0, "spacing": 290.0, "clamp_height": 360.0, "edge": 300.0,
-          "length": LENGTH}  # fmt: skip
+LAYOUT = {
+    "radius": RADIUS,
+    "clamp_width": 360.0,
+    "spacing": 290.0,
+    "clamp_height": 360.0,
+    "edge": 300.0,
+    "length": LENGTH,
+}
 # Targets of the pose on the inner side, and three control points at each clamp: axial place and angle.
 _POSE = [(x, a) for x in (-1400.0, -470.0, 470.0, 1400.0) for a in (-0.31, 0.0, 0.31)]
 _CONTROL = [(-1310.0, -0.03), (-1310.0, 0.03), (-830.0, 0.0)]
@@ -67,55 +72,47 @@ def calibration(cell: PanelCell, commands: Array) -> Array:
     return np.array(seen)
 
 
-def numbers(T: Array) -> list[float]:
-    """x, y, z, a, b, c (mm, deg about z, y', x'')."""
-    angles = Rotation.from_matrix(T[:3, :3]).as_euler("ZYX", degrees=True)
-    return [round(float(v), 6) for v in (*T[:3, 3], *angles)]
-
-
 def write_calibration(file: Path, commands: Array, seen: Array) -> None:
     """One row per robot and pose."""
-    rows = [[NAMES[i], m + 1, *numbers(commands[m, i]), *np.round(seen[m, i].ravel(), 5).tolist()]
-            for i in range(6) for m in range(len(commands))]  # fmt: skip
-    header = "robot pose x y z a_deg b_deg c_deg x1 y1 z1 x2 y2 z2 x3 y3 z3"
-    _write(file, header, rows)
+    rows = [
+        [name, m + 1, *pose_numbers(commands[m, i], 6), *np.round(seen[m, i].ravel(), 5).tolist()]
+        for i, name in enumerate(NAMES)
+        for m in range(len(commands))
+    ]
+    write_rows(file, f"robot pose {POSE} x1 y1 z1 x2 y2 z2 x3 y3 z3", rows)
 
 
 def write_flanges(file: Path, T_base_flange: Array) -> None:
     """Where the robots stand."""
-    _write(file, "robot x y z a_deg b_deg c_deg", [[n, *numbers(T)] for n, T in zip(NAMES, T_base_flange, strict=True)])
+    rows = [[name, *pose_numbers(T, 6)] for name, T in zip(NAMES, T_base_flange, strict=True)]
+    write_rows(file, f"robot {POSE}", rows)
 
 
 def write_points(file: Path, names: list[str], nominal: Array, seen: Array, robots: list[str] | None = None) -> None:
     """Nominal points in the panel frame and what the tracker sees in the world."""
     extra = [[r] for r in robots] if robots else [[] for _ in names]
-    rows = [[n, *e, *np.round(p, 4).tolist(), *np.round(q, 5).tolist()]
-            for n, e, p, q in zip(names, extra, nominal, seen, strict=True)]  # fmt: skip
-    _write(file, f"point {'robot ' if robots else ''}x y z seen_x seen_y seen_z", rows)
+    places = np.hstack([np.round(nominal, 4), np.round(seen, 5)]).tolist()
+    rows = [[name, *robot, *place] for name, robot, place in zip(names, extra, places, strict=True)]
+    write_rows(file, f"point {'robot ' if robots else ''}x y z seen_x seen_y seen_z", rows)
 
 
 def write_forces(file: Path, forces: Array) -> None:
     """Change of the sensors since the panel was laid on, N·mm and N."""
     rows = [[n, *np.round(f, 2).tolist()] for n, f in zip(NAMES, forces, strict=True)]
-    _write(file, "robot tx ty tz fx fy fz", rows)
+    write_rows(file, "robot tx ty tz fx fy fz", rows)
 
 
 def write_job(file: Path, cell: PanelCell, files: dict[str, str]) -> None:
     """The job file."""
     document = {
-        "format": "stitch-panel/1", "robots": list(NAMES), "master": "B",
-        "target": dict(zip(("x", "y", "z", "a_deg", "b_deg", "c_deg"), numbers(cell.target), strict=True)),
+        "format": "stitch-panel/1",
+        "robots": list(NAMES),
+        "master": "B",
+        "target": dict(zip(POSE.split(), pose_numbers(cell.target, 6), strict=True)),
         "layout": LAYOUT,
         "tracker": {"position": cell.tracker.tolist(), "constant": 0.010, "per_length": 5e-6},
         "shape": {"tolerance": 0.6, "axes": ["z", "rx", "ry"]},
         "legs": {"base": np.round(hexapod.BASE, 4).tolist(), "platform": np.round(hexapod.PLATFORM, 4).tolist()},
         "files": files,
-    }  # fmt: skip
+    }
     file.write_text(_COMMENT + tomli_w.dumps(document), encoding="utf-8")
-
-
-def _write(file: Path, header: str, rows: list[list[object]]) -> None:
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(header.split())
-        writer.writerows(rows)

@@ -12,11 +12,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.scanner import Cloud, Scanner
+from data_synth.scanner import Cloud
 from data_synth.scanning import scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window import NO_FIELD, Weld, warp
+from data_synth.window_scans import NO_FIELD, Weld, area_scanner, warp
 from data_synth.window_views import across_seam, along_edges, looking_at, over, stations
 from stitch import frames
 
@@ -141,14 +141,18 @@ class WindowLine:
         return self._scan(both, self.T_cell_body_nominal, self.T_cell_body, views, self.errors, _NARROW)
 
     def _scan(
-        self, mesh: trimesh.Trimesh, T_nominal: Array, T_true: Array, T_part_scanner: Array, errors: Errors,
+        self,
+        mesh: trimesh.Trimesh,
+        T_nominal: Array,
+        T_true: Array,
+        T_part_scanner: Array,
+        errors: Errors,
         field_of_view: float = _WIDE,
-    ) -> Scans:  # fmt: skip
+    ) -> Scans:
         """Go where the program says for a part at its nominal place (4, 4); see it where it truly is."""
         reported = T_nominal @ T_part_scanner @ frames.inverse(self.T_flange_scanner_nominal)
         true, rail = self._drive(reported, errors)
-        fov = field_of_view
-        scanner = Scanner("area", self.rays, self.rays, fov, fov, _STANDOFF, 640.0, errors.noise)
+        scanner = area_scanner(self.rays, field_of_view, _STANDOFF, depth=640.0, noise=errors.noise)
         seen = frames.inverse(T_true) @ true @ self.T_flange_scanner
         return Scans(reported, rail, [scan(mesh, T, scanner, NO_FIELD, self.rng) for T in seen])
 

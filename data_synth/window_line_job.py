@@ -1,15 +1,15 @@
 """A window line on disk: what it scans as session folders, its CAD and its programs as job files."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 
 from data_synth.window_job import pose_table, write_path, write_stations
 from data_synth.window_line import RADIUS, Scans, WindowLine
-from data_synth.write import write_ply
-from stitch import frames
+from data_synth.write import cloud_file
+from stitch.writing.session_files import SessionFiles, pose_columns, write_session
 
 Array = NDArray[np.float64]
 
@@ -61,16 +61,19 @@ def write_seam(folder: Path, line: WindowLine) -> None:
 
 def write_scans(folder: Path, scans: Scans, line: WindowLine, sphere: bool = False) -> None:
     """One session folder, eye_in_hand; the scanner's drawing gives the coarse hand-eye."""
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    rows = ["view,cloud,x,y,z,qx,qy,qz,qw,rail_mm"]
-    for i, (T, stop, cloud) in enumerate(zip(scans.T_cell_flange, scans.rail, scans.clouds, strict=True)):
-        name = f"v{i:03d}"
-        write_ply(folder / "clouds" / f"{name}.ply", cloud)
-        numbers = [*T[:3, 3], *frames.to_quaternion(T), stop]
-        rows.append(",".join([name, f"clouds/{name}.ply", *(f"{x:.12g}" for x in numbers)]))
-    (folder / "views.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    document = {
-        "format": "stitch-session/1", "name": folder.name, "length_unit": "mm", "mount": "eye_in_hand",
-        "scanner": {"pose": line.T_flange_scanner_nominal.tolist(), "noise": line.errors.noise},
-    } | ({"sphere": {"radius": RADIUS}} if sphere else {})  # fmt: skip
-    (folder / "session.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
+    names = [f"v{i:03d}" for i in range(len(scans.clouds))]
+    files = [f"clouds/{name}.ply" for name in names]
+    tables: dict[str, dict[str, Any]] = {
+        "scanner": {"pose": line.T_flange_scanner_nominal.tolist(), "noise": line.errors.noise}
+    }
+    if sphere:
+        tables["sphere"] = {"radius": RADIUS}
+    session = SessionFiles(
+        name=folder.name,
+        length_unit="mm",
+        mount="eye_in_hand",
+        tables=tables,
+        views={"view": names, "cloud": files, **pose_columns(scans.T_cell_flange), "rail_mm": scans.rail},
+        clouds={file: cloud_file(cloud) for file, cloud in zip(files, scans.clouds, strict=True)},
+    )
+    write_session(folder, session)

@@ -37,21 +37,23 @@ def along_edges(door: CarDoor, kind: str, count: int, distance: float) -> Array:
         loops = [(window_outline(door).offset(-16.0, circular_segments=96), 1.0)]
     else:
         loops = [(door_outline(door), 1.0), (window_outline(door), -1.0)]
-    return np.array([
+    poses = [
         looking_at(m, -np.cos(0.75) * n - np.sin(0.75) * facing * t, np.cross(n, t), distance)
         for outline, facing in loops
         for m, t, n in zip(*along_loop(door, outline, count), strict=True)
-    ])  # fmt: skip
+    ]
+    return np.array(poses)
 
 
 def across_seam(middle: Array, across: Array, outwards: Array, tilt: float, distance: float) -> Array:
     """(2 V, 4, 4): two views of each station, leaned by `tilt` (deg) to either side so that both flanks are seen."""
     leans = np.radians(tilt) * np.array([1.0, -1.0])
-    return np.array([
+    poses = [
         looking_at(m, -np.cos(lean) * n + np.sin(lean) * t, np.cross(n, t), distance)
         for m, t, n in zip(middle, across, outwards, strict=True)
         for lean in leans
-    ])  # fmt: skip
+    ]
+    return np.array(poses)
 
 
 def stations(pane: Pane) -> tuple[Array, Array, Array]:

@@ -1,33 +1,47 @@
 """Write what a cell measured as a session folder, and the truth where nobody in the cell looks."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 
+from data_synth import scanner
 from data_synth.arms import Arm
 from data_synth.kinematics import GRAVITY
-from data_synth.scanner import Cloud
 from data_synth.shapes import write_mesh
 from data_synth.simulate import Measured
-from stitch import frames
+from stitch.measurement.cloud import Cloud
+from stitch.writing import session_files
+from stitch.writing.session_files import Columns, SessionFiles, pose_columns
 
 Array = NDArray[np.float64]
 
 
 def write_session(out: Path, measured: Measured, name: str) -> None:
-    """session.toml, views.csv, clouds and, where the scene has them, points.csv, below the new folder `out`."""
-    (out / "clouds").mkdir(parents=True)
-    for i, cloud in enumerate(measured.clouds):
-        write_ply(out / "clouds" / f"v{i:03d}.ply", cloud)
-    (out / "views.csv").write_text(_views(measured))
-    (out / "session.toml").write_text(tomli_w.dumps(_document(name, measured)))
-    if measured.labelled:
-        (out / "points.csv").write_text(_points(measured))
+    """session.toml, views.csv, clouds and, where the scene has them, points.csv: the new folder `out`, whole or not.
+
+    Raises:
+        InputError: `out` exists and is not empty.
+    """
+    files = SessionFiles(
+        name=name,
+        length_unit="mm",
+        mount=measured.scene.mount,
+        views=_views(measured),
+        tables=_tables(measured),
+        clouds={f"clouds/v{i:03d}.ply": cloud_file(cloud) for i, cloud in enumerate(measured.clouds)},
+        points=_points(measured) if measured.labelled else None,
+    )
+    session_files.write_session(out, files)
+
+
+def cloud_file(cloud: scanner.Cloud) -> Cloud:
+    """One scan as its file holds it: intensity and, where a line was swept, times; nature's incidence stays hidden."""
+    times = {} if cloud.time is None else {"time": cloud.time}
+    return Cloud(cloud.points, scalars={"intensity": cloud.intensity, **times})
 
 
 def write_truth(path: Path, measured: Measured, seed: int) -> None:
@@ -51,25 +65,22 @@ def write_truth(path: Path, measured: Measured, seed: int) -> None:
     write_mesh(measured.mesh, path.with_suffix(".ply"))
 
 
-def _document(name: str, measured: Measured) -> dict[str, object]:
+def _tables(measured: Measured) -> dict[str, dict[str, Any]]:
+    """What session.toml says beside its head."""
     scene = measured.scene
-    document: dict[str, object] = {
-        "format": "stitch-session/1",
-        "name": name,
-        "length_unit": "mm",
-        "mount": scene.mount,
+    tables: dict[str, dict[str, Any]] = {
         "scanner": {
             "pose": measured.T_coarse.tolist(),
             "noise": scene.scanner.noise,
             "standoff": scene.scanner.standoff,
             "optical_axis": "+z",
-        },
+        }
     }
     if not scene.rail:
-        document["robot"] = robot_table(scene.arm)
+        tables["robot"] = robot_table(scene.arm)
     if scene.part.shape == "sphere":
-        document["sphere"] = {"radius": float(scene.part.parameters.get("radius", 30.0))}
-    return document
+        tables["sphere"] = {"radius": float(scene.part.parameters.get("radius", 30.0))}
+    return tables
 
 
 def robot_table(arm: Arm) -> dict[str, Any]:
@@ -91,48 +102,28 @@ def robot_table(arm: Arm) -> dict[str, Any]:
     return robot
 
 
-def _views(measured: Measured) -> str:
-    """A rail is no joint of the arm: such a session states flange poses and leaves the joints out."""
+def _views(measured: Measured) -> Columns:
+    """Columns of views.csv. A rail is no joint of the arm: such a session states flange poses and no joints."""
     scene, plan = measured.scene, measured.plan
     joints = [] if scene.rail else [f"j{i + 1}" for i in range(scene.arm.joints)]
-    header = ["view", "cloud", "time_s", *(f"{j}_deg" for j in joints), "x", "y", "z", "qx", "qy", "qz", "qw"]
-    header += [f"{j}_approach" for j in joints]
-    moving = bool(joints) and bool(np.abs(plan.velocity).max() > 0)
-    header += [f"{j}_velocity_deg_s" for j in joints] if moving else []
-    header += [*measured.covariates, *(["rail_mm"] if scene.rail else [])]
-    lines = [",".join(header)]
-    for v, T in enumerate(measured.T_base_flange):
-        numbers = [measured.times[v], *(np.degrees(plan.joints[v]) if joints else ()), *T[:3, 3]]
-        numbers += [*frames.to_quaternion(T), *(measured.approach[v] if joints else ())]
-        numbers += [*np.degrees(plan.velocity[v])] if moving else []
-        numbers += [
-            *(values[v] for values in measured.covariates.values()),
-            *([measured.rail[v]] if scene.rail else []),
-        ]
-        lines.append(f"v{v:03d},clouds/v{v:03d}.ply," + ",".join(f"{x:.12g}" for x in numbers))
-    return "\n".join(lines) + "\n"
+    names = [f"v{v:03d}" for v in range(len(measured.times))]
+    columns: dict[str, Sequence[object] | Array] = {"view": names, "cloud": [f"clouds/{name}.ply" for name in names]}
+    columns["time_s"] = np.asarray(measured.times, float)
+    columns |= {f"{j}_deg": np.degrees(plan.joints[:, i]) for i, j in enumerate(joints)}
+    columns |= pose_columns(measured.T_base_flange)
+    columns |= {f"{j}_approach": measured.approach[:, i] for i, j in enumerate(joints)}
+    if joints and np.abs(plan.velocity).max() > 0:
+        columns |= {f"{j}_velocity_deg_s": np.degrees(plan.velocity[:, i]) for i, j in enumerate(joints)}
+    columns |= measured.covariates
+    return columns | ({"rail_mm": measured.rail} if scene.rail else {})
 
 
-def _points(measured: Measured) -> str:
-    lines = ["view,target,x,y,z,sigma"]
-    for v in range(len(measured.times)):
-        for name, places in measured.labelled.items():
-            if np.isfinite(places[v]).all():
-                x, y, z = places[v]
-                lines.append(f"v{v:03d},{name},{x:.6f},{y:.6f},{z:.6f},{measured.scene.part.sigma:g}")
-    return "\n".join(lines) + "\n"
-
-
-def write_ply(path: Path, cloud: Cloud) -> None:
-    """One scan with its intensity and, where it has them, times."""
-    # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
-    kinds = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")]
-    if cloud.time is not None:
-        kinds.append(("time", "<f4"))
-    vertex = np.empty(len(cloud.points), kinds)
-    for axis, column in zip("xyz", cloud.points.T, strict=True):
-        vertex[axis] = column
-    vertex["intensity"] = cloud.intensity
-    if cloud.time is not None:
-        vertex["time"] = cloud.time
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+def _points(measured: Measured) -> Columns:
+    """Columns of points.csv: every target in every view that saw it."""
+    seen = [
+        (f"v{v:03d}", name, *(f"{x:.6f}" for x in places[v]), f"{measured.scene.part.sigma:g}")
+        for v in range(len(measured.times))
+        for name, places in measured.labelled.items()
+        if np.isfinite(places[v]).all()
+    ]
+    return {name: [row[i] for row in seen] for i, name in enumerate(("view", "target", "x", "y", "z", "sigma"))}

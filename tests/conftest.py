@@ -24,6 +24,24 @@ if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):
 # As inside a run: the tests call the stages directly.
 library_threads_off()
 
+# The longest files, which begin first: with files spread over two processes none is left alone at the end.
+LONGEST = (
+    "test_real_scans.py",
+    "test_surface_stages.py",
+    "test_mixed_fit.py",
+    "test_blade_diagnosis.py",
+    "test_scanner_field.py",
+    "test_diagnosis_commands.py",
+    "test_labelled_commands.py",
+    "test_joint_effects.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    place = {name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 
 

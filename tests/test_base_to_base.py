@@ -31,8 +31,18 @@ def stand(P, R, slide, angles, lengths, sigma=1e-4, level=1e-4, rail_slide=(np.n
         names = tuple(f"{letter}{i + 1}" for i in range(len(points)))
         return Touched(names, np.array(points), np.tile(np.eye(3) * sigma**2, (len(points), 1, 1)))
 
-    return Stand("m", touched("P", P), np.array(rail_slide), touched("R", R), np.full(len(R), slide), np.array(angles),
-                 np.array(lengths), 1.0, sigma, sigma, sigma, level, level)  # fmt: skip
+    return Stand(
+        length_unit="m",
+        rail=touched("P", P),
+        rail_slide=np.array(rail_slide),
+        rod=touched("R", R),
+        slide=np.full(len(R), slide),
+        angle=np.array(angles),
+        length=np.array(lengths),
+        turn=1.0,
+        **dict.fromkeys(("sigma_slide", "sigma_angle", "sigma_length"), sigma),
+        **dict.fromkeys(("sigma_level_stand", "sigma_level_base"), level),
+    )
 
 
 EXPERIMENT_1 = (3.8822, [0.6826, 0.7897], [4.0, 4.4084])
@@ -76,9 +86,10 @@ def general(seed, points, settings, noise=0.0):
     slide = np.linspace(3, 5, settings)
     theta, length = rng.uniform(0.4, 1.2, settings), rng.uniform(3, 5, settings)
     cups = zero + slide[:, None] * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
-    s = stand(zero + along[:, None] * x + rng.normal(0, noise, (points, 3)),
-              tilt.inv().apply(cups - t) + rng.normal(0, noise, (settings, 3)), 0.0,
-              theta + rng.normal(0, noise, settings), length + rng.normal(0, noise, settings), rail_slide=along)  # fmt: skip
+    rail = zero + along[:, None] * x + rng.normal(0, noise, (points, 3))
+    rod = tilt.inv().apply(cups - t) + rng.normal(0, noise, (settings, 3))
+    angles, lengths = (values + rng.normal(0, noise, settings) for values in (theta, length))
+    s = stand(rail, rod, 0.0, angles, lengths, rail_slide=along)
     s = replace(s, slide=slide, sigma_level_base=None)
     return tilt.as_matrix(), t, s
 
@@ -99,12 +110,11 @@ def test_covariance_is_the_scatter_of_repeated_measurements():
     for draw in range(200):
         R, t, s = general(3, points=3, settings=5)
         rng = np.random.default_rng(draw)
-        s = replace(
-            s, rail=replace(s.rail, points=s.rail.points + rng.normal(0, 1e-4, (3, 3))),
-            rod=replace(s.rod, points=s.rod.points + rng.normal(0, 1e-4, (5, 3))), slide=s.slide + rng.normal(0, 1e-4, 5),
-            angle=s.angle + rng.normal(0, 1e-4, 5), length=s.length + rng.normal(0, 1e-4, 5),
-            rail_slide=s.rail_slide + rng.normal(0, 1e-4, 3),
-        )  # fmt: skip
+        rail = replace(s.rail, points=s.rail.points + rng.normal(0, 1e-4, (3, 3)))
+        rod = replace(s.rod, points=s.rod.points + rng.normal(0, 1e-4, (5, 3)))
+        readings = {key: getattr(s, key) for key in ("slide", "angle", "length", "rail_slide")}
+        noisy = {key: value + rng.normal(0, 1e-4, len(value)) for key, value in readings.items()}
+        s = replace(s, rail=rail, rod=rod, **noisy)
         found = fit(s)
         turn = Rotation.from_matrix(found.T_base1_base2[:3, :3] @ R.T).as_rotvec()
         scaled.append(
@@ -147,8 +157,9 @@ def errors():
             exact_P * np.exp(1j * np.array([0.6283, -0.6283]) * u[0]),
             exact_R * np.exp(1j * np.array([-0.4488, 0.4488]) * u[1]),
         )
-        s = stand([[z.real, z.imag, 1.3 + h] for z, h in zip(P, 0.8 * lift, strict=True)], [[z.real, z.imag, 0.3] for z in R],
-                  3.8822, np.arctan2(arm.real, arm.imag), np.abs(arm), sigma=1e-4)  # fmt: skip
+        rail = [[z.real, z.imag, 1.3 + h] for z, h in zip(P, 0.8 * lift, strict=True)]
+        rod = [[z.real, z.imag, 0.3] for z in R]
+        s = stand(rail, rod, 3.8822, np.arctan2(arm.real, arm.imag), np.abs(arm), sigma=1e-4)
         s = replace(s, sigma_angle=1e-6, sigma_length=1e-6, sigma_slide=1e-6)
         for name, T in (("projection", project(s).T_base1_base2), ("least squares", fit(s).T_base1_base2)):
             turn = Rotation.from_matrix(T[:3, :3] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])).magnitude()
@@ -176,8 +187,8 @@ def test_command(capsys):
 
 def test_command_refuses_with_exit_code_1(tmp_path, capsys):
     text = EXAMPLE.read_text(encoding="utf-8")
-    for old, new in (("0.6826", "1.1305"), ("0.7897", "1.1772"), ("length = 4.0\n", "length = 5.0\n"), ("4.4084", "5.5555"),
-                     ("3.8822", "5.9093"), ("0.4488", "0.6283")):  # fmt: skip
+    second = {"0.6826": "1.1305", "0.7897": "1.1772", "length = 4.0\n": "length = 5.0\n", "4.4084": "5.5555"}
+    for old, new in (*second.items(), ("3.8822", "5.9093"), ("0.4488", "0.6283")):
         text = text.replace(old, new)
     (tmp_path / "two.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SystemExit) as stop:
@@ -195,7 +206,7 @@ def test_command_refuses_with_exit_code_1(tmp_path, capsys):
         ("length = 4.0\n", "length = -4.0\n", "must be above zero"),
         ("joint1 = 0.6283", 'joint1 = "a"', "write a finite number"),
         ("slide = 0.0\n", "", "no main point has a slide reading"),
-        ("turn = \"clockwise\"", "turn = \"left\"", "rod.turn is 'left'; write one of clockwise, anticlockwise"),
+        ('turn = "clockwise"', 'turn = "left"', "rod.turn is 'left'; write one of clockwise, anticlockwise"),
         ("sigma_slide", "sigma_slid", "did you mean 'sigma_slide'"),
         ('length_unit = "m"', 'length_unit = "ft"', "write one of"),
         ("joint1 = 0.6283\nradius = 1.45", "radius = 1.45", "joint1 is missing"),
@@ -203,7 +214,7 @@ def test_command_refuses_with_exit_code_1(tmp_path, capsys):
         ("joint1 = 0.6283", "joint1 = -0.6283", "far apart"),
         ("joint1 = 0.6283\nradius = 1.45", "slide = 1.0\njoint1 = 0.6283\nradius = 1.45", "the slide grows"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_named(tmp_path, old, new, part):
     text = EXAMPLE.read_text(encoding="utf-8")
     assert old in text
@@ -253,9 +264,8 @@ def test_millimetres_and_degrees_give_the_same(tmp_path):
     (tmp_path / "mm.toml").write_text("\n".join(lines), encoding="utf-8")
     found = solve(read_stand(tmp_path / "mm.toml")).fit
     covariance = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
-    same = replace(s, rail=replace(s.rail, covariance=covariance), rod=replace(s.rod, covariance=covariance),
-                   sigma_level_base=np.radians(0.0573))  # fmt: skip
-    wanted = fit(same)
+    rail, rod = (replace(touched, covariance=covariance) for touched in (s.rail, s.rod))
+    wanted = fit(replace(s, rail=rail, rod=rod, sigma_level_base=np.radians(0.0573)))
     scale = np.diag([1, 1, 1, 1000.0, 1000, 1000])
     assert np.allclose(found.T_base1_base2[:3, 3], wanted.T_base1_base2[:3, 3] * 1000, atol=1e-3)
     assert np.allclose(found.covariance, scale @ wanted.covariance @ scale, rtol=1e-3, atol=1e-12)

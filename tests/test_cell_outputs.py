@@ -21,7 +21,7 @@ import viz.cells.panel
 import viz.cells.panel_figures
 import viz.cells.window_fit
 import viz.cells.window_seam
-from data_synth.drilling import DrillingCell, Sizes
+from data_synth.drilling_cell import DrillingCell, Sizes
 from data_synth.drilling_job import write_job
 from stitch.cells import outputs
 from stitch.cli.main import main
@@ -30,14 +30,19 @@ from stitch.reading.session_folder import load_session
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 JOBS = {
-    "base": EXAMPLES / "base_to_base.toml", "drill": EXAMPLES / "drilling" / "job.toml",
-    "panel": EXAMPLES / "panel" / "job.toml", "fit": EXAMPLES / "window" / "fit.toml",
+    "base": EXAMPLES / "base_to_base.toml",
+    "drill": EXAMPLES / "drilling" / "job.toml",
+    "panel": EXAMPLES / "panel" / "job.toml",
+    "fit": EXAMPLES / "window" / "fit.toml",
     "seam": EXAMPLES / "window" / "seam.toml",
-}  # fmt: skip
+}
 VIEWERS = {
-    "base": viz.cells.base_to_base, "drill": viz.cells.drilling, "panel": viz.cells.panel,
-    "fit": viz.cells.window_fit, "seam": viz.cells.window_seam,
-}  # fmt: skip
+    "base": viz.cells.base_to_base,
+    "drill": viz.cells.drilling,
+    "panel": viz.cells.panel,
+    "fit": viz.cells.window_fit,
+    "seam": viz.cells.window_seam,
+}
 
 
 @dataclass(frozen=True)
@@ -149,16 +154,27 @@ def test_recording_is_whole(handed_out, command):
     program, path = Path(sys.executable).with_name("rerun"), handed_out / f"{command}.rrd"
     assert subprocess.run([program, "rrd", "verify", path], capture_output=True, check=False).returncode == 0
     printed = subprocess.run([program, "rrd", "print", path], capture_output=True, text=True, check=False).stdout
-    wanted = {"base": "/world/stand/rail", "drill": "/world/errors/before/1", "panel": "/world/shape/after",
-              "fit": "/world/part\\ 1/deviation", "seam": "/world/stations/8/gap"}  # fmt: skip
+    wanted = {
+        "base": "/world/stand/rail",
+        "drill": "/world/errors/before/1",
+        "panel": "/world/shape/after",
+        "fit": "/world/part\\ 1/deviation",
+        "seam": "/world/stations/8/gap",
+    }
     for entity in ("/words", wanted[command]):
         assert entity in printed
 
 
-@pytest.mark.parametrize("command, wanted", [
-    ("base", "R1 to R2 is 0.6073 m by the stand"), ("drill", "<td>1001</td>"),
-    ("panel", "Leg 4 of robot C"), ("fit", "Worst cells"), ("seam", "8 stations: 8 good"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "command, wanted",
+    [
+        ("base", "R1 to R2 is 0.6073 m by the stand"),
+        ("drill", "<td>1001</td>"),
+        ("panel", "Leg 4 of robot C"),
+        ("fit", "Worst cells"),
+        ("seam", "8 stations: 8 good"),
+    ],
+)
 def test_page_needs_nothing_beside_it(handed_out, command, wanted):
     page = (handed_out / f"{command}.html").read_text()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)
@@ -183,8 +199,8 @@ def test_expected_shape_is_what_the_commanded_clamps_do():
 
     job = read_job(JOBS["panel"])
     result = solve_job(job)
-    left = viz.cells.panel_figures.expected_after(job, result)
-    assert np.abs(left).max() < 0.05
+    remaining = viz.cells.panel_figures.expected_after(job, result)
+    assert np.abs(remaining).max() < 0.05
     assert result.shape_largest.max() > 3.0
 
 

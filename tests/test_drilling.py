@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_synth.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
+from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import ellipse_centres, render_plate
 from data_synth.drilling_job import write_job
 from stitch import frames
 from stitch.cells.drilling import hole_image
 from stitch.cells.drilling.base_frame import base_frame, fit_circle
+from stitch.cells.drilling.camera_effects import select_effects
 from stitch.cells.drilling.camera_model import Observations, distort, undistort
 from stitch.cells.drilling.compensation import compensate
-from stitch.cells.drilling.experiment import calibrate, run_group
-from stitch.cells.drilling.hidden_effects import name_effects
+from stitch.cells.drilling.drill_job import read_job
+from stitch.cells.drilling.drill_procedure import calibrate, run_group
+from stitch.cells.drilling.drill_solution import solve_job
 from stitch.cells.drilling.hole_frame import drive_pose, euler_zyx, hole_rotation
 from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_image, to_plane
-from stitch.cells.drilling.job import solve_job
 from stitch.cells.drilling.rangers import Rangers, fit_ranger, surface
-from stitch.cells.drilling.reading import read_job
 from stitch.cells.drilling.servo import Seeing, place, upright
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
@@ -187,7 +187,7 @@ def test_servo_ends_within_the_three_thresholds():
 
 def test_servo_that_does_not_settle_says_so():
     """Rangers that show the same tilt whatever the robot does."""
-    with pytest.raises(NoResultError, match="did not settle"):
+    with pytest.raises(NoResultError, match="did not converge"):
         place(lambda T: (np.array([86.0, 87.0, 88.0]), np.zeros(2)), ideal_sensors(), np.eye(4))
 
 
@@ -219,17 +219,16 @@ def test_hidden_effects_are_named_with_their_size(k1, plate):
     for seed in range(5):
         cell = DrillingCell(seed, Sizes(k1=k1, plate_height=plate))
         (xyz, uv), (check_xyz, check_uv) = cell.plate(), cell.check_holes()
-        seen = Observations(
-            np.vstack([xyz, check_xyz]), np.vstack([uv, check_uv]), np.arange(9 + len(check_xyz)) < 9, IMAGE
-        )  # fmt: skip
-        naming = name_effects(seen)
+        on_plate = np.arange(9 + len(check_xyz)) < 9
+        seen = Observations(np.vstack([xyz, check_xyz]), np.vstack([uv, check_uv]), on_plate, IMAGE)
+        found = select_effects(seen)
         present = {name for name, size in (("k1", k1), ("plate_height", plate)) if size}
-        assert {trial.effect for trial in naming.trials if trial.accepted} == present
+        assert {trial.effect for trial in found.trials if trial.accepted} == present
         truth = {"k1": k1, "plate_height": plate}
-        for trial in naming.trials:
+        for trial in found.trials:
             assert abs(trial.value - truth[trial.effect]) < 4 * trial.sigma
         new_xyz, new_uv = cell.check_holes((1.0,))
-        error = np.linalg.norm(naming.camera.plane(new_uv, new_xyz[:, 2]) - new_xyz[:, :2], axis=1).mean()
+        error = np.linalg.norm(found.camera.plane(new_uv, new_xyz[:, 2]) - new_xyz[:, :2], axis=1).mean()
         assert error < 0.08
         if plate:
             # tan(25°)·0.4 mm = 0.19 mm is what the plain homography makes of the plate's height.
@@ -352,8 +351,8 @@ def test_effects_left_out_leave_the_reference_holes_wrong(tmp_path):
         ("placed.csv", "101,", "109,", "reference hole 101 is missing"),
         ("placed.csv", "hole,x", "hole,X", "column 'x' is missing"),
         ("job.toml", "height = 186.61", "height = 186.61 mm", "not valid TOML"),
-        ("holes.csv", "reference,1244", "reference,x1244", "holes.csv:2: x is"),
-        ("rangers.csv", "L1,", "L1,a", "rangers.csv:2: a is"),
+        ("holes.csv", "reference,1244", "reference,x1244", "holes.csv line 2: x is"),
+        ("rangers.csv", "L1,", "L1,a", "rangers.csv line 2: a is"),
     ],
 )
 def test_bad_input_is_named(tmp_path, file, old, new, part):

@@ -13,14 +13,14 @@ from data_synth.panel_cell import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
 from stitch import frames
 from stitch.cells.panel.errors_along import along
-from stitch.cells.panel.experiment import Stage, run_pose, run_shape
 from stitch.cells.panel.global_model import Readings, RobotModel, calibrate
+from stitch.cells.panel.laser_tracker import Tracker
 from stitch.cells.panel.layout import Layout, contacts
 from stitch.cells.panel.legs import Legs, find_leg_offset, leg_jacobian, true_flanges
-from stitch.cells.panel.motion import adjust_pose, follow, preposition
+from stitch.cells.panel.panel_loops import Stage, run_pose, run_shape
+from stitch.cells.panel.panel_motion import adjust_pose, follow, preposition
 from stitch.cells.panel.rigid_fit import rigid_fit
-from stitch.cells.panel.shape import shape_step
-from stitch.cells.panel.tracker import Tracker
+from stitch.cells.panel.shape_control import ControlPoints, shape_step
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
@@ -140,8 +140,9 @@ def toy_models(turn):
     some = none.copy()
     some[:3, :3] = turn**2 * np.eye(3)
     base, contact = (np.eye(4), pose(30, 0, 0, 2000, 0, 0)), frames.make(np.eye(3), [0, 0, 150.0])
-    return [RobotModel(n, b, contact, np.zeros((3, 3)), c, np.zeros((0, 15)), np.zeros(0), 1)
-            for n, b, c in zip("MS", base, (none, some), strict=True)]  # fmt: skip
+    nothing = {"reflectors": np.zeros((3, 3)), "jacobian": np.zeros((0, 15)), "residuals": np.zeros(0), "redundancy": 1}
+    robots = zip("MS", base, (none, some), strict=True)
+    return [RobotModel(n, b, contact, covariance=c, **nothing) for n, b, c in robots]
 
 
 def test_drift_of_a_translation_is_turn_times_distance():
@@ -215,7 +216,7 @@ def test_pose_after_one_adjustment_and_shape_within_three_iterations():
     cell.compliant = True
     control, clamp = panel_job.control_points()
     contact = contacts(LAYOUT).T_panel_contact
-    run = run_shape(cell, stage, control, clamp, contact, stand, 0.6)
+    run = run_shape(cell, stage, ControlPoints(control, clamp, contact), stand, tolerance=0.6)
     assert run.deviations[0].max() > 3
     assert len(run.deviations) <= 4
     world = np.linalg.inv(cell.target) @ np.vstack([cell.true_points(control).T, np.ones(18)])
@@ -231,9 +232,10 @@ def test_shape_step_undoes_a_turned_clamp():
     contact = contacts(LAYOUT).T_panel_contact
     control, clamp = panel_job.control_points()
     wrong = np.array([2e-3, 0, 0, 0, 0, 1.0])
-    moved = np.array([(contact[c] @ frames.exp(wrong) @ np.linalg.inv(contact[c]) @ [*p, 1])[:3]
-                      for p, c in zip(control, clamp, strict=True)])  # fmt: skip
-    step = shape_step(moved, control, clamp, contact, np.tile(np.eye(4), (6, 1, 1)), np.tile(np.eye(4), (6, 1, 1)))
+    pushed = contact @ frames.exp(wrong) @ np.linalg.inv(contact)
+    moved = np.array([(pushed[c] @ [*p, 1])[:3] for p, c in zip(control, clamp, strict=True)])
+    still = np.tile(np.eye(4), (6, 1, 1))
+    step = shape_step(moved, ControlPoints(control, clamp, contact), still, still)
     assert step.twists == pytest.approx(np.tile(-wrong, (6, 1)), abs=3e-3)
     assert (step.twists[:, 2:5] == 0).all()
 
@@ -253,8 +255,9 @@ def test_tracker_readings_in_its_own_frame_give_the_same(tmp_path, capsys):
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     T = np.linalg.inv(pose(25, 3, -2, -3200, -1800, 1900))
-    for name, columns in (("targets", ["seen_x seen_y seen_z"]), ("control", ["seen_x seen_y seen_z"]),
-                          ("calibration", ["x1 y1 z1", "x2 y2 z2", "x3 y3 z3"])):  # fmt: skip
+    seen = ["seen_x seen_y seen_z"]
+    tables = {"targets": seen, "control": seen, "calibration": ["x1 y1 z1", "x2 y2 z2", "x3 y3 z3"]}
+    for name, columns in tables.items():
         lines = (tmp_path / f"{name}.csv").read_text().splitlines()
         header, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
         for triple in columns:
@@ -296,13 +299,16 @@ def main_code(arguments):
         assert not stop.code
 
 
-@pytest.mark.parametrize("old, new, message", [
-    ('master = "B"', 'master = "X"', "master is 'X'"),
-    ("[tracker]", "[tracker]\nnoise = 1", "unknown key 'tracker.noise'"),
-    ("radius = 2960.0", "radius = -1", "layout.radius is -1; it must be above zero"),
-    ('calibration = "calibration.csv"', "", "files.calibration is missing"),
-    ('"flanges.csv"', '"none.csv"', "none.csv: not found"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ('master = "B"', 'master = "X"', "master is 'X'"),
+        ("[tracker]", "[tracker]\nnoise = 1", "unknown key 'tracker.noise'"),
+        ("radius = 2960.0", "radius = -1", "layout.radius is -1; it must be above zero"),
+        ('calibration = "calibration.csv"', "", "files.calibration is missing"),
+        ('"flanges.csv"', '"none.csv"', "none.csv: not found"),
+    ],
+)
 def test_bad_job_is_refused_in_one_line(tmp_path, capsys, old, new, message):
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())

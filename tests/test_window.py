@@ -9,20 +9,20 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from data_synth import window, window_views
+from data_synth import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames
 from stitch.cells.window.cad import nearest, surface
+from stitch.cells.window.cad_fit import fit
+from stitch.cells.window.cad_start import find_start
 from stitch.cells.window.deviation import deviations
 from stitch.cells.window.edge import find_edge
-from stitch.cells.window.fit import fit
 from stitch.cells.window.instances import split
-from stitch.cells.window.path import correct_path
+from stitch.cells.window.joined_scans import join
+from stitch.cells.window.path_correction import correct_path
 from stitch.cells.window.regions import Box, Regions
-from stitch.cells.window.scans import join
 from stitch.cells.window.seam import Limits, Station, measure_seam
-from stitch.cells.window.start import find_start
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.measurement.scan import prepare_view
@@ -63,8 +63,8 @@ def pane_cad(pane):
 
 
 def scan_pane(pane, T, seed):
-    far, poses = window.scan_outside(pane, T, NOISE, seed, (2, 1), rays=80, distance=600.0)
-    near, close = window.scan_edges(pane, T, Pane(**DOOR), "pane", NOISE, seed + 9, count=8, rays=90)
+    far, poses = window_scans.scan_outside(pane, T, NOISE, seed, (2, 1), rays=80, distance=600.0)
+    near, close = window_scans.scan_edges(pane, T, Pane(**DOOR), "pane", NOISE, seed + 9, count=8, rays=90)
     return joined(far + near, np.concatenate([poses, close]))
 
 
@@ -96,10 +96,10 @@ def test_fit_without_a_guess(pane, pane_cad):
 
 def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     """A dent of 3 mm (σ 60 mm) on a door of 600 mm; start 6 mm and 0.5° off."""
-    weld = window.Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
-    warped, cad, T = window.warp(door, weld), surface(door), truth(1)
-    far, poses = window.scan_outside(warped, T, NOISE, 1, (2, 2), rays=110, distance=500.0)
-    near, close = window.scan_edges(warped, T, CarDoor(**DOOR), "door", NOISE, 2, count=8, rays=80)
+    weld = window_scans.Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
+    warped, cad, T = window_scans.warp(door, weld), surface(door), truth(1)
+    far, poses = window_scans.scan_outside(warped, T, NOISE, 1, (2, 2), rays=110, distance=500.0)
+    near, close = window_scans.scan_edges(warped, T, CarDoor(**DOOR), "door", NOISE, 2, count=8, rays=80)
     scan = joined(far + near, np.concatenate([poses, close]))
     centre = frames.make(np.eye(3), cad.centre)
     start = T @ centre @ frames.exp(np.array([6e-3, -5e-3, 6e-3, 4, -3, 3.5])) @ np.linalg.inv(centre)
@@ -113,7 +113,7 @@ def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     middle = shown.cells.middle
     at = (np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) < 25) & (shown.cells.mean < -1)
     assert at.sum() >= 4
-    expected = -window.dent(weld, middle[at, 0], middle[at, 2]) / np.hypot(1, slope)
+    expected = -window_scans.dent(weld, middle[at, 0], middle[at, 2]) / np.hypot(1, slope)
     assert shown.cells.mean[at] == pytest.approx(expected, abs=0.2)
     far_off = np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) > 4 * weld.reach
     assert np.median(np.abs(shown.cells.mean[far_off])) < 0.05
@@ -179,10 +179,10 @@ def test_seam_at_eight_stations(door, pane):
     moved.apply_translation([0.7, 0.6, -2.5])
     middle, across, out = window_views.stations(Pane(**DOOR))
     T = truth(4)
-    scan = joined(*window.scan_seam([door, moved], T, middle, across, out, NOISE, 1, rays=110))
+    scan = joined(*window_scans.scan_seam([door, moved], T, (middle, across, out), NOISE, 1, rays=110))
     places = [Station(str(i), *v) for i, v in enumerate(zip(middle, across, out, strict=True))]
     seams = measure_seam(scan, T, places, Limits())
-    true = np.array([window.true_seam(moved, door, p.T_part_station) for p in places])
+    true = np.array([window_scans.true_seam(moved, door, p.T_part_station) for p in places])
     found = np.array([[s.flush, s.gap] for s in seams])
     assert np.abs(found - true).max() < 0.05
     wanted = ["bad" if abs(g - 16) > 2 or abs(f) > 1.5 else "good" for f, g in true]
@@ -219,14 +219,17 @@ def main_code(arguments):
         assert not stop.code
 
 
-@pytest.mark.parametrize("command, name, old, new, message", [
-    ("fit", "fit.toml", '"pane.stl"', '"none.stl"', "none.stl: not found"),
-    ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; it must be above zero"),
-    ("fit", "fit.toml", "high = [700.0", "high = [10.0", "region[1].low must lie below its high"),
-    ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; did you mean 'nominal'?"),
-    ("seam", "seam.toml", "[part]", "[other]", "unknown key 'other'"),
-    ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "command, name, old, new, message",
+    [
+        ("fit", "fit.toml", '"pane.stl"', '"none.stl"', "none.stl: not found"),
+        ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; it must be above zero"),
+        ("fit", "fit.toml", "high = [700.0", "high = [10.0", "region[1].low must lie below its high"),
+        ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; did you mean 'nominal'?"),
+        ("seam", "seam.toml", "[part]", "[other]", "unknown key 'other'"),
+        ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
+    ],
+)
 def test_bad_job_is_refused_in_one_line(tmp_path, capsys, command, name, old, new, message):
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -256,5 +259,5 @@ def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
     scan = scan_pane(pane, truth(1), 1)
     points = scan.points + np.where(np.arange(len(scan.points)) < 2000, 1e8, 0.0)[:, None]
     thrown = type(scan)(points, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
-    with pytest.raises(NoResultError, match="mend a scanner's pose"):
+    with pytest.raises(NoResultError, match="correct a scanner's pose"):
         find_start(thrown, pane_cad)

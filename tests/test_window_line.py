@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from data_synth.window import Weld, true_seam
 from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
+from data_synth.window_scans import Weld, true_seam
 from stitch import frames
 from stitch.cells.window.seam import Station
 from stitch.cli.main import main
@@ -95,14 +95,21 @@ def test_seam_is_that_of_the_meshes(placed):
         assert row["verdict"] == "good"
 
 
-@pytest.mark.parametrize("old, new, message", [
-    ('session = "window"', 'session = "nowhere"', "nowhere/session.toml: not found"),
-    ('hand_eye = "hand-eye.json"', 'hand_eye = "window.toml"', "window.toml: holds no hand_eye with length_unit"),
-    ('hand_eye = "hand-eye.json"', 'hand_eye = "none.json"', "none.json: not found; `stitch calibrate sphere SESSION -o none.json` writes one"),
-    ('hand_eye = "hand-eye.json"', "", "session needs hand_eye"),
-    ('session = "window"', 'session = "window"\nscans = "grip.csv"', "say where the scans are"),
-    ('session = "window"', 'scans = "grip.csv"', "hand_eye goes with session"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ('session = "window"', 'session = "nowhere"', "nowhere/session.toml: not found"),
+        ('hand_eye = "hand-eye.json"', 'hand_eye = "window.toml"', "window.toml: holds no hand_eye with length_unit"),
+        (
+            'hand_eye = "hand-eye.json"',
+            'hand_eye = "none.json"',
+            "none.json: not found; `stitch calibrate sphere SESSION -o none.json` writes one",
+        ),
+        ('hand_eye = "hand-eye.json"', "", "session needs hand_eye"),
+        ('session = "window"', 'session = "window"\nscans = "grip.csv"', "say where the scans are"),
+        ('session = "window"', 'scans = "grip.csv"', "hand_eye goes with session"),
+    ],
+)
 def test_bad_scans_are_refused_in_one_line(placed, capsys, old, new, message):
     folder, _, _ = placed
     text = (folder / "window.toml").read_text()

@@ -15,6 +15,7 @@ from viz.colours import robust_limit, signed_colours, unsigned_colours, view_col
 from viz.history_figures import waterfall
 from viz.maps import change_maps, residual_maps
 from viz.page_parts import png_bytes
+from viz.rrd_file import RecordingFile
 from viz.run_figures import shown_points, view_shifts
 from viz.run_markdown import run_markdown
 from viz.target_figures import residual_vectors
@@ -34,8 +35,8 @@ class RerunRecorder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.recording = rr.RecordingStream("stitch")
-        self.recording.save(path, default_blueprint=blueprint())
+        self.file = RecordingFile("stitch", path, blueprint())
+        self.recording = self.file.stream
         self.step = 0
         self.names: list[str] = []
         self.picked: list[Array] = []
@@ -99,7 +100,7 @@ class RerunRecorder:
         rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)
         self._history(run)
         rec.send_blueprint(blueprint(changed=run.poses_before is not None))
-        rec.disconnect()
+        self.file.write()
 
     def _sticks(self, run: Run) -> None:
         """Offsets of the targets under the model, magnified, beside the targets."""

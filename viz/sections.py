@@ -18,6 +18,7 @@ from viz import diagnosis_figures as draw
 from viz.blueprint import diagnosis_blueprint
 from viz.comparison_figures import comparison
 from viz.page_parts import render, svg_address, svg_text
+from viz.rrd_file import RecordingFile
 
 # Candidate effects in the table of the page.
 _SHOWN = 8
@@ -119,11 +120,11 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
 
 def _record(found: Diagnosis, folder: Path) -> None:
     """The verdict and its pictures; `stitch view` opens it beside the recording of the run."""
-    recording = rr.RecordingStream("stitch_diagnosis")
     text = f"# {found.verdict}\n\n{found.sentence}"
     with whole(folder / "diagnosis.rrd") as file:
-        recording.save(str(file), default_blueprint=diagnosis_blueprint())
+        written = RecordingFile("stitch_diagnosis", file, diagnosis_blueprint())
+        recording = written.stream
         recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
         for picture in sorted((folder / "pictures").glob("*.png")):
             recording.log(f"diagnosis/{picture.stem}", rr.EncodedImage(path=picture), static=True)
-        recording.disconnect()
+        written.write()

@@ -1,15 +1,15 @@
 """CSV tables with named columns, as a person edits them."""
 
-import csv
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from stitch.cells.toml_tables import LARGEST
+from stitch.cells.job_toml import LARGEST
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.csv_lines import read_lines
+from stitch.reading.csv_number import number
 
 
 @dataclass(frozen=True)
@@ -35,39 +35,42 @@ def read_columns(file: Path, texts: str, numbers: str) -> Columns:
     Raises:
         InputError: the file, a column or a value is missing or no finite number; names the line.
     """
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            rows = [(reader.line_num, row) for row in reader]
-            header = [name.strip() for name in reader.fieldnames or []]
-    except FileNotFoundError:
-        raise InputError(f"{file}: not found; write it, or mend its name in the job file") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: not a CSV file in UTF-8: {error}") from None
+    header, lines = read_lines(file)
     for name in (*texts.split(), *numbers.split()):
         if name not in header:
             raise InputError(f"{file}: column {name!r} is missing; the header must name {texts} {numbers}".rstrip())
-    if not rows:
+    if not lines:
         raise InputError(f"{file}: no rows below the header; add one per line")
-    clean = [(line, {(key or "").strip(): value for key, value in row.items()}) for line, row in rows]
+    rows = [(line, dict(zip(header, cells + [""] * len(header), strict=False))) for line, cells in lines]
     return Columns(
-        {name: [_text(file, line, name, row.get(name)) for line, row in clean] for name in texts.split()},
-        {name: np.array([_number(file, line, name, row.get(name)) for line, row in clean]) for name in numbers.split()},
-        len(clean),
+        {name: [_text(file, line, name, row[name]) for line, row in rows] for name in texts.split()},
+        {name: np.array([_number(file, line, name, row[name]) for line, row in rows]) for name in numbers.split()},
+        len(rows),
     )
 
 
-def _text(file: Path, line: int, name: str, value: str | None) -> str:
-    if not (value or "").strip():
-        raise InputError(f"{file}:{line}: {name} is empty; write a name")
-    return str(value).strip()
+def refuse_twice(file: Path, what: str, names: list[str]) -> None:
+    """Refuse a name that stands in two rows.
+
+    Args:
+        what: the thing that has the name, such as "hole".
+
+    Raises:
+        InputError: names the first that does.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{file}: {what} {name} stands twice; leave one of them out, or rename it")
 
 
-def _number(file: Path, line: int, name: str, value: str | None) -> float:
-    try:
-        number = float(value or "")
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number) or abs(number) > LARGEST:
-        raise InputError(f"{file}:{line}: {name} is {value!r}; write a finite number")
-    return number
+def _text(file: Path, line: int, name: str, cell: str) -> str:
+    if not cell.strip():
+        raise InputError(f"{file} line {line}: {name} is empty; write a name")
+    return cell.strip()
+
+
+def _number(file: Path, line: int, name: str, cell: str) -> float:
+    value = number(file, line, name, cell)
+    if abs(value) > LARGEST:
+        raise InputError(f"{file} line {line}: {name} is {cell.strip()!r}; nothing in a cell is that large")
+    return value

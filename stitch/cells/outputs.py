@@ -23,6 +23,15 @@ SessionOption = Annotated[
 ]
 
 
+def draw(command: str, folder: Path, *found: Any) -> list[str]:
+    """Write the pictures of a command's job and result (`found`) into its folder; returns the files' names.
+
+    They come from whoever offers them under the entry point `stitch.cell_pictures`, by the command's name.
+    """
+    offered = entry_points(group="stitch.cell_pictures", name=command)
+    return [name for writer in offered for name in writer.load()(*found, folder)]
+
+
 def show(command: str, recording: Path | None, report: Path | None, *found: Any) -> None:
     """Write recording and page of a command's job and result (`found`), each whole or not at all.
 

@@ -3,12 +3,14 @@
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.cells.csv_table import Columns
+from stitch.cells.job_toml import check_keys, finite
 from stitch.frames import Array
 
 COLUMNS = "x y z a_deg b_deg c_deg"
@@ -30,6 +32,16 @@ def to_numbers(poses: Array) -> Array:
 def from_columns(table: Columns) -> Array:
     """Poses (N, 4, 4) of a table that holds the six columns."""
     return from_numbers(table.stack(COLUMNS))
+
+
+def pose_of(file: Path, place: str, entries: Any) -> Array:
+    """The pose (4, 4) that a table of a job file holds, by the keys of COLUMNS.
+
+    Raises:
+        InputError: no table, an unknown key, or something that is no finite number.
+    """
+    check_keys(file, place, entries, set(COLUMNS.split()))
+    return from_numbers(np.array([finite(file, f"{place}.{key}", entries.get(key)) for key in COLUMNS.split()]))
 
 
 def write_poses(file: Path, key: str, names: Sequence[str], poses: Array) -> None:

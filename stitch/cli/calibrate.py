@@ -22,8 +22,8 @@ from stitch.cli.streams import emit, results_alone
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
-from stitch.stepwise import suggest
 from stitch.runs.state import state_of
+from stitch.stepwise import suggest
 from stitch.system.console import console
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json, write_json

@@ -3,12 +3,14 @@
 Other packages, and the cells, add commands through the entry-point group `stitch.commands`.
 """
 
+import errno
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -26,7 +28,7 @@ from stitch.cli.streams import results_alone, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.system import time_limit
 
-_COMMANDS = {
+_COMMANDS: dict[str, Callable[..., Any]] = {
     "run": run,
     "check": check,
     "compare": compare_run,
@@ -40,6 +42,17 @@ _COMMANDS = {
     "import": import_command,
 }
 _LONGEST = 2000
+_ROOM = "; to fix: make room there, then run it again; what stood there is as it was"
+_RIGHTS = "; to fix: name a folder that may be written, or change its rights"
+_FIXES = {
+    errno.ENOSPC: _ROOM,
+    errno.EDQUOT: _ROOM,
+    errno.EFBIG: _ROOM,
+    errno.EACCES: _RIGHTS,
+    errno.EPERM: _RIGHTS,
+    errno.EROFS: _RIGHTS,
+    errno.ENAMETOOLONG: "; to fix: shorten it",
+}
 
 
 def build() -> typer.Typer:
@@ -72,7 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(1)
     except OSError as error:
-        _end(f"{error.filename or 'file system'}: {error.strerror or error}", 2)
+        fix = _FIXES.get(error.errno or 0, "")
+        _end(f"{error.filename or 'file system'}: {error.strerror or error}{fix}", 2)
     except MemoryError:
         _end("not enough memory; leave out views, or thin the scans", 1)
     except Exception as error:

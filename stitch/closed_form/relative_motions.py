@@ -39,7 +39,7 @@ def require_motion(A: Array) -> None:
     spread = axis_spread(A)
     if spread[0] == 0:
         raise NoResultError(
-            "all views have one orientation: the hand-eye's translation cannot be found; "
+            "all views have one orientation, the motions only translate: the hand-eye's translation cannot be found; "
             "to fix: turn the flange both ways"
         )
     if spread[1] < _PARALLEL:

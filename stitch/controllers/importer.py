@@ -79,9 +79,7 @@ def _given(pose: Callable[[Array], Array], name: str, value: str | None) -> Arra
     count = 7 if pose is abb.pose else 6
     cells = value.split(",")
     if len(cells) != count or not all(is_number(cell) for cell in cells):
-        raise InputError(
-            f"--{name} {value}: to fix: write {count} numbers with commas, as the controller shows the pose"
-        )
+        raise InputError(f"--{name} {value}: write {count} numbers with commas, as the controller shows the pose")
     try:
         return pose(np.array([float(cell) for cell in cells]))
     except ValueError as error:

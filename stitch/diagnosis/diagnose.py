@@ -30,7 +30,7 @@ def diagnose_state(state: State) -> Diagnosis:
     """
     unit = state.session.length_unit
     with library_threads_off():
-        linear = linearise(state.measurement, state.model, state.gate, state.session.nominal)
+        linear = linear_model_of(state)
         candidates, missing = candidates_of(linear)
         selection = select(linear, candidates, unit)
         matrix = alias_matrix(linear, [r.score for r in selection.ranked])
@@ -55,6 +55,11 @@ def diagnose_state(state: State) -> Diagnosis:
             notes=notes,
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))
+
+
+def linear_model_of(state: State) -> LinearModel:
+    """What a session says beside the model of a run."""
+    return linearise(state.measurement, state.model, state.gate, state.session.nominal)
 
 
 def _examined(linear: LinearModel, selection: Selection, matrix: Array, tests: int) -> list[CandidateEffect]:

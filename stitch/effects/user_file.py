@@ -104,7 +104,7 @@ def _line(error: BaseException, path: Path) -> str:
         return f" line {error.lineno}"
     trace, found = error.__traceback__, ""
     while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
+        if os.path.abspath(trace.tb_frame.f_code.co_filename) == os.path.abspath(path):
             found = f" line {trace.tb_lineno}"
         trace = trace.tb_next
     return found

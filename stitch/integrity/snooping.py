@@ -60,6 +60,8 @@ class Snooping:
     model: ViewModel
     found: Found
     freed: FreePoses  # with the views where they belong
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -95,7 +97,9 @@ def snoop(capture: Capture, T_mount: Array, gate: float, freed: FreePoses | None
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
     linked = linkage(freed.overlaps)
-    placed, homeless = _placed(capture, model_poses, freed, linked)
+    tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
+    needed = _ACCEPTED * _usual(capture, freed.poses, linked.core, tolerance) if linked.unlinked else _ACCEPTED
+    placed, homeless = _placed(capture, model_poses, freed, linked, (tolerance, needed))
     if placed:
         poses = np.array(freed.poses)
         for v, placement in placed.items():
@@ -103,12 +107,15 @@ def snoop(capture: Capture, T_mount: Array, gate: float, freed: FreePoses | None
         freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
     model = view_model(capture, T_mount, freed)
     found = find_blunders(model, homeless)
-    own = {b.view: b.p_value for b in found.blunders}
-    misplaced = [_misplaced(capture, model_poses[v], freed.poses[v], v, p) for v, p in own.items()]
+    misplaced = [
+        _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
+        for b in found.blunders
+    ]
     groups = linkage(freed.overlaps).components
     misplaced += [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if _alone(v, groups)]
     groups = tuple(g for g in groups if not set(g) <= {m.view for m in misplaced if m.kind == "foreign"})
-    return Snooping(linked, tuple(sorted(misplaced, key=lambda m: m.view)), found.block, groups, model, found, freed)
+    misplaced.sort(key=lambda m: m.view)
+    return Snooping(linked, tuple(misplaced), found.block, groups, model, found, freed, tolerance, needed)
 
 
 def _alone(view: int, groups: Sequence[tuple[int, ...]]) -> bool:
@@ -116,15 +123,13 @@ def _alone(view: int, groups: Sequence[tuple[int, ...]]) -> bool:
 
 
 def _placed(
-    capture: Capture, model_poses: Array, freed: FreePoses, linked: Linkage
+    capture: Capture, model_poses: Array, freed: FreePoses, linked: Linkage, limits: tuple[float, float]
 ) -> tuple[dict[int, Placement], list[int]]:
     """Where the views outside the core belong, and those that belong nowhere; the core grows as they are placed."""
     core, waiting, placed = list(linked.core), list(linked.unlinked), dict[int, Placement]()
     if not waiting or len(core) < 2:
         return placed, waiting
-    tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
-    size, poses = part_size([capture]), np.array(freed.poses)
-    usual = _usual(capture, poses, core, tolerance)
+    (tolerance, needed), size, poses = limits, part_size([capture]), np.array(freed.poses)
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
         new = {}
@@ -134,7 +139,7 @@ def _placed(
                 continue
             starts = [starts_about(model_poses[v], scan, size), model_poses, starts_anywhere(surface, scan)]
             best = place(scan, surface, np.concatenate(starts), size)[0]
-            if best.closure > _ACCEPTED * usual and best.near > _FEW_SHARED:
+            if best.closure > needed and best.near > _FEW_SHARED:
                 new[v] = best
         if not new:
             break
@@ -144,6 +149,14 @@ def _placed(
         core += list(new)
         waiting = [v for v in waiting if v not in new]
     return placed, waiting
+
+
+def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:
+    """(4, 4) where the surface of the other views puts one: robust weights of all pairs hold it back."""
+    others = [v for v in range(len(capture.scans)) if v != view]
+    surface = surface_of(capture.scans, freed.poses, others, tolerance)
+    best = place(capture.scans[view], surface, freed.poses[view][None], part_size([capture]))[0]
+    return best.T if best.closure > judge(capture.scans[view], freed.poses[view], surface).closure else freed.poses[view]
 
 
 def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:

@@ -80,10 +80,10 @@ def _checked(file: Path, schema: dict[str, Any]) -> Any:
         document = json.loads(told, parse_constant=_refused)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({shortened(str(error))}); run `stitch run` again") from None
-    error = best_match(Draft202012Validator(schema).iter_errors(document))
-    if error is not None:
-        place = ".".join(str(step) for step in error.absolute_path) or "the document"
-        raise InputError(f"{file}: damaged ({place}: {shortened(error.message, 160)}); run `stitch run` again")
+    wrong = best_match(Draft202012Validator(schema).iter_errors(document))
+    if wrong is not None:
+        place = ".".join(str(step) for step in wrong.absolute_path) or "the document"
+        raise InputError(f"{file}: damaged ({place}: {shortened(wrong.message, 160)}); run `stitch run` again")
     return document
 
 

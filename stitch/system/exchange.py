@@ -18,7 +18,7 @@ def exchange(first: Path, second: Path) -> bool:
     try:
         libc = ctypes.CDLL(None, use_errno=True)
         if sys.platform == "darwin":
-            return libc.renamex_np(a, b, ctypes.c_uint(_EXCHANGE)) == 0
-        return libc.renameat2(_HERE, a, _HERE, b, ctypes.c_uint(_EXCHANGE)) == 0
+            return bool(libc.renamex_np(a, b, ctypes.c_uint(_EXCHANGE)) == 0)
+        return bool(libc.renameat2(_HERE, a, _HERE, b, ctypes.c_uint(_EXCHANGE)) == 0)
     except (AttributeError, OSError, TypeError):
         return False

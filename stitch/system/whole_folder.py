@@ -54,6 +54,10 @@ def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
             yield scratch
             scratch.chmod(0o777 & ~_umask())
             _commit(scratch, path, ours)
+        except OSError as error:
+            # The scratch folder is gone when somebody reads this.
+            place = str(error.filename or path).replace(str(scratch), str(path))
+            raise OSError(error.errno, error.strerror or str(error), place) from None
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
 

@@ -15,7 +15,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.calibrate.robot_calibration import calibrated, dh_rows
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.measurement import Term
+from stitch.model.term import term_of
 from stitch.measurement.robot import forward
 from stitch.model.forward import corrected
 from stitch.pipeline import run
@@ -47,13 +47,13 @@ def test_rows_and_urdf_place_the_flange_as_the_chain_does(convention, tmp_path):
     views = tuple(replace(v, T_base_flange=forward(nominal, v.joints)) for v in session.views)
     session = replace(session, robot=nominal, views=views)
     found = run(session)
-    terms = [Term(EFFECTS[name], rng.normal(size=len(found.measurement.parameters(EFFECTS[name]))) * size)
-             for name, size in (("joint_offset", 1e-3), ("link_geometry", 1e-3))]  # fmt: skip
-    arm = calibrated(replace(found, terms=tuple(terms))).robot
+    zero = [term_of(found.measurement, EFFECTS[name]) for name in ("joint_offset", "link_geometry")]
+    model = found.model.with_terms([term.at(1e-3 * rng.normal(size=len(term.parameters))) for term in zero])
+    arm = calibrated(replace(found, model=model)).robot
     (tmp_path / "a.urdf").write_text(to_urdf(arm))
     urdf = robot_from_urdf(tmp_path / "a.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
     rows = robot_from_dh("arm", convention, dh_rows(arm), None, np.array([0, 0, -9.81]), "mm")
-    own = corrected(found.measurement, terms, found.T_mount)
+    own = corrected(found.measurement, model)
     T_base_flange = np.linalg.inv(own.T_reference_mount)
     for robot in (urdf, rows):
         np.testing.assert_allclose(

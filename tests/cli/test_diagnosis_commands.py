@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from data_synth.commands import judge
+from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import load_scene
-from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main
 from stitch.errors import InputError
@@ -19,7 +19,7 @@ def session_on_disk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     scene = load_scene("blade")
     scene = replace(scene, scanner=replace(scene.scanner, columns=100, rows=100))
-    measured = simulate(scene, {"joint_compliance": 3.0}, 0, 14)
+    measured = simulated(scene, {"joint_compliance": 3.0}, 0, 14)
     write_session(folder / "s", measured, "s")
     write_truth(folder / "s.truth.json", measured, 0)
     return folder

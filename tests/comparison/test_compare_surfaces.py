@@ -7,7 +7,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.comparison.compare_surfaces import compare
 from stitch.pipeline import run
-from stitch.stored.load_state import state_of
+from stitch.runs.state import state_of
 
 
 def blade_run(seed, hidden, mount="eye_to_hand", views=12):

@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from stitch.diagnosis.selection.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
 from stitch.statistics.satterthwaite import satterthwaite
-from stitch.statistics.variance_components import Evidence, VarianceFit, fit_variances
+from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances
 
 
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
@@ -26,7 +26,7 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     columns = rng.normal(size=(n, p)) * (np.arange(n) < n - 4)[:, None]
     A = np.ones((n, 1))
     free = columns - A @ np.linalg.lstsq(A, columns, rcond=None)[0]
-    plausible = Evidence(np.zeros((1, n)), A[None], components[:, None])
+    plausible = MixedModel(np.zeros((1, n)), A[None], components[:, None])
     unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
     degrees_of_freedom = satterthwaite(plausible, unit).of(free[None])
     least = least_noncentrality(free * 2.0, 1.0, tests, n - 1 - p, degrees_of_freedom)
@@ -34,7 +34,7 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     shown = 0
     for _ in range(draws):
         z = columns @ theta + rng.standard_normal(n)
-        drawn = Evidence(z[None], A[None], components[:, None])
+        drawn = MixedModel(z[None], A[None], components[:, None])
         gain = 0.5 * (fit_variances(drawn).deviance - fit_variances(drawn, columns[None], np.full(p, 2.0)).deviance)
         fitted, rest = np.linalg.lstsq(np.hstack([A, columns]), z, rcond=None)[:2]
         square = np.sum((free @ fitted[1:]) ** 2) / p / (rest[0] / (n - 1 - p))

@@ -4,20 +4,19 @@ import numpy as np
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.initial_values import evidence_of_state
-from stitch.diagnosis.score import score
-from stitch.diagnosis.selection.ranking import certain, rank
-from stitch.diagnosis.validation.extrapolation import extrapolation
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.selection.ranking import certain, ranked_one
+from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
-from stitch.stored.load_state import state_of
+from stitch.runs.state import state_of
 
 
 def stands(session, name):
     """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
-    evidence = evidence_of_state(state_of(run(session)))
-    own = rank([score(evidence, candidate_of(evidence, EFFECTS[name]))])[0][0]
-    return certain(own), extrapolation(evidence, own.score)
+    linear = linear_model_of(state_of(run(session)))
+    own = ranked_one(linear, candidate_of(linear, EFFECTS[name]), tests=1)
+    return certain(own), extrapolate(linear, own.score)
 
 
 def test_a_gear_error_of_a_joint_that_was_driven_everywhere_helps_at_left_out_ends_too():

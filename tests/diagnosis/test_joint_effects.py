@@ -4,24 +4,21 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
-from stitch.diagnosis.diagnose import diagnose
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
-from stitch.pipeline import run
+from stitch.pipeline import add, diagnose, run
+from stitch.runs.state import state_of
 from stitch.stepwise import suggest
-from stitch.stored.load_state import state_of
 
 
 def test_a_hidden_joint_offset_is_named_and_found():
     offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
     session, *_ = labelled_cell(2, views=40, offset=offset)
     before = run(session)
-    found = before.diagnose()
+    found = diagnose(before)
     assert "joint_offset" in found.effects, found.sentence
-    after = before.add("joint_offset")
+    after = add(before, "joint_offset")
     assert after.heldout_rms < 0.2 * before.heldout_rms
-    values = dict(
-        zip([p.name for p in after.measurement.parameters(after.terms[0].effect)], after.terms[0].values, strict=True)
-    )
+    values = {p.name: p.value for p in after.terms[0].parameters}
     for name, true in zip(("d2", "d3", "d5"), offset[[1, 2, 4]], strict=True):
         assert values[name] == pytest.approx(true, abs=2e-4)
 
@@ -45,7 +42,7 @@ def test_an_effect_that_another_made_idle_is_dropped():
 
 def test_an_honest_cell_is_adequate():
     session, *_ = labelled_cell(5, views=40)
-    found = run(session).diagnose()
+    found = diagnose(run(session))
     assert found.verdict == "adequate", found.sentence
 
 
@@ -55,9 +52,9 @@ def test_growth_is_found_wherever_the_part_is_held(mount):
     still = TARGETS[0] + [80.0, -40.0, -90.0] + (0 if mount == "eye_to_hand" else TABLE)
     session, *_ = labelled_cell(4, mount=mount, grown=Growth(2e-4, still))
     found = run(session)
-    assert diagnose(state_of(found)).effects == ("part_growth",)
+    assert diagnose(found).effects == ("part_growth",)
     found = run(session, effects=["part_growth"])
-    values, sigmas = found.terms[0].values, found.sigmas[0]
+    values, sigmas = found.terms[0].values, found.terms[0].sigmas
     true = 2e-4 * np.append(1.0, found.measurement.target_views[0].origin - still)
     assert (sigmas < [1e-5, 2e-3, 2e-3, 2e-3]).all()  # mm: a quarter of the motion of the middle
     assert (np.abs(values - true) < 4 * sigmas).all()
@@ -67,7 +64,7 @@ def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
     """Offsets of the smallest detectable size, put into the same measurements joint by joint."""
     session, *_ = labelled_cell(5)
     found = run(session)
-    suspect = next(s for s in diagnose(state_of(found)).candidates if s.name == "joint_offset")
+    suspect = next(s for s in diagnose(found).candidates if s.name == "joint_offset")
     sizes = [min(suspect.detectable.get(f"d{i + 1}", np.inf), 1e-3) for i in range(6)]
     middle = np.mean([v.sighting.points.mean(axis=0) for v in session.views], axis=0)
     pushed = []

@@ -7,9 +7,12 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import parameters_in
 from stitch.measurement.capture import capture
-from stitch.measurement.measurement import Term, measurement_of
-from stitch.model.forward import corrected, placed
+from stitch.measurement.measurement import measurement_of
+from stitch.model.forward import corrected, perturbed_frames
+from stitch.model.model import Model
+from stitch.model.term import term_of
 
 # Amplitude 1 is a tenth of a millimetre; a hundredth of that must remain: second-order terms are smaller still.
 _LEFT = 0.03
@@ -38,10 +41,10 @@ def test_undoing_an_effect_gives_natures_poses(still_cells, name, mount):
     measurement = chain_for(measured)
     told = measured.hidden[name]
     effect = EFFECTS[name]
-    values = np.array([told.get(p.name, 0.0) for p in measurement.parameters(effect)])
-    left, right = placed(measurement, [Term(effect, values)])
+    values = np.array([told.get(p.name, 0.0) for p in parameters_in(measurement, effect)])
+    left, right = perturbed_frames(measurement, [term_of(measurement, effect).at(values)])
     poses = left @ measured.T_mount @ right
-    plain, still = placed(measurement, [])
+    plain, still = perturbed_frames(measurement, [])
     middle = np.array([[0.0, 0.0, 420.0]])
     truth = frames.transform(measured.T_reference_scanner, middle)
     off = np.linalg.norm(frames.transform(poses, middle) - truth, axis=-1).max()
@@ -58,8 +61,8 @@ def test_undoing_a_scanner_effect_gives_the_true_points(name):
     plain, bent = hidden_pair(name, "eye_to_hand")
     measurement = chain_for(bent)
     effect = EFFECTS[name]
-    values = np.array([bent.hidden[name][p.name] for p in measurement.parameters(effect)])
-    mended = corrected(measurement, [Term(effect, values)], bent.T_mount)
+    values = np.array([bent.hidden[name][p.name] for p in parameters_in(measurement, effect)])
+    mended = corrected(measurement, Model(bent.T_mount, (term_of(measurement, effect).at(values),)))
     for scan, true, wrong in zip(mended.scans, plain.clouds, bent.clouds, strict=True):
         before = np.abs(wrong.points - true.points).max()
         assert np.abs(scan.points - true.points).max() <= _LEFT * before + 1e-9

@@ -1,10 +1,10 @@
 """Parameters of effects: units, and effects that a session cannot have."""
 
 import pytest
-from stitch.model.terms import known, require
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import known, require
 from stitch.errors import InputError
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of

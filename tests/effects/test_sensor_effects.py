@@ -6,6 +6,7 @@ import pytest
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.measurement.measurement import measurement_of
+from stitch.model.term import term_of
 
 
 @pytest.mark.parametrize(
@@ -15,7 +16,8 @@ def test_a_scanner_that_looks_along_minus_z_has_the_same_errors(blade_capture, n
     """Turning the scanner's frame by 180° about x turns every effect of the scanner with it."""
     measured, capture = blade_capture
     measurement, effect, turn = measurement_of(session_of(measured), capture), EFFECTS[name], np.diag([1.0, -1.0, -1.0])
-    arguments = measurement.arguments(effect, np.array([p.typical for p in measurement.parameters(effect)]))
+    term = term_of(measurement, effect)
+    arguments = term.at(term.typical).arguments
     points = capture.scans[0].points
     moved = effect.function(points, measurement.scan_views[0], **arguments)
     assert np.abs(moved - points).max() > 1e-3

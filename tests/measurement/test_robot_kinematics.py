@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stitch.writing.urdf_file import to_urdf
 from stitch import frames
 from stitch.measurement.robot import (
     forward,

@@ -8,10 +8,13 @@ import pytest
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import lacking, parameters_in
 from stitch.measurement.capture import capture
-from stitch.measurement.measurement import Term, measurement_of
-from stitch.model.forward import placed
+from stitch.measurement.measurement import measurement_of
+from stitch.model.forward import perturbed_frames
 from stitch.model.jacobian import shifts, twists
+from stitch.model.model import Model
+from stitch.model.term import Term, term_of
 
 
 def chain_for(measured):
@@ -24,14 +27,14 @@ def test_twists_are_the_derivative_of_the_poses(still_cells, name):
     """Central differences of half the size about the same place, by another route: a point carried along."""
     measurement = chain_for(still_cells["eye_to_hand"])
     effect = EFFECTS[name]
-    if measurement.lacks(effect):
-        pytest.skip(f"needs {measurement.lacks(effect)}")
-    parameters = measurement.parameters(effect)
+    if lacking(measurement, effect):
+        pytest.skip(f"needs {lacking(measurement, effect)}")
+    parameters = parameters_in(measurement, effect)
     # A twist that is zero hides its time constant: begin where it is not.
     values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
     T = still_cells["eye_to_hand"].T_mount
     centre = np.array([5.0, -3.0, 80.0])
-    slopes = twists(measurement, [], Term(effect, values), T, centre)
+    slopes = twists(measurement, Model(T), term_of(measurement, effect).at(values), centre)
     point = np.array([10.0, 20.0, 120.0])
     for i, parameter in enumerate(parameters):
         if parameter.discrete:
@@ -40,8 +43,8 @@ def test_twists_are_the_derivative_of_the_poses(still_cells, name):
         h = (0.001 if parameter.grid else 0.01) * parameter.typical
         carried = []
         for sign in (1, -1):
-            left, right = placed(measurement, [Term(effect, values + sign * h * np.eye(len(values))[i])])
-            left0, right0 = placed(measurement, [Term(effect, values)])
+            left, right = perturbed_frames(measurement, [term_of(measurement, effect).at(values + sign * h * np.eye(len(values))[i])])
+            left0, right0 = perturbed_frames(measurement, [term_of(measurement, effect).at(values)])
             carried.append(frames.transform(left @ T @ right @ frames.inverse(left0 @ T @ right0), point[None])[:, 0])
         expected = (carried[0] - carried[1]) / (2 * h)
         predicted = slopes[i][:, 3:] + np.cross(slopes[i][:, :3], point - centre)
@@ -58,14 +61,15 @@ def test_point_slopes_are_minus_what_nature_does(still_cells, name):
     effect = EFFECTS[name]
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
-    slopes = shifts(measurement, [], Term(effect, np.zeros(len(measurement.parameters(effect)))), 2, pose, index)
+    zero = Term(effect, parameters_in(measurement, effect))
+    slopes = shifts(measurement, Model(np.eye(4)), zero, v=2, pose=pose, index=index)
     view = measurement.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
     points = measurement.capture.scans[2].points[index]
     at = frames.transform(pose, points) if effect.place == "shape" else points
-    for i, parameter in enumerate(measurement.parameters(effect)):
+    for i, parameter in enumerate(parameters_in(measurement, effect)):
         h = 1e-3 * parameter.typical
         values = h * np.eye(len(slopes))[i]
-        moved = (effect.function(at, view, **measurement.arguments(effect, values)) - at) / h
+        moved = (effect.function(at, view, **zero.at(values).arguments) - at) / h
         expected = -frames.rotate(frames.inverse(pose), moved) if effect.place == "shape" else -moved
         assert np.allclose(slopes[i], expected, rtol=1e-2, atol=1e-6 * np.abs(expected).max())

@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stitch.model.terms import fitted_of, sigmas_of, terms_of
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import parameters_in
 from stitch.errors import InputError
 from stitch.measurement.capture import capture
-from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import unit_torques
-from stitch.model.model_toml import Model
+from stitch.model.bound import bound
+from stitch.model.model_toml import ModelFile
+from stitch.model.term import term_of
 from stitch.pipeline import run_rig
 from stitch.stages.rig import require_effects
 
@@ -43,10 +45,11 @@ def placed_session(still_cells):
 
 def fitted(measurement, name):
     """A model in which every parameter of an effect has a value and a sigma of its own."""
-    size = len(measurement.parameters(EFFECTS[name]))
+    size = len(parameters_in(measurement, EFFECTS[name]))
     values, sigmas = np.arange(1.0, size + 1) * 1e-6, np.arange(1.0, size + 1) * 1e-8
-    told = fitted_of(measurement, [Term(EFFECTS[name], values)], [sigmas])
-    return Model("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), told), values, sigmas
+    term = term_of(measurement, EFFECTS[name]).at(values, sigmas)
+    stated = {name: {p.name: p for p in term.parameters}}
+    return ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), stated), values, sigmas
 
 
 def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(placed_session):
@@ -54,9 +57,9 @@ def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(pla
     session, own = placed_session
     full, wrist = (measurement_of(s, own) for s in (massless(session), wrist_only(massless(session))))
     model, values, sigmas = fitted(full, "joint_compliance")
-    (term,) = terms_of(model, wrist)
+    (term,) = bound(model, wrist).terms
     np.testing.assert_array_equal(term.values, values)
-    np.testing.assert_array_equal(sigmas_of(model, wrist)[0], sigmas)
+    np.testing.assert_array_equal(term.sigmas, sigmas)
     assert {f.unit for f in model.effects["joint_compliance"].values()} == {"kg rad/(N m)"}
     unit, bent = unit_torques(wrist.robot, wrist.views.joints), np.zeros(wrist.views.joints.shape)
     for name, f in model.effects["joint_compliance"].items():
@@ -70,16 +73,16 @@ def test_what_a_model_knows_is_never_dropped_or_read_in_another_unit(placed_sess
     with_masses, bare = (measurement_of(s, own) for s in (session, massless(session)))
     for there, here in ((with_masses, bare), (bare, with_masses)):
         with pytest.raises(InputError, match="the model's joint_compliance has c.*link masses") as error:
-            terms_of(fitted(there, "joint_compliance")[0], here)
+            bound(fitted(there, "joint_compliance")[0], here)
         assert "\n" not in str(error.value)
     for name, column in (("part_growth", "part_temperature_c"), ("robot_thermal_growth", "robot_temperature_c")):
         warm, timed = with_masses, measurement_of(without(session, column), own)
-        assert all(p.unit.endswith("/°C") for p in warm.parameters(EFFECTS[name]))
-        assert all(p.unit.endswith("/h") for p in timed.parameters(EFFECTS[name]))
+        assert all(p.unit.endswith("/°C") for p in parameters_in(warm, EFFECTS[name]))
+        assert all(p.unit.endswith("/h") for p in parameters_in(timed, EFFECTS[name]))
         for there, here in ((warm, timed), (timed, warm)):
-            terms_of(fitted(there, name)[0], there)
+            bound(fitted(there, name)[0], there)
             with pytest.raises(InputError, match=f"{name}.g is in '1/(h|°C)'.*{column}"):
-                terms_of(fitted(there, name)[0], here)
+                bound(fitted(there, name)[0], here)
 
 
 def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_session):

@@ -5,7 +5,7 @@ import pytest
 
 from data_synth.fixtures.edits import edit
 from stitch.errors import InputError
-from stitch.model.model_toml import Model, read_model, write_model
+from stitch.model.model_toml import ModelFile, read_model, write_model
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), [
@@ -14,7 +14,7 @@ from stitch.model.model_toml import Model, read_model, write_model
 ])  # fmt: skip
 def test_a_model_that_was_edited_wrongly_is_refused(tmp_path, old, new, expected):
     file = tmp_path / "model.toml"
-    write_model(Model("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6)), file)
+    write_model(ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6)), file)
     edit(file, old, new)
     with pytest.raises(InputError, match=f"model.toml: {expected}; "):
         read_model(file)

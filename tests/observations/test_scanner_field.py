@@ -6,12 +6,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import load_scene
-from data_synth.simulate import simulate
 from stitch import frames, pipeline
-from stitch.diagnosis.initial_values import evidence_of_state
+from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.surfaces.scanner_field import field_scatter
-from stitch.stored.load_state import state_of
+from stitch.runs.state import state_of
 
 SEEDS = 2
 
@@ -22,7 +22,7 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
     scanner = replace(scene.scanner, columns=50, rows=50, field_error=share * scene.scanner.noise)
     squares, sigmas = [], []
     for seed in range(SEEDS):
-        measured = simulate(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
+        measured = simulated(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
         found = pipeline.run(session_of(measured))
         xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
         squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))
@@ -42,8 +42,8 @@ def test_what_incidence_shows_is_not_laid_on_the_field():
     """A carried scanner on a coarse surface: grazing points pretend a bias, while its field has no error at all."""
     scene = load_scene("blade-table")
     scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
-    measured = simulate(replace(scene, scanner=scanner), {}, 3, views=10)
-    evidence = evidence_of_state(state_of(pipeline.run(session_of(measured))))
-    shown, unit = (field_scatter(evidence.measurement, evidence.freed, share) for share in (None, 1.0))
+    measured = simulated(replace(scene, scanner=scanner), {}, 3, views=10)
+    linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
+    shown, unit = (field_scatter(linear.measurement, linear.observation.freed, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
     assert np.max(shares[:-1]) < 0.2

@@ -5,19 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stitch.observations.surfaces.point_effects import point_gram
 
 from data_synth.fixtures.drilled_plate import VIEWS, measured_plate
 from data_synth.fixtures.in_memory import labelled_session_of
 from stitch import frames
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import capture
-from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.measurement import measurement_of
 from stitch.measurement.sightings import Sightings
 from stitch.model.forward import corrected
+from stitch.model.model import Model
+from stitch.model.term import term_of
 from stitch.observations.surfaces.free_poses import answer, free_poses
 from stitch.observations.surfaces.gram import Gram, assemble
 from stitch.observations.surfaces.target_pairs import joined, target_pairs
+from stitch.observations.surfaces.view_responses import view_responses
 
 
 def scattered(seed, views=7, targets=4):
@@ -100,12 +102,12 @@ def test_sums_of_targets_are_the_slopes_of_what_sets_them_apart():
     T_mount = measured_plate(0).T_mount
     own = measurement.capture
     freed = free_poses(own, own.poses(T_mount), 2.0)
-    term = Term(EFFECTS["range_scale"], np.zeros(1))
-    sums, g = point_gram(measurement, (), [term], freed), freed.overlaps.gram
-    step = 0.01 * measurement.parameters(term.effect)[0].typical
+    term = term_of(measurement, EFFECTS["range_scale"])
+    sums, g = view_responses(measurement, Model(T_mount), [term], freed)[0].points, freed.overlaps.gram
+    step = 0.01 * term.parameters[0].typical
     pulls, squares = [], []
     for sign in (1, -1):
-        moved = corrected(measurement, [replace(term, values=np.array([sign * step]))], T_mount)
+        moved = corrected(measurement, Model(T_mount, (term.at([sign * step]),)))
         pairs = target_pairs(moved.sightings, freed.poses)
         both = joined(no_surface(VIEWS, g.centre, g.variance), pairs, 1.0)
         pulls.append(both.vector[both.labelled])

@@ -8,10 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS
+from stitch.effects.in_session import lacking
 from stitch.measurement.capture import capture
-from stitch.measurement.measurement import Term, measurement_of
+from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import corrected, shift_targets
 from stitch.model.jacobian import target_shifts
+from stitch.model.model import Model
+from stitch.model.term import term_of
 from stitch.observations.targets.closed_form import closed_form
 from stitch.observations.targets.landmarks import initial_landmarks
 from stitch.observations.targets.rows import effect_rows, rows_of
@@ -44,16 +47,17 @@ def test_rows_are_the_slopes_of_what_is_left():
     measurement = measurement_of(session, capture(session))
     for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
         effect = EFFECTS[name]
-        if measurement.lacks(effect):
+        if lacking(measurement, effect):
             continue
-        zero = Term(effect, np.zeros(len(measurement.parameters(effect))))
+        zero, plain = term_of(measurement, effect), Model(T_mount)
         landmarks = initial_landmarks(measurement.capture, T_mount)
         rows = rows_of(measurement.capture, T_mount, landmarks)
-        slopes = effect_rows(rows, measurement, (), zero)
-        for i, parameter in enumerate(measurement.parameters(effect)):
+        slopes = effect_rows(rows, measurement, plain, zero)
+        for i, parameter in enumerate(zero.parameters):
             step = 0.01 * parameter.typical
-            both = [rows_of(corrected(measurement, [replace(zero, values=s * step * np.eye(len(zero.values))[i])], T_mount),
-                            T_mount, landmarks).residual for s in (1, -1)]  # fmt: skip
+            stepped = [zero.at(s * step * np.eye(len(zero.values))[i]) for s in (1, -1)]
+            captures = [corrected(measurement, plain.with_term(term)) for term in stepped]
+            both = [rows_of(own, T_mount, landmarks).residual for own in captures]
             numeric = (both[0] - both[1]) / (2 * step)
             scale = max(np.abs(numeric).max(), 1e-12)
             np.testing.assert_allclose(
@@ -65,9 +69,9 @@ def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
     # The last joint's offset must not borrow from what is left, however large that is.
     session, T_mount, *_ = labelled_cell(1, views=12, scatter=(1e-3, 1.0))
     measurement = measurement_of(session, capture(session))
-    term = Term(EFFECTS["joint_offset"], np.zeros(6))
+    term = term_of(measurement, EFFECTS["joint_offset"])
     rows = rows_of(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
-    column = effect_rows(rows, measurement, (), term)[..., 5].ravel()
+    column = effect_rows(rows, measurement, Model(T_mount), term)[..., 5].ravel()
     landmarks = rows.landmarks.reshape(rows.residual.size, -1)
     left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
     assert np.abs(left).max() < 1e-6 * np.abs(column).max()
@@ -76,7 +80,7 @@ def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
 def test_slopes_of_shifts_are_linear_in_small_steps():
     session, T_mount, *_ = labelled_cell(1, views=4)
     measurement = measurement_of(session, capture(session))
-    term = Term(EFFECTS["range_scale"], np.zeros(1))
+    term = term_of(measurement, EFFECTS["range_scale"])
     poses = measurement.capture.poses(T_mount)
-    moved = shift_targets(measurement, [replace(term, values=np.array([1e-4]))], poses)
-    np.testing.assert_allclose(moved, 1e-4 * target_shifts(measurement, (), term, poses)[0], rtol=1e-3)
+    moved = shift_targets(measurement, [term.at([1e-4])], poses)
+    np.testing.assert_allclose(moved, 1e-4 * target_shifts(measurement, Model(T_mount), term, poses)[0], rtol=1e-3)

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from stitch.statistics.satterthwaite import satterthwaite
-from stitch.statistics.variance_components import Evidence, VarianceFit
+from stitch.statistics.variance_components import MixedModel, VarianceFit
 
 GROUPS = (30, 20, 500)
 
 
-def groups() -> tuple[Evidence, VarianceFit]:
+def groups() -> tuple[MixedModel, VarianceFit]:
     """Three groups of numbers, each with a variance of its own; the mean of the first is unknown."""
     own = np.repeat(np.arange(3), GROUPS)
     components = np.array([np.diag((own == k).astype(float)) for k in range(3)])[:, None]
     A = (own == 0).astype(float)[None, :, None]
-    evidence = Evidence(np.zeros((1, own.size)), A, components)
+    evidence = MixedModel(np.zeros((1, own.size)), A, components)
     return evidence, VarianceFit(np.array([4.0, 0.25, 1.0]), 0.0, np.zeros(1), np.eye(1))
 
 

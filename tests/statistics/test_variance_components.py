@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.variance_components import Evidence, at_variances, fit_variances
+from stitch.statistics.variance_components import MixedModel, at_variances, fit_variances
 
 
 def test_variances_are_found_again():
@@ -17,7 +17,7 @@ def test_variances_are_found_again():
     half = np.linalg.cholesky(np.einsum("c,cij->ij", truth, C[:, 0]))
     for _ in range(40):
         z = half @ rng.standard_normal(n) + A[0] @ rng.normal(0, 30, 5)
-        found.append(fit_variances(Evidence(z[None], A, C)).variances)
+        found.append(fit_variances(MixedModel(z[None], A, C)).variances)
     mean, error = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))
     # The prior off the boundary lifts the first two by about a standard deviation of one estimate at most.
     assert (mean - truth < 3 * error + np.std(found, axis=0)).all()
@@ -32,8 +32,8 @@ def test_evidence_is_the_gaussian_integral():
     z, A, G = rng.standard_normal((1, n)), rng.standard_normal((1, n, 2)), rng.standard_normal((1, n, 3))
     prior = np.array([0.5, 1.0, 2.0])
     variances = np.array([1.0, 0.7, 1.3])
-    plain, wide = (at_variances(Evidence(z, A, c), variances) for c in (C, C))
-    with_G = at_variances(Evidence(z, A, C), variances, G, prior)
+    plain, wide = (at_variances(MixedModel(z, A, c), variances) for c in (C, C))
+    with_G = at_variances(MixedModel(z, A, C), variances, G, prior)
     V = np.einsum("c,cij->ij", variances, C[:, 0])
     values = []
     for K in (V, V + (G[0] * prior**2) @ G[0].T):

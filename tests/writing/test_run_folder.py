@@ -15,8 +15,9 @@ from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import Step
-from stitch.stored.load_state import load_state, state_of
+from stitch.runs.run import LedgerStep
+from stitch.runs.state import state_of
+from stitch.stored.load_state import load_state
 from stitch.stored.stored_run import stored_run
 from stitch.writing.run_folder import write_run
 from viz import run_page, sections
@@ -145,7 +146,7 @@ def test_a_change_that_fails_leaves_the_run_as_it_was(changing, monkeypatch, err
 def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch, stitch_command):
     """The fit is made once more for the recording; history and result speak of the same one."""
     run, result = changing
-    step, last = Step((), 0.1, 0.1, 0.1, np.eye(4)), Step((), 0.1, result.heldout_rms, 0.1, result.T_mount)
+    step, last = LedgerStep((), 0.1, 0.1, 0.1, np.eye(4)), LedgerStep((), 0.1, result.heldout_rms, 0.1, result.T_mount)
     fitted = replace(result, ledger=(step, step))
     monkeypatch.setattr(change_command, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
     monkeypatch.setattr(change_command, "suggest", lambda state, at_most: (fitted, [], None))

@@ -6,8 +6,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.report import LIMIT, BaseResult, describe
 from stitch.cells.base_to_base.stand import Stand
+from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult, describe
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.cells import stage
@@ -18,11 +18,11 @@ from viz.cells.page import Page, Picture, Table, write
 def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
     """Sentence, plan and elevation, contradictions, the transform; without a result the contradictions alone."""
     comparisons = compare_distances(stand) if result is None else result.comparisons
-    judged = (
+    caption = (
         "Distances that the stand and a robot's joints give independently; beyond "
         f"{LIMIT:g} sigmas the command refuses to give a transform."
     )
-    pictures = [Picture("Do the readings contradict each other?", contradictions(comparisons), judged)]
+    pictures = [Picture("Do the readings contradict each other?", contradictions(comparisons), caption)]
     tables = [Table("Distances", ("comparison",), [(describe(c, stand.length_unit),) for c in comparisons])]
     verdict, notes = "The readings contradict each other; no transform is given.", []
     if result is not None:
@@ -76,8 +76,8 @@ def record(stand: Stand, result: BaseResult, path: Path) -> None:
     """Both bases, the rail, the rods and the touched points, frame of base 1."""
     T = result.fit.T_base1_base2
     size = 0.12 * float(np.linalg.norm(T[:3, 3]))
-    told = "\n".join(f"- {describe(c, stand.length_unit)}." for c in result.comparisons)
-    words = f"# Base to base\n\n{sentence(stand, result)}\n\n{told}\n\n{_LEGEND}"
+    comparisons = "\n".join(f"- {describe(c, stand.length_unit)}." for c in result.comparisons)
+    words = f"# Base to base\n\n{sentence(stand, result)}\n\n{comparisons}\n\n{_LEGEND}"
     pivots, cups = rods(stand, result)
     with stage.stage(path, "Base to base", words) as recording:
         stage.frame(recording, "base 1", np.eye(4), size)

@@ -9,8 +9,8 @@ from matplotlib.patches import Ellipse
 
 from stitch import frames
 from stitch.cells.base_to_base.contradiction import Comparison
-from stitch.cells.base_to_base.report import LIMIT, BaseResult
 from stitch.cells.base_to_base.stand import Stand, rod_points
+from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult
 from stitch.frames import Array
 
 _ONE, _TWO, _ROD = "#4878a8", "#6a9955", "#b5523b"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cells.drilling.job import JobResult
-from stitch.cells.drilling.reading import Job
+from stitch.cells.drilling.drill_job import Job
+from stitch.cells.drilling.drill_solution import Drive, JobResult
 from stitch.frames import transform
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
@@ -20,7 +20,7 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
         "which the holes to drill move."
     )
     pictures = [Picture("Holes and drive errors", holes(job, result), caption)]
-    if len(result.left_out):
+    if len(result.leave_one_out_errors):
         caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
         pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
     page = Page("Drilling", sentence(job, result), pictures, _tables(job, result), _notes(result))
@@ -39,7 +39,7 @@ def sentence(job: Job, result: JobResult) -> str:
 
 
 def _notes(result: JobResult) -> list[str]:
-    found = [t for t in (result.naming.trials if result.naming else ()) if t.accepted]
+    found = [t for t in (result.effects.trials if result.effects else ()) if t.accepted]
     out = [f"Found and taken out: {t.effect} = {t.value:.4g} ± {t.sigma:.2g} (p {t.p_value:.1g})." for t in found]
     tool = result.tool_axis
     if tool is not None and tool.accepted:
@@ -51,20 +51,21 @@ def _notes(result: JobResult) -> list[str]:
 def _tables(job: Job, result: JobResult) -> list[Table]:
     unit = job.length_unit
     references = [
-        (hole.name, name, f"{np.linalg.norm(error):.3f}", f"{np.linalg.norm(left):.3f}")
+        (hole.name, name, f"{np.linalg.norm(error):.3f}", f"{np.linalg.norm(residual):.3f}")
         for name, c in result.groups.items()
-        for hole, error, left in zip(references_of(job, name), c.errors, c.residuals, strict=True)
+        for hole, error, residual in zip(references_of(job, name), c.errors, c.residuals, strict=True)
     ]
-    drives = [
-        (d.hole.name, d.hole.group, *(f"{x:.3f}" for x in d.position), *(f"{a:.3f}" for a in np.degrees(d.angles)),
-         f"{np.linalg.norm(d.position - d.hole.position):.3f}")
-        for d in result.drives
-    ]  # fmt: skip
+    drives = [(d.hole.name, d.hole.group, *(f"{x:.3f}" for x in _drive_numbers(d))) for d in result.drives]
     header = ("hole", "group", *(f"{k} ({unit})" for k in "xyz"), "a (°)", "b (°)", "c (°)", f"moved ({unit})")
     return [
         Table("Reference holes", ("hole", "group", f"error before ({unit})", f"left after ({unit})"), references),
         Table("Drives", header, drives),
     ]
+
+
+def _drive_numbers(d: Drive) -> list[float]:
+    """Position, angles in degrees, and how far the drive moved."""
+    return [*d.position, *np.degrees(d.angles), float(np.linalg.norm(d.position - d.hole.position))]
 
 
 def record(job: Job, result: JobResult, path: Path) -> None:
@@ -84,8 +85,8 @@ def record(job: Job, result: JobResult, path: Path) -> None:
         inward = np.array([d.direction for d in result.drives])
         stage.points(recording, "holes/corrected", drives, [stage.GREEN], size / 150)
         stage.arrows(recording, "drives", drives - inward * size / 8, inward * size / 8, stage.GREEN, size / 500)
-        for name, (T, _, _) in job.placed.items():
-            stage.frame(recording, f"tool on {name}", T, size / 15)
+        for name, placed in job.placed.items():
+            stage.frame(recording, f"tool on {name}", placed.T_base_tool, size / 15)
 
 
 def _words(job: Job, result: JobResult) -> str:

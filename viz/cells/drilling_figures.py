@@ -4,13 +4,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.drilling.job import JobResult
-from stitch.cells.drilling.reading import Hole, Job
+from stitch.cells.drilling.drill_job import Hole, Job
+from stitch.cells.drilling.drill_solution import JobResult
 from stitch.frames import Array, transform
 
 _BEFORE, _AFTER, _DRILL = "#b5523b", "#6a9955", "#4878a8"
 # Of the panel's extent, that the largest error's arrow is drawn.
 _LONGEST = 0.25
+_ARROWS = {"angles": "xy", "scale_units": "xy", "scale": 1}  # as long as they are in the data's unit
 
 
 def holes(job: Job, result: JobResult) -> Figure:
@@ -58,8 +59,7 @@ def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Arra
         at = ((transform(c.T_actual_nominal, nominal) if after else nominal) - middle) @ side.T
         off = (c.residuals if after else c.errors) @ side.T * magnified(job, result)
         ax.scatter(*at.T, s=45, facecolor="none", edgecolor="0.3", zorder=3, label=_once(ax, "reference hole"))
-        ax.quiver(*at.T, *off.T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.006,
-                  label=_once(ax, label))  # fmt: skip
+        ax.quiver(*at.T, *off.T, **_ARROWS, color=colour, width=0.006, label=_once(ax, label))
         ax.update_datalim(at + off)
     drives = np.array([d.position if after else d.hole.position for d in result.drives])
     ax.plot(*((drives - middle) @ side.T).T, "+", color=_DRILL, ms=9, label="hole to drill")
@@ -71,8 +71,8 @@ def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Arra
 
 def _name_holes(ax: Axes, job: Job, middle: Array, side: Array) -> None:
     for name, position in {hole.name: hole.position for hole in job.holes}.items():
-        ax.annotate(name, side @ (position - middle), xytext=(0, -13), textcoords="offset points", ha="center",
-                    fontsize=7, color="0.4")  # fmt: skip
+        at = side @ (position - middle)
+        ax.annotate(name, at, xytext=(0, -13), textcoords="offset points", ha="center", fontsize=7, color="0.4")
 
 
 def _once(ax: Axes, label: str) -> str:
@@ -84,13 +84,14 @@ def plate(job: Job, result: JobResult) -> Figure:
     """Leave-one-out errors of the plate's holes."""
     figure = Figure(figsize=(4.6, 3.8), layout="constrained")
     ax = figure.subplots()
-    at, off = job.plate_xyz[:, :2], result.left_out
+    at, off = job.plate_xyz[:, :2], result.leave_one_out_errors
     ax.scatter(*at.T, s=120, facecolor="none", edgecolor="0.3")
     largest = max(float(np.linalg.norm(off, axis=1).max()), 1e-9)
     scale = 0.25 * float(np.ptp(at, axis=0).max()) / largest
-    ax.quiver(*at.T, *(off * scale).T, color=_BEFORE, angles="xy", scale_units="xy", scale=1, width=0.007)
-    ax.set(aspect="equal", xlabel=f"flange x ({job.length_unit})", ylabel=f"flange y ({job.length_unit})",
-           title=f"longest arrow {largest:.3f} {job.length_unit}")  # fmt: skip
+    ax.quiver(*at.T, *(off * scale).T, **_ARROWS, color=_BEFORE, width=0.007)
+    unit = job.length_unit
+    ax.set(aspect="equal", xlabel=f"flange x ({unit})", ylabel=f"flange y ({unit})")
+    ax.set_title(f"longest arrow {largest:.3f} {unit}")
     ax.margins(0.25)
     return figure
 

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.panel.figures import errors_figure
-from stitch.cells.panel.job import JobResult
-from stitch.cells.panel.reading import Job
-from stitch.cells.panel.words import leg_sentence, shape_sentence
+from stitch.cells.panel.panel_job import Job
+from stitch.cells.panel.panel_sentences import leg_sentence, shape_sentence
+from stitch.cells.panel.panel_solution import JobResult
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
+from viz.cells.panel_error_figures import errors_figure
 from viz.cells.panel_figures import deviation_before, expected_after, forces, misfit, shape
 from viz.colours import signed_colours
 
@@ -36,8 +36,8 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     caption = "Reflectors seen by the tracker against the fitted model, every bar one robot; 1 is the tracker's sigma."
     pictures.append(Picture("What the model of each robot leaves", misfit(job, result), caption))
     caption = "What the uncertainty of the model does to the slaves when the master moves."
-    args = job.robots, job.master, result.shift, result.turn
-    pictures.append(Picture("Errors to expect along a motion", errors_figure(*args), caption))
+    figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
+    pictures.append(Picture("Errors to expect along a motion", figure, caption))
     write(Page("Panel held by robots", sentence(job, result), pictures, _tables(job, result), _notes(result)), path)
 
 
@@ -62,8 +62,8 @@ def _tables(job: Job, result: JobResult) -> list[Table]:
         sigma = np.sqrt(np.diag(model.covariance)).reshape(4, 3).max(axis=1)
         base = " ".join(f"{x:.2f}" for x in model.T_world_base[:3, 3])
         degrees = np.degrees(sigma)
-        rows.append((model.name, base, f"{sigma[1]:.3f}", f"{degrees[0]:.4f}", f"{sigma[3]:.3f}", f"{degrees[2]:.4f}",
-                     f"{model.p_value:.2g}"))  # fmt: skip
+        base_sigma, clamp_sigma = ((f"{sigma[k]:.3f}", f"{degrees[k - 1]:.4f}") for k in (1, 3))
+        rows.append((model.name, base, *base_sigma, *clamp_sigma, f"{model.p_value:.2g}"))
     header = ("robot", "base in the world (mm)", "σ (mm)", "σ (°)", "clamp σ (mm)", "σ (°)", "misfit p")
     return [Table("Global model", header, rows)]
 

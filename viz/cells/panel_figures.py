@@ -5,8 +5,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.panel.job import JobResult
-from stitch.cells.panel.reading import Job
+from stitch.cells.panel.panel_job import Job
+from stitch.cells.panel.panel_solution import JobResult
 from stitch.frames import Array, Indices
 from viz.colours import SIGNED
 
@@ -16,11 +16,11 @@ def expected_after(job: Job, result: JobResult) -> Array:
     assert result.shape is not None and job.control is not None
     after = np.zeros(len(job.control.clamp))
     for i, T in enumerate(result.contacts.T_panel_contact):
-        own = job.control.clamp == i
-        local = frames.transform(frames.inverse(T), job.control.nominal[own])
+        beside = job.control.clamp == i
+        local = frames.transform(frames.inverse(T), job.control.nominal[beside])
         twist = result.shape.twists[i]
         moved = twist[3:] + np.cross(twist[:3], local)
-        after[own] = -(result.shape.deviations[own] @ T[:3, 2]) - moved[:, 2]
+        after[beside] = -(result.shape.deviations[beside] @ T[:3, 2]) - moved[:, 2]
     return after
 
 
@@ -38,8 +38,8 @@ def shape(job: Job, result: JobResult) -> Figure:
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     before = deviation_before(job, result)
     limit = max(float(np.abs(before).max()), job.tolerance)
-    for ax, values, title in zip(axes, (before, expected_after(job, result)), ("measured", "expected after the "
-                                 "correction"), strict=True):  # fmt: skip
+    shown = (("measured", before), ("expected after the correction", expected_after(job, result)))
+    for ax, (title, values) in zip(axes, shown, strict=True):
         _draw_panel(ax, job, result)
         at = _unrolled(job, job.control.nominal)
         drawn = ax.scatter(*at.T, c=values, s=70, cmap=SIGNED, vmin=-limit, vmax=limit, edgecolor="0.3", zorder=3)

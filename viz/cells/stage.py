@@ -45,9 +45,13 @@ def frame(recording: rr.RecordingStream, name: str, T: Array, size: float) -> No
 
 
 def points(
-    recording: rr.RecordingStream, name: str, places: Array, colours: Colours, radius: float,
+    recording: rr.RecordingStream,
+    name: str,
+    places: Array,
+    colours: Colours,
+    radius: float,
     labels: Sequence[str] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Points (N, 3), one colour each or one for all."""
     shown = None if labels is None else list(labels)
     cloud = rr.Points3D(np.float32(places), colors=colours, radii=radius, labels=shown, show_labels=labels is not None)
@@ -55,9 +59,13 @@ def points(
 
 
 def arrows(
-    recording: rr.RecordingStream, name: str, origins: Array, vectors: Array, colour: tuple[int, int, int],
+    recording: rr.RecordingStream,
+    name: str,
+    origins: Array,
+    vectors: Array,
+    colour: tuple[int, int, int],
     radius: float,
-) -> None:  # fmt: skip
+) -> None:
     """Arrows from origins (N, 3) along vectors (N, 3)."""
     found = rr.Arrows3D(origins=np.float32(origins), vectors=np.float32(vectors), colors=[colour], radii=radius)
     recording.log(place(name), found, static=True)

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from stitch import frames
 from stitch.cells.window.deviation import Deviations
-from stitch.cells.window.job import Part
-from stitch.cells.window.reading import FitJob
+from stitch.cells.window.window_jobs import FitJob
+from stitch.cells.window.window_solution import Part
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -36,19 +36,21 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
 
 def sentence(parts: list[Part]) -> str:
     """What was found and how it compares."""
-    told = []
+    sentences = []
     for i, part in enumerate(parts):
         bad, cells = part.deviations.outside, part.deviations.cells
         name = f"Part {i + 1}" if len(parts) > 1 else "The part"
         where = f"its points lie {part.fit.scale:.3f} (one sigma) about the CAD"
         if bad.any():
             worst = float(cells.mean[int(np.argmax(np.abs(cells.mean)))])
-            told.append(
+            sentences.append(
                 f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells are out, by {worst:+.2f} at most."
             )
         else:
-            told.append(f"{name} is found; {where}, and all {len(bad)} cells are within {part.deviations.tolerance:g}.")
-    return " ".join(told)
+            sentences.append(
+                f"{name} is found; {where}, and all {len(bad)} cells are within {part.deviations.tolerance:g}."
+            )
+    return " ".join(sentences)
 
 
 def _tables(parts: list[Part]) -> list[Table]:
@@ -56,18 +58,22 @@ def _tables(parts: list[Part]) -> list[Table]:
     for i, part in enumerate(parts):
         sigma = part.fit.sigma
         place = (f"{x:.3f}" for x in part.fit.T_base_part[:3, 3])
-        poses.append((str(i + 1), *place, f"{sigma[3:].max():.4f}", f"{np.degrees(sigma[:3]).max():.5f}",
-                      f"{part.fit.rms:.3f}", f"{part.start.share:.0%}", f"{part.start.runner_up:.0%}"))  # fmt: skip
+        sizes = f"{sigma[3:].max():.4f}", f"{np.degrees(sigma[:3]).max():.5f}", f"{part.fit.rms:.3f}"
+        shares = f"{part.start.share:.0%}", f"{part.start.runner_up:.0%}"
+        poses.append((str(i + 1), *place, *sizes, *shares))
     header = ("part", "x", "y", "z", "σ", "σ (°)", "rms", "meets the CAD", "next best pose")
     tables = [Table("Where the parts lie", header, poses)]
     for i, part in enumerate(parts):
-        cells = part.deviations.cells
-        worst = np.argsort(-np.abs(cells.mean))[:_WORST]
-        rows = [(*(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]),
-                 "bad" if part.deviations.outside[k] else "good") for k in worst]  # fmt: skip
+        worst = np.argsort(-np.abs(part.deviations.cells.mean))[:_WORST]
+        rows = [_cell_row(part.deviations, k) for k in worst]
         title = "Worst cells" + (f" of part {i + 1}" if len(parts) > 1 else "")
         tables.append(Table(title, ("x", "y", "z", "deviation", "points", "verdict"), rows))
     return tables
+
+
+def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:
+    cells, verdict = found.cells, "bad" if found.outside[k] else "good"
+    return *(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]), verdict
 
 
 def deviation_map(found: Deviations) -> Figure:
@@ -78,8 +84,8 @@ def deviation_map(found: Deviations) -> Figure:
     ax = figure.subplots()
     pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
     order = pick[np.argsort(np.abs(found.distance[pick]))]
-    drawn = ax.scatter(found.points[order, i], found.points[order, j], c=found.distance[order], s=5, lw=0, cmap=SIGNED,
-                       vmin=-found.tolerance, vmax=found.tolerance)  # fmt: skip
+    colours = {"c": found.distance[order], "cmap": SIGNED, "vmin": -found.tolerance, "vmax": found.tolerance}
+    drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
     bad = found.cells.middle[found.outside]
     ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
     figure.colorbar(drawn, label="outside (+) or inside (−) the CAD", extend="both", shrink=0.8)
@@ -137,8 +143,6 @@ _LEGEND = (
 
 def _record_cad(recording: stage.Recording, name: str, job: FitJob, T: Array) -> None:
     mesh = job.cad.mesh
-    shown = rr.Mesh3D(
-        vertex_positions=np.float32(frames.transform(T, np.asarray(mesh.vertices))), triangle_indices=mesh.faces,
-        albedo_factor=[190, 190, 195, 120],
-    )  # fmt: skip
+    places = np.float32(frames.transform(T, np.asarray(mesh.vertices)))
+    shown = rr.Mesh3D(vertex_positions=places, triangle_indices=mesh.faces, albedo_factor=[190, 190, 195, 120])
     recording.log(stage.place(name), shown, static=True)

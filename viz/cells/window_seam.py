@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.window.reading import SeamJob
 from stitch.cells.window.seam import Limits, Seam, Station
+from stitch.cells.window.window_jobs import SeamJob
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -42,9 +42,9 @@ def write_page(job: SeamJob, seams: list[Seam], path: Path) -> None:
 def sentence(limits: Limits, seams: list[Seam]) -> str:
     """How many stations are good."""
     counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
-    told = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     return (
-        f"{len(seams)} stations: {told}. Allowed: flush {limits.flush:g} ± {limits.flush_tolerance:g} mm, gap "
+        f"{len(seams)} stations: {found}. Allowed: flush {limits.flush:g} ± {limits.flush_tolerance:g} mm, gap "
         f"{limits.gap:g} ± {limits.gap_tolerance:g} mm."
     )
 
@@ -144,8 +144,8 @@ def record(job: SeamJob, seams: list[Seam], path: Path) -> None:
                 edges = np.array([[edge[0], 0.0, edge[1]] for edge in (seam.inner, seam.outer)])
                 edges = frames.transform(T, edges)
                 stage.line(recording, f"stations/{seam.station}/gap", edges, colour, 0.8)
-                told = [f"{seam.verdict}: flush {seam.flush:+.2f}, gap {seam.gap:.2f}"]
-                stage.points(recording, f"stations/{seam.station}/verdict", edges[1:], [colour], 1.5, told)
+                label = [f"{seam.verdict}: flush {seam.flush:+.2f}, gap {seam.gap:.2f}"]
+                stage.points(recording, f"stations/{seam.station}/verdict", edges[1:], [colour], 1.5, label)
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

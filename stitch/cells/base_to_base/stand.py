@@ -64,9 +64,8 @@ def cylinder_covariance(joint1: Array, radius: Array, sigma: tuple[float, float,
 
 def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:
     """Rod cup (M, 3) in the stand frame (formulas 5 and 6 of the source, with the slide added)."""
-    return np.stack(
-        [slide - length * np.cos(angle), turn * length * np.sin(angle), np.zeros_like(slide)], axis=-1
-    )  # fmt: skip
+    across = turn * length * np.sin(angle)
+    return np.stack([slide - length * np.cos(angle), across, np.zeros_like(slide)], axis=-1)
 
 
 def level_stand(rail: Array, rail_slide: Array) -> Array:

@@ -1,7 +1,7 @@
 """The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
 
 On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
-seen at many places and heights, told by robot and rangers, shows them.
+seen at many places and heights, which robot and rangers measure, shows them.
 """
 
 from dataclasses import dataclass
@@ -86,14 +86,7 @@ def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
     Raises:
         NoResultError: too few holes, all at one height, or a plate height error asked for without a plate.
     """
-    if len(seen.xyz) < 8 or np.ptp(seen.xyz[:, 2]) < 1e-3 * np.ptp(seen.xyz[:, 0]):
-        raise NoResultError(
-            "a camera beyond its work plane needs eight or more holes at different heights; measure some"
-        )
-    if "plate_height" in effects and not (seen.on_plate.any() and np.unique(seen.xyz[~seen.on_plate, 2]).size > 1):
-        raise NoResultError(
-            "a plate height error shows only against a hole seen at several other heights; measure some"
-        )
+    _check_enough(seen, effects)
     centre = np.array(seen.image_size) / 2 - 0.5
     corner = float(np.linalg.norm(seen.image_size) / 2)
     # Normalised as the DLT wants it, for the refinement's conditioning too.
@@ -111,13 +104,30 @@ def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
 
     solution = least_squares(residuals, np.append(start, np.zeros(len(effects))), method="lm", x_scale="jac")
     P, named = camera(solution.x)
-    left = solution.fun.reshape(-1, 2)
     variance = solution.fun @ solution.fun / max(solution.fun.size - len(solution.x), 1)
     spread = np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)) * variance)[11:]
     return CameraFit(
-        P, float(named.get("k1", 0.0)), float(named.get("plate_height", 0.0)), centre, corner, effects, left,
-        dict(zip(effects, spread.tolist(), strict=True)),
-    )  # fmt: skip
+        P,
+        k1=float(named.get("k1", 0.0)),
+        plate_height=float(named.get("plate_height", 0.0)),
+        centre=centre,
+        corner=corner,
+        effects=effects,
+        residuals=solution.fun.reshape(-1, 2),
+        sigma=dict(zip(effects, spread.tolist(), strict=True)),
+    )
+
+
+def _check_enough(seen: Observations, effects: tuple[str, ...]) -> None:
+    """Refuse holes that leave the camera or an effect open."""
+    if len(seen.xyz) < 8 or np.ptp(seen.xyz[:, 2]) < 1e-3 * np.ptp(seen.xyz[:, 0]):
+        raise NoResultError(
+            "a camera beyond its work plane needs eight or more holes at different heights; measure some"
+        )
+    if "plate_height" in effects and not (seen.on_plate.any() and np.unique(seen.xyz[~seen.on_plate, 2]).size > 1):
+        raise NoResultError(
+            "a plate height error shows only against a hole seen at several other heights; measure some"
+        )
 
 
 def _dlt(xyz: Array, uv: Array, to_xyz: Array, to_uv: Array) -> Array:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stitch import frames
+from stitch.cells.point_alignment import align_points, on_a_line
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -30,10 +30,7 @@ def compensate(nominal: Array, actual: Array) -> Compensation:
         NoResultError: fewer than three holes, or holes on a line.
     """
     nominal, actual = np.asarray(nominal, float), np.asarray(actual, float)
-    a, b = nominal - nominal.mean(axis=0), actual - actual.mean(axis=0)
-    spreads = (np.linalg.svd(points, compute_uv=False) for points in (a, b))
-    if len(nominal) < 3 or any(spread[1] <= 1e-3 * spread[0] for spread in spreads):
+    if len(nominal) < 3 or on_a_line(nominal) or on_a_line(actual):
         raise NoResultError("a group needs three or more reference holes off one line; add a reference hole")
-    R = Rotation.align_vectors(b, a)[0].as_matrix()
-    T = frames.make(R, actual.mean(axis=0) - R @ nominal.mean(axis=0))
+    T = align_points(nominal, actual)
     return Compensation(T, actual - frames.transform(T, nominal), actual - nominal)

@@ -31,10 +31,12 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     h = vectors[8]
     # In normalised coordinates the plane's centre maps near the image's, so the last entry is far from zero.
     start = h[:8] / h[8]
-    refined = least_squares(
-        lambda x: (_apply(np.asarray(np.append(x, 1.0).reshape(3, 3)), p) - q).ravel(), start, method="lm"
-    ).x  # fmt: skip
-    H = np.linalg.inv(to_uv) @ np.append(refined, 1.0).reshape(3, 3) @ to_xy
+
+    def matrix_of(x: Array) -> Array:
+        return np.asarray(np.append(x, 1.0).reshape(3, 3))
+
+    refined = least_squares(lambda x: (_apply(matrix_of(x), p) - q).ravel(), start, method="lm").x
+    H = np.linalg.inv(to_uv) @ matrix_of(refined) @ to_xy
     return np.asarray(H / H[2, 2])
 
 

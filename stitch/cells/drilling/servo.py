@@ -85,7 +85,7 @@ def place(measure: Measure, seeing: Seeing, T_base_tool: Array) -> Placed:
     """Tilt, then height, then camera offset, and again until all three are below their thresholds.
 
     Raises:
-        NoResultError: the loop does not settle.
+        NoResultError: the loop does not converge.
     """
     limits = seeing.thresholds
     for step in range(_MOST_STEPS):
@@ -101,6 +101,6 @@ def place(measure: Measure, seeing: Seeing, T_base_tool: Array) -> Placed:
         else:
             return Placed(T_base_tool, sight, step)
     raise NoResultError(
-        f"the tool did not settle on the hole in {_MOST_STEPS} steps: tilt {np.degrees(sight.tilt):.2f}°, height "
+        f"the tool did not converge on the hole in {_MOST_STEPS} steps: tilt {np.degrees(sight.tilt):.2f}°, height "
         f"{dh:+.2f}, offset {np.hypot(x, y):.2f}; calibrate rangers and camera again"
     )

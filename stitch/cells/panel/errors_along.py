@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.panel.global_model import RobotModel
-from stitch.cells.panel.motion import follow
+from stitch.cells.panel.panel_motion import follow
 from stitch.frames import Array
 
 
@@ -25,9 +25,8 @@ class ErrorsAlong:
 
 
 def along(
-    models: Sequence[RobotModel], T_base_flange: Array, master: int, steps: Array, turn: bool,
-    draws: int = 200, seed: int = 0,
-) -> ErrorsAlong:  # fmt: skip
+    models: Sequence[RobotModel], T_base_flange: Array, master: int, steps: Array, *, turn: bool, draws: int = 200
+) -> ErrorsAlong:
     """Rms change of the relative pose of each slave's contact frame, per axis and step.
 
     The true cell is drawn about the model from each robot's covariance; commands come from the model alone.
@@ -37,7 +36,7 @@ def along(
         steps: (D,) distances in mm, or angles in rad if `turn`; a turn is about the master's flange.
     """
     T_world_base = _stack(models)[0]
-    true_base, true_contact = _draws(models, draws, seed)
+    true_base, true_contact = _draws(models, draws)
 
     def relative(flanges: Array) -> Array:
         contact = true_base @ flanges @ true_contact
@@ -68,9 +67,9 @@ def _stack(models: Sequence[RobotModel]) -> tuple[Array, Array]:
     return np.array([m.T_world_base for m in models]), np.array([m.T_flange_contact for m in models])
 
 
-def _draws(models: Sequence[RobotModel], draws: int, seed: int) -> tuple[Array, Array]:
+def _draws(models: Sequence[RobotModel], draws: int) -> tuple[Array, Array]:
     """True bases and clamps (draws, N, 4, 4) that the covariances allow."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)
     bases, clamps = _stack(models)
     return bases @ frames.exp(xi[..., :6]), clamps @ frames.exp(xi[..., 6:])

@@ -53,7 +53,7 @@ class RobotModel:
         return float(chi2.sf(self.chi_square, self.redundancy))
 
 
-def start(readings: Readings) -> tuple[Array, Array]:
+def initial_guess(readings: Readings) -> tuple[Array, Array]:
     """T_world_base and T_flange_contact in closed form: AX = XB over motions from the first pose, then the base.
 
     Raises:
@@ -82,7 +82,7 @@ def calibrate(readings: Readings) -> RobotModel:
     Raises:
         NoResultError: too few poses, or motions about one axis only.
     """
-    T_base, _T_contact = start(readings)
+    T_base, _T_contact = initial_guess(readings)
     inside = frames.inverse(T_base @ readings.T_base_flange)
     points = frames.transform(inside, readings.reflectors).mean(axis=0)
 
@@ -98,9 +98,15 @@ def calibrate(readings: Readings) -> RobotModel:
     to_twists[:6, :6] = np.eye(6)
     to_twists[6:, 6:] = _contact_jacobian(reflectors)
     return RobotModel(
-        readings.name, T_base @ frames.exp(solution.x[:6]), contact_frame(reflectors), reflectors,
-        to_twists @ spread @ to_twists.T, solution.jac, solution.fun, solution.fun.size - 15,
-    )  # fmt: skip
+        name=readings.name,
+        T_world_base=T_base @ frames.exp(solution.x[:6]),
+        T_flange_contact=contact_frame(reflectors),
+        reflectors=reflectors,
+        covariance=to_twists @ spread @ to_twists.T,
+        jacobian=solution.jac,
+        residuals=solution.fun,
+        redundancy=solution.fun.size - 15,
+    )
 
 
 def _contact_jacobian(points: Array) -> Array:

@@ -39,11 +39,11 @@ class LegOffset:
     leg: int  # from 1
     offset: float  # mm, real length minus the one the controller believes
     sigma: float
-    gain: float  # drop of chi-square; chi-square with one degree if there is no offset
+    chi_square_drop: float  # chi-square with one degree of freedom if there is no offset
     runner_up: int  # the leg that explains the data next best
-    runner_up_gain: float
+    runner_up_drop: float
     found: bool  # beyond chance
-    p_after: float  # chance of the misfit that is left with the offset taken out
+    p_after: float  # chance of so large a chi-square with the offset taken out
 
 
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
@@ -82,14 +82,19 @@ def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: in
     free = columns - Q @ (Q.T @ columns)
     power = np.maximum((free**2).sum(axis=0), _SWALLOWED * (columns**2).sum(axis=0))
     offsets = -(free.T @ model.residuals) / power
-    gains = offsets**2 * power
-    best, second = np.argsort(gains)[::-1][:2]
-    left = model.chi_square - gains[best]
+    drops = offsets**2 * power
+    best, second = np.argsort(drops)[::-1][:2]
     return LegOffset(
-        model.name, int(best) + 1, float(offsets[best]), float(1 / np.sqrt(power[best])), float(gains[best]),
-        int(second) + 1, float(gains[second]), bool(chi2.sf(gains[best], 1) * tests < _FALSE_ALARM),
-        float(chi2.sf(left, model.redundancy - 1)),
-    )  # fmt: skip
+        robot=model.name,
+        leg=int(best) + 1,
+        offset=float(offsets[best]),
+        sigma=float(1 / np.sqrt(power[best])),
+        chi_square_drop=float(drops[best]),
+        runner_up=int(second) + 1,
+        runner_up_drop=float(drops[second]),
+        found=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
+        p_after=float(chi2.sf(model.chi_square - drops[best], model.redundancy - 1)),
+    )
 
 
 def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, float]]) -> Array:
@@ -112,6 +117,6 @@ def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
     if len(loose):
         x, y, z = T_base_flange[loose[0], :3, 3]
         raise NoResultError(
-            f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; mend that pose, or the joints in [legs]"
+            f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; correct that pose, or the joints in [legs]"
         )
     return np.asarray(np.linalg.inv(lengths))

@@ -3,19 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stitch import frames
+from stitch.cells.point_alignment import align_points, on_a_line
 from stitch.errors import NoResultError
 from stitch.frames import Array
-
-# Points that lie within this share of their extent of one line leave the turn about it open.
-_FLAT = 1e-3
 
 
 @dataclass(frozen=True)
 class RigidFit:
-    """T_to_from and what is left of every point."""
+    """T_to_from and the residual of every point."""
 
     T: Array  # (4, 4)
     covariance: Array  # (6, 6) of the twist ξ in T·exp(ξ), rotation first, about the points' centroid
@@ -34,12 +31,10 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
     nominal, measured = np.asarray(nominal, float), np.asarray(measured, float)
     if len(nominal) < 3:
         raise NoResultError(f"{len(nominal)} points fix no pose; measure at least three that are not on a line")
-    c_nominal, c_measured = nominal.mean(axis=0), measured.mean(axis=0)
-    spread = np.linalg.svd(nominal - c_nominal, compute_uv=False)
-    if spread[1] < _FLAT * max(spread[0], 1e-12):
+    if on_a_line(nominal):
         raise NoResultError("all points lie on one line: the turn about it is open; measure a point off the line")
-    R = Rotation.align_vectors(measured - c_measured, nominal - c_nominal)[0].as_matrix()
-    T = frames.make(R, c_measured - R @ c_nominal)
-    design = np.concatenate([-frames.skew(nominal - c_nominal), np.tile(np.eye(3), (len(nominal), 1, 1))], axis=-1)
+    T = align_points(nominal, measured)
+    arms = nominal - nominal.mean(axis=0)
+    design = np.concatenate([-frames.skew(arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=-1)
     gain = np.linalg.pinv(design.reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
     return RigidFit(T, gain @ gain.T, measured - frames.transform(T, nominal))

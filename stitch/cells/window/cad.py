@@ -70,9 +70,17 @@ def surface(mesh: Any) -> Surface:
     count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
-    tree = KDTree(np.hstack([samples, reach * normals]))
-    spacing = float(np.sqrt(mesh.area / count))
-    return Surface(mesh, scene, centre, size, spacing, np.asarray(samples), normals, tree, reach)
+    return Surface(
+        mesh,
+        scene,
+        centre,
+        size=size,
+        spacing=float(np.sqrt(mesh.area / count)),
+        samples=np.asarray(samples),
+        normals=normals,
+        tree=KDTree(np.hstack([samples, reach * normals])),
+        reach=reach,
+    )
 
 
 def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:

@@ -3,22 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from stitch.cells.window.biweight import MAD, TUKEY, biweight
 from stitch.cells.window.cad import Nearest
 from stitch.frames import Array
 
-_TUKEY, _MAD = 4.685, 1.4826
 # Cells with fewer points have no mean worth judging; their points keep their own weights.
 _FEWEST = 5
-
-
-def biweight(u: Array) -> Array:
-    """Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
-    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
-
-
-def biweight_slope(u: Array) -> Array:
-    """Change of weight · u with u: what the normal matrix of a robust fit's covariance takes (Huber & Ronchetti)."""
-    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))
 
 
 def cell_weights(points: Array, found: Nearest, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
@@ -36,6 +26,6 @@ def cell_weights(points: Array, found: Nearest, used: NDArray[np.bool_], cell: f
     if not full.any():
         return np.ones(len(points))
     floor = scale / np.sqrt(np.median(count[full]))
-    spread = max(_MAD * float(np.median(np.abs(mean[full]))), float(floor))
-    weight = np.where(full, biweight(mean / (_TUKEY * spread)), 1.0)
+    spread = max(MAD * float(np.median(np.abs(mean[full]))), float(floor))
+    weight = np.where(full, biweight(mean / (TUKEY * spread)), 1.0)
     return np.asarray(weight[where])

@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 from stitch import frames
 from stitch.cells.pose_table import write_columns
 from stitch.cells.window.cad import Surface, nearest
-from stitch.cells.window.scans import Joined
+from stitch.cells.window.joined_scans import Joined
 from stitch.frames import Array
 
 # A cell with fewer points has no mean worth a verdict.
@@ -79,10 +79,8 @@ def write_ply(file: Path, found: Deviations) -> None:
 
 def write_csv(file: Path, found: Deviations) -> None:
     """One row per cell, the worst first."""
-    order = np.argsort(-np.abs(found.cells.mean))
-    c = found.cells
-    write_columns(file, {
-        "x": c.middle[order, 0], "y": c.middle[order, 1], "z": c.middle[order, 2], "deviation": c.mean[order],
-        "spread": c.spread[order], "points": c.count[order].tolist(),
-        "verdict": ["bad" if bad else "good" for bad in found.outside[order]],
-    })  # fmt: skip
+    c, order = found.cells, np.argsort(-np.abs(found.cells.mean))
+    columns = {axis: c.middle[order, k] for k, axis in enumerate("xyz")}
+    columns |= {"deviation": c.mean[order], "spread": c.spread[order]}
+    verdicts = ["bad" if bad else "good" for bad in found.outside[order]]
+    write_columns(file, {**columns, "points": c.count[order].tolist(), "verdict": verdicts})

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.cells.window.cell_weights import biweight, biweight_slope
+from stitch.cells.window.biweight import MAD, TUKEY, biweight, biweight_slope
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
 # Fewer points of a surface or flank fix no edge to a twentieth of a millimetre.
 _FEWEST = 25
-_TUKEY, _MAD = 4.685, 1.4826
 # Edge of the cubes whose points share what the model leaves, mm.
 _CUBE = 3.0
 # Points further from the edge than this say nothing about it that the surface's bend does not blur, mm.
@@ -83,13 +82,13 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array]:
     for _ in range(20):
         root = np.sqrt(weight)
         found = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        left = values - design @ found
-        scale = max(_MAD * float(np.median(np.abs(left))), 1e-9)
-        weight = biweight(left / (_TUKEY * scale))
-    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, biweight_slope(left / (_TUKEY * scale)), design))
+        residual = values - design @ found
+        scale = max(MAD * float(np.median(np.abs(residual))), 1e-9)
+        weight = biweight(residual / (TUKEY * scale))
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, biweight_slope(residual / (TUKEY * scale)), design))
     _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
     scores = np.zeros((cube.max() + 1, design.shape[1]))
-    np.add.at(scores, cube.ravel(), design * (weight * left)[:, None])
+    np.add.at(scores, cube.ravel(), design * (weight * residual)[:, None])
     cubes, unknowns = scores.shape
     few = cubes / max(cubes - unknowns, 1)
     return np.asarray(found), np.asarray(few * inverse @ scores.T @ scores @ inverse)

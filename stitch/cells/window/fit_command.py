@@ -9,9 +9,9 @@ import typer
 from rich.console import Console
 
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
-from stitch.cells.session_folder import write_sessions
-from stitch.cells.window import fit_parts, handover, read_fit_job
-from stitch.cells.window.job import Part, fit_document, write_fit
+from stitch.cells.window import fit_parts, read_fit_job, scan_session
+from stitch.cells.window.window_solution import Part, fit_document, write_fit
+from stitch.writing.session_files import write_session
 
 
 def fit(
@@ -27,7 +27,7 @@ def fit(
     parts = fit_parts(job)
     written = write_fit(job, parts, output) if output is not None else []
     if session is not None:
-        write_sessions(session, [handover.session(file.stem, job.placed, job.cad_file)])
+        write_session(session, scan_session.session(file.stem, job.placed, job.cad_file))
     show("fit", recording, report, job, parts)
     if as_json:
         print(json.dumps(fit_document(job, parts), indent=1))

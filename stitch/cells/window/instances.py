@@ -3,7 +3,7 @@
 import numpy as np
 
 from stitch.cells.window.cad import Surface
-from stitch.cells.window.scans import Joined
+from stitch.cells.window.joined_scans import Joined
 from stitch.errors import NoResultError
 from stitch.system.native import load_open3d
 
@@ -31,6 +31,6 @@ def split(scan: Joined, cad: Surface, wanted: int) -> list[Joined]:
     big = [heap for heap in heaps if scan.area[heap].sum() > _LEAST * cad.mesh.area / 2]
     if len(big) < wanted:
         raise NoResultError(
-            f"{len(big)} separate parts in the scan, {wanted} wanted; scan the others, or mend `instances`"
+            f"{len(big)} separate parts in the scan, {wanted} wanted; scan the others, or correct `instances`"
         )
     return [scan.take(heap) for heap in sorted(big, key=lambda heap: -scan.area[heap].sum())[:wanted]]

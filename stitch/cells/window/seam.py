@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.window.edge import Edge, find_edge
-from stitch.cells.window.scans import Joined
+from stitch.cells.window.joined_scans import Joined
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -48,11 +48,11 @@ class Seam:
     """One station measured, mm; NaN and a reason where it could not be."""
 
     station: str
-    flush: float  # inner part above (+) or below (−) the outer one
-    gap: float  # between the edges, along `across`
-    sigma_flush: float
-    sigma_gap: float
-    verdict: str  # "good", "bad", "open" or "not measured"
+    flush: float = np.nan  # inner part above (+) or below (−) the outer one
+    gap: float = np.nan  # between the edges, along `across`
+    sigma_flush: float = np.nan
+    sigma_gap: float = np.nan
+    verdict: str = "not measured"  # or "good", "bad", "open"
     reason: str = ""
     inner: tuple[float, float] | None = None  # its edge: across and outwards in the station's frame
     outer: tuple[float, float] | None = None
@@ -82,7 +82,7 @@ def _measure(scan: Joined, T_base_part: Array, station: Station, limits: Limits,
         inner = _side(points, normals, -1.0, "inner part")
         outer = _side(points, normals, 1.0, "outer part")
     except NoResultError as error:
-        return Seam(station.name, np.nan, np.nan, np.nan, np.nan, "not measured", str(error))
+        return Seam(station.name, reason=str(error))
     gap, flush = outer.across - inner.across, inner.height - outer.height
     variance = np.diag(inner.covariance) + np.diag(outer.covariance) + pose_sigma**2
     sigma_gap, sigma_flush = np.sqrt(variance)
@@ -90,21 +90,29 @@ def _measure(scan: Joined, T_base_part: Array, station: Station, limits: Limits,
         (abs(flush - limits.flush) - limits.flush_tolerance, sigma_flush),
         (abs(gap - limits.gap) - limits.gap_tolerance, sigma_gap),
     )
-    edges = [(edge.across, edge.height) for edge in (inner, outer)]
-    return Seam(station.name, flush, gap, float(sigma_flush), float(sigma_gap), verdict, "", *edges)
+    return Seam(
+        station.name,
+        flush,
+        gap,
+        sigma_flush=float(sigma_flush),
+        sigma_gap=float(sigma_gap),
+        verdict=verdict,
+        inner=(inner.across, inner.height),
+        outer=(outer.across, outer.height),
+    )
 
 
 def _side(points: Array, normals: Array, side: float, name: str) -> Edge:
     """The edge on one side of the gap's middle: the inner part lies on its negative side, its flank looks to +."""
-    own = side * points[:, 0] > 0
+    here = side * points[:, 0] > 0
     try:
-        return find_edge(points[own], normals[own], -side)
+        return find_edge(points[here], normals[here], -side)
     except NoResultError as error:
         raise NoResultError(f"{name}: {error}") from None
 
 
-def _verdict(*beyond: tuple[float, float]) -> str:
-    """Good if everything is within by two sigmas, bad if anything is beyond by two; else nobody can say."""
-    if any(excess > 2 * sigma for excess, sigma in beyond):
+def _verdict(*checks: tuple[float, float]) -> str:
+    """Good if every excess over a tolerance is below zero by two sigmas, bad if any is above by two; else open."""
+    if any(excess > 2 * sigma for excess, sigma in checks):
         return "bad"
-    return "good" if all(excess < -2 * sigma for excess, sigma in beyond) else "open"
+    return "good" if all(excess < -2 * sigma for excess, sigma in checks) else "open"

@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
-from stitch.cells.session_folder import write_sessions
-from stitch.cells.window import handover, read_seam_job, solve_seam
-from stitch.cells.window.job import write_seam
+from stitch.cells.window import read_seam_job, scan_session, solve_seam
 from stitch.cells.window.seam import Limits, Seam
+from stitch.cells.window.window_solution import write_seam
+from stitch.writing.session_files import write_session
 
 
 def seam(
@@ -31,7 +31,7 @@ def seam(
     if output is not None:
         write_seam(seams, output)
     if session is not None:
-        write_sessions(session, [handover.session(file.stem, job.placed)])
+        write_session(session, scan_session.session(file.stem, job.placed))
     show("seam", recording, report, job, seams)
     if as_json:
         rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]

@@ -1,0 +1,69 @@
+"""`stitch base FILE`: where the second robot stands as seen from the first."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import frames
+from stitch.cells.base_to_base import BaseResult, read_stand, rod_session, solve
+from stitch.cells.base_to_base.stand_solution import describe, document
+from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.errors import NoResultError
+from stitch.writing.session_files import write_session
+
+
+def base(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings of the stand, TOML.")],
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+) -> None:
+    """Find the transform between two robot bases from a stand with a measuring rod."""
+    stand = read_stand(file)
+    try:
+        result = solve(stand)
+    except NoResultError:
+        # The page shows which readings contradict each other.
+        show("base", None, report, stand, None)
+        raise
+    if session is not None:
+        write_session(session, rod_session.session(stand, result))
+    show("base", recording, report, stand, result)
+    if as_json:
+        print(json.dumps(document(result), indent=1))
+    else:
+        _print(result)
+
+
+def _print(result: BaseResult) -> None:
+    console = Console(stderr=True)
+    unit, solution = result.length_unit, result.fit
+    table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
+    for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
+        table.add_column(heading)
+    table.add_row("least squares", *_pose(solution.T_base1_base2))
+    table.add_row("  sigma", _numbers(solution.sigma[3:], 5), _numbers(solution.sigma[:3], 6))
+    if result.projection is not None:
+        table.add_row("projection", *_pose(result.projection.T_base1_base2))
+    console.print(table)
+    console.print(f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings.")
+    for comparison in result.comparisons:
+        console.print(describe(comparison, unit) + ".")
+    if result.no_projection:
+        console.print(f"No projection: {result.no_projection}.")
+    for row in solution.T_base1_base2:
+        print(" ".join(f"{value:.9g}" for value in row))
+
+
+def _pose(T: np.ndarray) -> tuple[str, str]:
+    return _numbers(T[:3, 3], 5), _numbers(frames.log(T)[:3], 6)
+
+
+def _numbers(values: np.ndarray, digits: int) -> str:
+    return "  ".join(f"{value:.{digits}f}" for value in values)

@@ -1,0 +1,165 @@
+"""Where the part lies, without a guess: principal axes and features give candidates, the surface decides."""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from stitch import frames
+from stitch.cells.window.cad import Surface, sample_partners
+from stitch.cells.window.cad_fit import moved_about
+from stitch.cells.window.joined_scans import Joined
+from stitch.errors import NoResultError
+from stitch.frames import Array, Indices
+from stitch.system.native import load_open3d
+
+_FEWEST = 50
+_POINTS = 1500  # of the scan that judge a candidate
+_KEEP = 6  # candidates that are refined
+_REFINE = 20  # steps of a candidate's refinement
+_FEATURE_RUNS = 3
+# A start of which less than a third of the scan meets the CAD is none.
+_LEAST_SHARE = 1 / 3
+# A pose that so much of the scan agrees with needs no second opinion.
+_CERTAIN = 0.95
+
+
+@dataclass(frozen=True)
+class Start:
+    """A coarse pose and how well it stands against the next best different one."""
+
+    T_base_part: Array  # (4, 4)
+    share: float  # of the scan's points that meet the CAD
+    runner_up: float  # the same of the best pose elsewhere; close to `share` means a symmetric part
+
+
+def find_start(scan: Joined, cad: Surface) -> Start:
+    """Try the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets; refine.
+
+    Features are FPFH with RANSAC (Rusu et al. 2009, through Open3D): they serve where the scan shows only a piece of
+    the part, principal axes where it is too smooth for features.
+
+    Raises:
+        NoResultError: no candidate brings a third of the scan onto the CAD.
+    """
+    if scan.usable.sum() < _FEWEST:
+        raise NoResultError(f"{scan.usable.sum()} usable points in the scan; the rest are edges or seen too flat")
+    index = _spread(scan)
+    points, normals = scan.points[index], scan.normals[index]
+    gate, fine = cad.size / 25, cad.size / 250
+    ranked = sorted(_by_axes(points, cad), key=lambda T: -_share(T, points, normals, cad, gate))
+    refined = [_refine(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
+    shares = [_share(T, points, normals, cad, fine) for T in refined]
+    if max(shares) < _CERTAIN:
+        refined += [_refine(T, points, normals, cad, gate) for T in _by_features(points, normals, cad)]
+        shares = [_share(T, points, normals, cad, fine) for T in refined]
+    best = int(np.argmax(shares))
+    elsewhere = [s for T, s in zip(refined, shares, strict=True) if _apart(T, refined[best], cad) > cad.size / 50]
+    if shares[best] < _LEAST_SHARE:
+        raise NoResultError(
+            f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; check the CAD's unit, or cut away "
+            "what is not the part"
+        )
+    return Start(refined[best], shares[best], max(elsewhere, default=0.0))
+
+
+def _spread(scan: Joined) -> Indices:
+    """Indices of points evenly over the surface: one per voxel, then evenly thinned."""
+    usable = np.flatnonzero(scan.usable)
+    size = np.ptp(scan.points[usable], axis=0).max() / 70
+    _, first = np.unique(np.floor(scan.points[usable] / size).astype(int), axis=0, return_index=True)
+    kept = usable[np.sort(first)]
+    if len(kept) < _FEWEST:
+        raise NoResultError(
+            f"the scans reach over {70 * size:.3g}, mostly empty; correct a scanner's pose, or cut them"
+        )
+    picked: Indices = kept[np.linspace(0, len(kept) - 1, min(_POINTS, len(kept))).astype(int)]
+    return picked
+
+
+def _by_axes(points: Array, cad: Surface) -> list[Array]:
+    """The 24 turns that lay the scan's principal axes onto the CAD's."""
+    clouds = (points, cad.samples[::20])
+    scan_axes, cad_axes = (np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in clouds)
+    turns = [np.eye(3)[list(p)] * signs for p in permutations(range(3)) for signs in product((1, -1), repeat=3)]
+    found = []
+    for turn in turns:
+        R = scan_axes.T @ turn @ cad_axes
+        if np.linalg.det(R) > 0:
+            found.append(frames.make(R, points.mean(axis=0) - R @ cad.samples.mean(axis=0)))
+    return found
+
+
+def _by_features(points: Array, normals: Array, cad: Surface) -> list[Array]:
+    o3d = load_open3d()
+    size = cad.size / 60
+    step = max(1, len(cad.samples) // 6000)
+
+    def cloud(p: Array, n: Array):  # type: ignore[no-untyped-def]
+        made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
+        made.normals = o3d.utility.Vector3dVector(n)
+        search = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * size, max_nn=100)
+        return made, o3d.pipelines.registration.compute_fpfh_feature(made, search)
+
+    scan_points, scan_features = cloud(points, normals)
+    cad_points, cad_features = cloud(cad.samples[::step], cad.normals[::step])
+    registration = o3d.pipelines.registration
+    checks = [
+        registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+        registration.CorrespondenceCheckerBasedOnDistance(1.5 * size),
+    ]
+    found = []
+    for run in range(_FEATURE_RUNS):
+        o3d.utility.random.seed(run)
+        result = registration.registration_ransac_based_on_feature_matching(
+            scan_points,
+            cad_points,
+            scan_features,
+            cad_features,
+            mutual_filter=True,
+            max_correspondence_distance=1.5 * size,
+            estimation_method=registration.TransformationEstimationPointToPoint(False),
+            ransac_n=3,
+            checkers=checks,
+            criteria=registration.RANSACConvergenceCriteria(50_000, 0.999),
+        )
+        found.append(frames.inverse(np.array(result.transformation)))
+    return found
+
+
+def _partners(T_base_part: Array, points: Array, normals: Array, cad: Surface) -> tuple[Array, Array, Array]:
+    """Points in the part frame, their samples and the samples' normals."""
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, points)
+    index = sample_partners(cad, local, frames.rotate(T, normals))
+    return local, cad.samples[index], cad.normals[index]
+
+
+def _share(T_base_part: Array, points: Array, normals: Array, cad: Surface, gate: float) -> float:
+    local, samples, directions = _partners(T_base_part, points, normals, cad)
+    seen = frames.rotate(frames.inverse(T_base_part), normals)
+    same = np.einsum("ij,ij->i", seen, directions) > 0.8
+    return float(np.mean(same & (np.linalg.norm(local - samples, axis=1) < gate)))
+
+
+def _refine(T_base_part: Array, points: Array, normals: Array, cad: Surface, gate: float) -> Array:
+    """Point-to-plane steps with a gate that closes to a tenth."""
+    for width in gate * np.geomspace(4.0, 0.1, _REFINE):
+        local, samples, directions = _partners(T_base_part, points, normals, cad)
+        off = local - samples
+        near = np.linalg.norm(off, axis=1) < max(width, 3 * cad.spacing)
+        if near.sum() < 12:
+            break
+        residual = np.einsum("ij,ij->i", off[near], directions[near])
+        arm = local[near] - cad.centre
+        design = np.hstack([np.cross(arm, directions[near]) / cad.size, directions[near]])
+        # Directions that the surface leaves open must not run away: a weak pull to stay.
+        step = np.linalg.solve(design.T @ design + 1e-4 * near.sum() * np.eye(6), -design.T @ residual)
+        step[:3] /= cad.size
+        T_base_part = moved_about(T_base_part, step, cad.centre)
+    return T_base_part
+
+
+def _apart(T_a: Array, T_b: Array, cad: Surface) -> float:
+    corners = cad.samples[:: max(1, len(cad.samples) // 200)]
+    return float(np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1).max())

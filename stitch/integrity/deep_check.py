@@ -1,0 +1,90 @@
+"""`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
+
+
+from stitch.frames import Array
+from stitch.integrity.conventions import Explained, explained, verdict
+from stitch.integrity.linkage import only
+from stitch.integrity.pairing import explain
+from stitch.integrity.problems import Problem
+from stitch.integrity.relative_scans import relative_scans
+from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.targets import check_targets
+from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.thinning import thinned
+from stitch.stages.coarse import coarse
+from stitch.stages.correct import close_in
+from stitch.units import METRES
+
+# Enough points a view to judge millimetres.
+_POINTS = 8000
+# No arm scatters by more.
+ROTATION, TRANSLATION_M = 0.010, 0.005
+# A hand-eye from the scans' own motions starts within this share of the part's size; one that is stated may be off more.
+_GATE, _STATED_GATE = 0.15, 0.35
+_CLOSES = 0.5
+
+
+def deep_check(session: Session) -> list[Problem]:
+    """What is wrong with a session; empty if nothing is found.
+
+    Raises:
+        NoResultError: the views do not overlap under any hand-eye, and no mistake explains it.
+    """
+    if not session.has_clouds:
+        return check_targets(session)
+    session, capture = thinned(session, _POINTS)
+    found = explained(session, relative_scans(capture))
+    named = verdict(found)
+    if named and named[0].hypothesis.kind != "exchanged":
+        return [_convention(session, named)]
+    T_mount, snooped = examined(session, capture, found)
+    problems = explain(session, capture, T_mount, snooped)
+    if contradicts(session, snooped) and not any(p.kind == "disconnected" for p in problems):
+        if named:
+            return [_convention(session, named)]
+        problems.append(_unexplained(session, snooped))
+    return problems
+
+
+def examined(session: Session, capture: Capture, found: list[Explained]) -> tuple[Array, Snooping]:
+    """The hand-eye that these poses allow, and what snooping says under it."""
+    stated = next((e for e in found if e.hypothesis.kind == "stated" and e.scale == 1.0), None)
+    size = part_size([capture])
+    if stated is not None and stated.closed >= _CLOSES:
+        start, gate = stated.T_mount, _GATE * size
+    elif session.scanner.T_mount is not None:
+        start, gate = session.scanner.T_mount, _STATED_GATE * size
+    else:
+        begun = coarse([capture])
+        start, gate = begun.T_mount, begun.gate
+    T_mount, overlaps, _ = close_in([capture], start, [gate])
+    freed = free_poses(capture, capture.poses(T_mount), overlaps[0].gate)
+    return T_mount, snoop(capture, T_mount, overlaps[0].gate, freed)
+
+
+def contradicts(session: Session, found: Snooping) -> bool:
+    """True if the poses contradict the scans beyond what any arm does."""
+    lost = len(found.left_out) > len(session.views) / 2
+    return lost or found.rotation > ROTATION or found.translation > TRANSLATION_M / METRES[session.length_unit]
+
+
+def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
+    """One problem from hypotheses that explain the motions equally well."""
+    best = named[0].hypothesis
+    fixes = list(dict.fromkeys(e.hypothesis.fix for e in named))
+    fix = fixes[0] + (f"; as likely: {'; '.join(fixes[1:3])}" if len(fixes) > 1 else "")
+    names = [view.name for view in session.views]
+    return Problem(best.kind, tuple(only(best.rows, names)), fix)
+
+
+def _unexplained(session: Session, found: Snooping) -> Problem:
+    off = f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+    fix = (
+        f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and clouds "
+        "belong together and how the poses were converted"
+    )
+    return Problem("displaced", tuple(view.name for view in session.views), fix)
+
+

@@ -1,0 +1,168 @@
+"""What views that do not belong say about their rows: exchanged, a neighbour's joints, a copy, a wrong digit, another part."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.integrity.linkage import only
+from stitch.integrity.placing import surface_of
+from stitch.integrity.problems import Problem
+from stitch.integrity.scan_faults import copies, same_poses, scan_fault
+from stitch.integrity.snooping import Misplaced, Snooping
+from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.robot import forward
+from stitch.measurement.session import Session
+
+# A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
+# (share of the part's size).
+_CLOSER, _CLOSE_SHARE = 0.2, 0.03
+# One joint explains a displacement if it leaves less than this share of it.
+_ONE_JOINT = 0.1
+_COPY = "this scan is a copy of that of {}: put the right file in its row"
+
+
+def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping) -> list[Problem]:
+    """One problem for everything that snooping found, with the rows and what to do.
+
+    Args:
+        session, capture: with the same views.
+        T_mount: (4, 4) hand-eye under which `found` was made.
+    """
+    names = [view.name for view in session.views]
+    poses = capture.poses(T_mount)
+    out, told = [], set[int]()
+    for v, w in copies(capture):
+        bad = _worse(found, v, w)
+        told.add(bad)
+        good = v if bad == w else w
+        out.append(Problem("duplicate_scan", (names[v], names[w]), _COPY.format(names[good])))
+    misplaced = [m for m in found.misplaced if m.view not in told]
+    rows = {m.view: _row_of(capture, poses, m) for m in misplaced if m.T is not None}
+    cycles = _cycles(rows)
+    for cycle in cycles:
+        told |= set(cycle)
+        out.append(Problem("exchanged", tuple(only(cycle, names)), _exchange(cycle, rows, names)))
+    same = same_poses(capture)
+    for m in misplaced:
+        if m.view not in told:
+            out.append(_single(session, capture, T_mount, found, m, same))
+    if found.block is not None:
+        out.append(_reclamped(found, names))
+    if len(found.disconnected) > 1:
+        shown = " | ".join(", ".join(only(group, names)) for group in found.disconnected)
+        views = tuple(n for group in found.disconnected[1:] for n in only(group, names))
+        out.append(Problem("disconnected", views, f"no surface links {shown}: add views between them"))
+    return out
+
+
+def _worse(found: Snooping, v: int, w: int) -> int:
+    """Of two views with the same scan, the one that does not belong."""
+    return v if v in found.left_out and w not in found.left_out else w
+
+
+def _row_of(capture: Capture, poses: Array, m: Misplaced) -> int | None:
+    """The row to whose pose a misplaced scan belongs, if to another one."""
+    assert m.T is not None
+    points = capture.scans[m.view].points[::50]
+    there = frames.transform(m.T, points)
+    off = np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1))
+    best = int(np.argmin(off))
+    close = off[best] < max(_CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER * off[m.view]
+    return best if close and best != m.view else None
+
+
+def _cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
+    """Closed rounds of scans that stand in each other's rows."""
+    out, seen = [], set[int]()
+    for start in sorted(rows):
+        path, at = [start], rows[start]
+        while at is not None and at not in path and at not in seen:
+            path.append(at)
+            at = rows.get(at)
+        if at == start and len(path) > 1:
+            out.append(tuple(path))
+            seen |= set(path)
+    return out
+
+
+def _exchange(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
+    if len(cycle) == 2:
+        return f"exchange the clouds of {names[cycle[0]]} and {names[cycle[1]]} in views.csv"
+    moves = ", ".join(f"the cloud of {names[v]} to row {names[int(rows[v] or 0)]}" for v in cycle)
+    return f"the clouds of {len(cycle)} rows are mixed up: move {moves}"
+
+
+def _single(
+    session: Session, capture: Capture, T_mount: Array, found: Snooping, m: Misplaced, same: Sequence[tuple[int, int]]
+) -> Problem:  # fmt: skip
+    names = [view.name for view in session.views]
+    own = (names[m.view],)
+    if m.T is None:
+        poses = found.freed.poses
+        core = [v for v in found.linkage.core if v != m.view]
+        surface = surface_of(capture.scans, poses, core, found.tolerance)
+        fault = scan_fault(
+            capture.scans[m.view], capture.poses(T_mount)[m.view], surface, part_size([capture]), found.needed
+        )
+        if fault is not None:
+            return Problem(fault.kind, own, fault.fix)
+        return Problem("foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out")
+    amount = f"{m.distance:.4g} {session.length_unit} and {np.degrees(m.rotation):.3g}°"
+    partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
+    if partner is not None:
+        joint = session.views[m.view].joints is not None and abs(partner - m.view) == 1
+        kind = "joint_row" if joint else "duplicate_pose"
+        what = "joint angles" if joint else "pose"
+        return Problem(kind, (*own, names[partner]), f"{own[0]} has the {what} of {names[partner]}, and is off by {amount}: "
+                       f"put in its own")  # fmt: skip
+    digit = _one_joint(session, capture, T_mount, m)
+    if digit is not None:
+        joint_name, stated, fits, neighbour = digit
+        kind = "joint_row" if neighbour else "displaced"
+        return Problem(kind, own, f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit ({amount} off): "
+                       "correct it or leave the view out")  # fmt: skip
+    return Problem("displaced", own, f"its pose is off by {amount}: correct the row, scan again or leave the view out")
+
+
+def _one_joint(
+    session: Session, capture: Capture, T_mount: Array, m: Misplaced
+) -> tuple[str, float, float, bool] | None:
+    """The joint whose angle alone explains a displacement: name, degrees stated and that fit, neighbour's angle or not."""
+    robot, joints = session.robot, session.views[m.view].joints
+    if robot is None or joints is None or m.T is None:
+        return None
+    points = capture.scans[m.view].points[::50]
+    there = frames.transform(m.T, points)
+
+    def off(q: Array) -> float:
+        T = forward(robot, q)
+        T = frames.inverse(T) if session.mount == "eye_to_hand" else T
+        return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
+
+    start = off(joints)
+    best: tuple[float, int, float] = (np.inf, 0, 0.0)
+    for j in range(len(joints)):
+        unit = np.eye(len(joints))[j]
+        grid = np.linspace(-np.pi, np.pi, 181)
+        near = grid[int(np.argmin([off(joints + a * unit) for a in grid]))]
+        for a in (near, 0.0):
+            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(a - 0.02, a + 0.02))
+            best = min(best, (float(fit.fun), j, float(fit.x)))
+    left, j, turn = best
+    if left > _ONE_JOINT * start:
+        return None
+    fits = joints[j] + turn
+    others = [session.views[r].joints for r in (m.view - 1, m.view + 1) if 0 <= r < len(session.views)]
+    neighbour = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)
+    return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(fits)), neighbour
+
+
+def _reclamped(found: Snooping, names: Sequence[str]) -> Problem:
+    assert found.block is not None
+    start = found.block.start
+    views = tuple(names[start:]) if start >= len(names) / 2 else tuple(names[:start])
+    what = "the part was clamped anew" if found.block.what == "part" else "the scanner moved on its mount"
+    return Problem("reclamped", views, f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it")

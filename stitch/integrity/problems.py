@@ -1,0 +1,28 @@
+"""One mistake of a session: its kind, the views it concerns and what to do."""
+
+from dataclasses import dataclass
+from typing import Any
+
+KINDS = (
+    "exchanged", "shifted", "reversed", "inverse", "mount", "euler", "degrees", "quaternion", "unit", "scale", "mirrored",
+    "joint_row", "duplicate_scan", "duplicate_pose", "displaced", "foreign", "reclamped", "disconnected", "frame",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong, where, and how to put it right; `views` is empty where it concerns the whole session."""
+
+    kind: str  # one of KINDS
+    views: tuple[str, ...]
+    fix: str  # one line
+    certain: bool = True  # False: a hint that the numbers do not prove
+
+    def as_dict(self) -> dict[str, Any]:
+        """As `stitch check --deep --json` prints it."""
+        return {"kind": self.kind, "views": list(self.views), "fix": self.fix}
+
+    def line(self) -> str:
+        """As a message: kind, views, to fix."""
+        where = f" ({', '.join(self.views[:6])}{' …' if len(self.views) > 6 else ''})" if self.views else ""
+        return f"{self.kind}{where}: {self.fix}"

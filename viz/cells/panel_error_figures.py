@@ -1,0 +1,64 @@
+"""Figures of what a panel cell's motions and corrections leave; PNG or SVG by the file's name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from stitch.cells.panel.errors_along import ErrorsAlong
+from stitch.cells.panel.panel_job import Job
+from stitch.cells.panel.panel_solution import JobResult
+from stitch.frames import Array
+
+
+def write_pictures(job: Job, result: JobResult, folder: Path) -> list[str]:
+    """Write the errors to expect along a motion as PNG and SVG; returns the files' names."""
+    names = ["errors.png", "errors.svg"]
+    figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
+    for name in names:
+        figure.savefig(folder / name, dpi=110)
+    return names
+
+
+def errors_figure(names: Sequence[str], master: int, shift: ErrorsAlong, turn: ErrorsAlong) -> Figure:
+    """Error against distance and angle, one line per slave: the worst of the three axes."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex="row", squeeze=False)
+    rows = ((shift, shift.steps, "distance moved / mm"), (turn, np.degrees(turn.steps), "angle turned / deg"))
+    for row, (errors, steps, label) in enumerate(rows):
+        microns, millidegrees = errors.position * 1e3, np.degrees(errors.angle) * 1e3
+        columns = ((microns, "position error / µm"), (millidegrees, "angle error / 0.001°"))
+        for ax, (sizes, size_label) in zip(axes[row], columns, strict=True):
+            _draw_slaves(ax, steps, sizes, names, master=master)
+            ax.set(xlabel=label, ylabel=size_label)
+    axes[0, 0].legend(title=f"slaves of {names[master]}", fontsize="small")
+    figure.suptitle("Slave against master, rms expected from the global model's covariance, worst axis")
+    return figure
+
+
+def _draw_slaves(ax: Axes, steps: Array, sizes: Array, names: Sequence[str], *, master: int) -> None:
+    """Errors (3, D, N) over D steps, the worst axis of each slave."""
+    for i, name in enumerate(names):
+        if i != master:
+            ax.plot(steps, sizes[:, :, i].max(axis=0), label=name)
+    # An error of zero shall look like zero, not like magnified rounding.
+    ax.set_ylim(0, max(0.05, 1.05 * sizes.max()))
+    ax.grid(alpha=0.3)
+
+
+def shape_figure(names: Sequence[str], steps: Sequence[Array], tolerance: float, forces: Array) -> Figure:
+    """Largest deviation at each clamp, step by step (each (N,) mm), and the largest force (steps,) N."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    deviations, bars = figure.subplots(1, 2)
+    table = np.array(steps)
+    for i, name in enumerate(names):
+        deviations.plot(range(len(table)), table[:, i], marker="o", label=name)
+    deviations.axhline(tolerance, color="0.4", linestyle="--", label="tolerance")
+    deviations.set(xlabel="corrections", ylabel="largest deviation at the clamp / mm", xticks=range(len(table)))
+    deviations.set_ylim(0, None)
+    deviations.legend(fontsize="small", ncols=2)
+    bars.bar(range(len(forces)), forces)
+    bars.set(xlabel="corrections", ylabel="largest change of force / N", xticks=range(len(forces)))
+    return figure

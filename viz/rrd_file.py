@@ -1,0 +1,29 @@
+"""A Rerun recording that is written when it is complete.
+
+Rerun's own file sink writes from a thread of its own: on a full disk it reports nothing and waits without end.
+"""
+
+from pathlib import Path
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+
+class RecordingFile:
+    """A recording in memory, and the file that it becomes."""
+
+    def __init__(self, name: str, path: Path, default: rrb.Blueprint | None = None) -> None:
+        self.stream = rr.RecordingStream(name)
+        self._path = path
+        self._memory = self.stream.memory_recording()
+        if default is not None:
+            self.stream.send_blueprint(default, make_active=False, make_default=True)
+
+    def write(self) -> None:
+        """Write what was recorded and end the recording.
+
+        Raises:
+            OSError: the disk is full, or the folder cannot be written.
+        """
+        self._path.write_bytes(self._memory.drain_as_bytes())
+        self.stream.disconnect()
