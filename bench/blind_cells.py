@@ -2,16 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
 from data_synth import kinematics, nature
+from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.moment import Plan
-from data_synth.planning import plan_views
 from data_synth.scene import Scene, load_scene
-from data_synth.simulate import Measured, part_mesh, simulate
+from data_synth.simulate import Measured, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import form_weights
@@ -20,7 +20,6 @@ from stitch.effects import EFFECTS
 from stitch.effects.user_file import load
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 from stitch.runs.run import Run
 
 # Evidence counts in views: a few thousand points a view show what millions would.
@@ -50,10 +49,8 @@ def scene_of(name: str, hard: str = "", useful: tuple[int, ...] = ()) -> Scene:
     return replace(scene, scanner=scanner, repeatability=repeatability, useful=useful or scene.useful)
 
 
-@cache
 def _planned(name: str, seed: int) -> tuple[Plan, Array]:
-    scene = load_scene(name)
-    return plan_views(scene, part_mesh(scene), scene.plan.views, np.random.default_rng([seed, 1]))
+    return plan_for(load_scene(name), seed)
 
 
 def _last_joint_only(name: str, seed: int) -> tuple[Plan, Array]:

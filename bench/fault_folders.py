@@ -61,9 +61,103 @@ def _result(change: Callable[[dict[str, Any]], Any], command: list[str]) -> Call
 
 
 _WRONG = {
-    "session": 5, "hand_eye": [[1, 2], [3]], "residual_rms": "x", "noise_floor": None, "effects": [1], "stages": {"a": 1},
-    "views": [5], "unobservable": [1], "repeatability": 7, "verdict": [], "notes": "n", "convergence": [1], "heldout_rms": {},
-}  # fmt: skip
+    "session": 5,
+    "hand_eye": [[1, 2], [3]],
+    "residual_rms": "x",
+    "noise_floor": None,
+    "effects": [1],
+    "stages": {"a": 1},
+    "views": [5],
+    "unobservable": [1],
+    "repeatability": 7,
+    "verdict": [],
+    "notes": "n",
+    "convergence": [1],
+    "heldout_rms": {},
+}
+_COMMANDS = """
+add r incidence_bias
+add r --suggested
+drop r range_scale
+diagnose r
+compare r
+next r
+report r
+report r --no-diagnosis
+"""
+_RETURNS = """
+return None
+return points[:-1]
+return points.T
+return points * np.nan
+return points * 1j
+return 'x'
+return [[1, 2], [3]]
+return k
+sys.exit(0)
+raise SystemExit
+exit()
+1 / 0
+return own(points, view, k)
+raise MemoryError
+points += 1; return points
+assert False, '[/red]'
+return points.astype(object)
+return points > 0
+raise BaseException('b')
+return np.full(points.shape, np.inf)
+"""
+_PLACES = {
+    "in the session": "s/run",
+    "the session": "s",
+    "clouds of the session": "s/clouds",
+    "here": ".",
+    "above": "..",
+    "another session": "o",
+    "in another session": "p/x",
+    "a file": "mine.txt",
+    "below a file": "mine.txt/x",
+    "own files": "own",
+    "a model alone": "model",
+    "run of another session": "q",
+    "long": "x" * 300,
+    "system": "/proc/stitch",
+    "link to a session": "link",
+}
+_LINES = """
+rnu s
+run
+run nowhere
+run s --what
+run s --effects nothing
+run s --effects range_scale --hand-eye r
+run s --hand-eye nowhere
+run s --hand-eye p
+run s s
+run s p -o out
+check
+check nowhere
+check :smile:
+add r
+add r range_scale
+add r nothing
+add r incidence_bias --suggested
+add r --suggested --at-most x
+drop r nothing
+drop r incidence_bias
+batch nowhere
+effects nothing
+import nowhere.ls
+import s/session.toml
+import s
+calibrate
+calibrate sphere s
+calibrate tracker s
+calibrate robot nowhere
+view s
+compare [red]
+diagnose r --effects-file nowhere.py
+"""
 
 
 def run_folders() -> Iterator[Case]:
@@ -114,8 +208,7 @@ def _names_code(command: list[str]) -> Callable[[Path], list[str]]:
 
 def foreign_code() -> Iterator[Case]:
     """A run folder that names a Python file: nothing of it runs until somebody allows it."""
-    commands = [REUSE, ["add", "r", "incidence_bias"], ["drop", "r", "range_scale"], ["diagnose", "r"], ["compare", "r"],
-                ["next", "r"], ["report", "r"], ["report", "r", "--no-diagnosis"], ["add", "r", "--suggested"]]  # fmt: skip
+    commands = [REUSE, *(line.split() for line in _COMMANDS.strip().splitlines())]
     for command in commands:
         yield Case("code of a stranger", " ".join(command[:2]), _names_code(command))
     yield Case("code that is allowed", "report", _names_code([*REPORT, "--trust"]), fine=True, writes=("r", "executed"))
@@ -140,12 +233,7 @@ def _effect(text: str, json_out: bool = False) -> Callable[[Path], list[str]]:
 
 def effects_files() -> Iterator[Case]:
     """A user's effects that raise, end the program, never end, or return what is no displacement."""
-    bodies = ("return None", "return points[:-1]", "return points.T", "return points * np.nan", "return points * 1j",
-              "return 'x'", "return [[1, 2], [3]]", "return k", "sys.exit(0)", "raise SystemExit", "exit()", "1 / 0",
-              "return own(points, view, k)", "raise MemoryError", "points += 1; return points", "assert False, '[/red]'",
-              "return points.astype(object)", "return points > 0", "raise BaseException('b')",
-              "return np.full(points.shape, np.inf)")  # fmt: skip
-    for body in bodies:
+    for body in _RETURNS.strip().splitlines():
         yield Case("what an effect returns", body[:40], _effect(_EFFECT.format(body=body, more="")))
     for body in ("while True: pass", "time.sleep(1e6)", "while True: time.sleep(0.1)"):
         yield Case("effects without end", body, _effect(_EFFECT.format(body=body, more="")))
@@ -183,11 +271,7 @@ def effects_files() -> Iterator[Case]:
 def outputs() -> Iterator[Case]:
     """Places for the run where something would be lost, or nothing can be written."""
     base = ["run", "s", "--no-recording", "-o"]
-    places = {"in the session": "s/run", "the session": "s", "clouds of the session": "s/clouds", "here": ".", "above": "..",
-              "another session": "o", "in another session": "p/x", "a file": "mine.txt", "below a file": "mine.txt/x",
-              "own files": "own", "a model alone": "model", "run of another session": "q", "long": "x" * 300,
-              "system": "/proc/stitch", "link to a session": "link"}  # fmt: skip
-    for name, place in places.items():
+    for name, place in _PLACES.items():
         yield Case("places for the run", name, _places([*base, place]))
     writes = ("q", "r", "out")
     yield Case("places that are right", "--force", _places([*base, "q", "--force"]), fine=True, writes=("q/",))
@@ -236,13 +320,7 @@ def _held(command: list[str]) -> Callable[[Path], list[str]]:
 
 def command_lines() -> Iterator[Case]:
     """Words that are no command, options that contradict, terminals without UTF-8."""
-    lines = ["", "rnu s", "run", "run nowhere", "run s --what", "run s --effects nothing", "run s s", "check", "check nowhere",
-             "run s --effects range_scale --hand-eye r", "add r", "add r range_scale", "add r nothing", "drop r incidence_bias",
-             "add r incidence_bias --suggested", "add r --suggested --at-most x", "batch nowhere", "effects nothing",
-             "import nowhere.ls", "import s/session.toml", "import s", "run s --hand-eye nowhere", "run s --hand-eye p",
-             "calibrate sphere s", "calibrate tracker s", "calibrate robot nowhere", "calibrate", "view s", "run s p -o out",
-             "diagnose r --effects-file nowhere.py", "drop r nothing", "compare [red]", "check :smile:"]  # fmt: skip
-    for line in lines:
+    for line in ["", *_LINES.strip().splitlines()]:
         yield Case("command lines", line, lambda room, words=line: words.split())
     for encoding in ("ascii", "latin-1", "cp437"):
         for command in (["effects"], ["compare", "r"], [*RUN]):

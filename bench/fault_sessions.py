@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from fault_room import Case
+
 from data_synth.fixtures.edits import set_cell
 
 RUN = ["run", "s", "-o", "out", "--no-recording"]
@@ -41,8 +42,9 @@ def _toml(change: Callable[[str], str | bytes], command: list[str] = RUN) -> Cal
 
 def _key(key: str, value: str) -> Callable[[str], str]:
     def change(text: str) -> str:
-        import tomli_w
         import tomllib
+
+        import tomli_w
 
         document = tomllib.loads(text)
         table, _, name = key.rpartition(".")

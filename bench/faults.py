@@ -10,8 +10,9 @@ import os
 import re
 import tempfile
 import time
+import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import date
 from itertools import chain
 from pathlib import Path
@@ -48,24 +49,37 @@ _PAGE = Path(__file__).resolve().parents[1] / "docs" / "limits.md"
 def make_material(folder: Path) -> float:
     """Two small cloud sessions s and o, labelled points p, runs r of s and q of o; seconds of a run in a fork."""
     folder.mkdir()
-    for seed, name in enumerate("so"):
-        write_session(folder / name, measured_blade(seed, views=6, pixels=50), name)
-    write_labelled(folder / "p", labelled_cell(5, views=16)[0])
+    # In processes of their own: this one must stay without threads, or its forks would wait for them.
+    _forked(lambda: _write_sessions(folder))
     seconds = 0.0
     for arguments in (["run", "s", "-o", "r", "--effects", "range_scale"], ["run", "o", "-o", "q"]):
         began = time.monotonic()
-        process = os.fork()
-        if not process:
-            os.chdir(folder)
-            try:
-                stitch(arguments)
-            except SystemExit as end:
-                os._exit(end.code if isinstance(end.code, int) else 1)
-        if os.waitpid(process, 0)[1]:
-            raise SystemExit(f"{' '.join(arguments)}: the good run failed")
+        _forked(lambda arguments=arguments: (os.chdir(folder), stitch(arguments)))
         seconds = max(seconds, time.monotonic() - began)
     (folder / "r" / "mine.txt").write_text("a person's own")
     return seconds
+
+
+def _write_sessions(folder: Path) -> None:
+    for seed, name in enumerate("so"):
+        write_session(folder / name, measured_blade(seed, views=6, pixels=50), name)
+    write_labelled(folder / "p", labelled_cell(5, views=16)[0])
+
+
+def _forked(work: Callable[[], object]) -> None:
+    process = os.fork()
+    if not process:
+        code = 1
+        try:
+            work()
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        except BaseException:
+            traceback.print_exc()
+        os._exit(code)
+    if os.waitpid(process, 0)[1]:
+        raise SystemExit("the good input of the benchmark fails already")
 
 
 def cases(only: str) -> Iterator[Case]:
@@ -87,9 +101,8 @@ def table(outcomes: list[Outcome], kills: list[Kills]) -> str:
     lines.append("")
     for k in kills:
         whole = k.old + k.new
-        lines.append(
-            f"`{k.command}` killed {whole + len(k.neither)} times: {k.old} old run, {k.new} new run, {len(k.neither)} neither."
-        )
+        told = f"{k.old} times the old run, {k.new} times the new one, {len(k.neither)} times neither"
+        lines.append(f"`{k.command}` killed {whole + len(k.neither)} times: {told}.")
     return "\n".join(lines)
 
 
@@ -106,7 +119,7 @@ def main() -> None:
         material, rooms = Path(name).resolve() / "material", Path(name).resolve() / "rooms"
         rooms.mkdir()
         usual = make_material(material)
-        print(f"a good run takes {usual:.1f} s; a command hangs after {usual + _HANG:.1f} s")
+        print(f"a good run takes {usual:.1f} s; a command hangs after {usual + _HANG:.1f} s", flush=True)
         outcomes = []
         for outcome in judge(cases(given.only), material, rooms, usual + _HANG):
             outcomes.append(outcome)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.scene import load_scene
-from data_synth.simulate import Measured, simulate
+from data_synth.simulate import simulate
 from stitch import frames
-from stitch.measurement.capture import capture, place
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.capture import capture
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.pipeline import run, run_rig
@@ -102,23 +102,15 @@ def synthetic(seeds: int = 20) -> None:
 
 def _trial(mount: str, seed: int) -> tuple[float, float, float]:
     """Squared error and predicted variance at the part, mean squared z."""
-    scene = load_scene({"eye_to_hand": "blade", "eye_in_hand": "blade-table"}[mount])
+    scene = load_scene(SCENE_OF_MOUNT[mount])
     m = simulate(replace(scene, small=0.0), {}, seed, 12)
-    c = _capture(m)
-    direction = np.random.default_rng(1000 + seed).normal(size=(2, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    start = m.T_mount @ frames.exp(np.r_[direction[0] * np.radians(5), direction[1] * 30])
-    found = correct([c], start, 0.35 * part_size([c])).hand_eye
+    c = captured(m)
+    found = correct([c], disturbed(m.T_mount, 1000 + seed), 0.35 * part_size([c])).hand_eye
     xi = frames.log(frames.inverse(m.T_mount) @ found.T_mount)
     middle = np.mean([s.points.mean(axis=0) for s in c.scans], axis=0)
     J = np.hstack([-frames.skew(middle), np.eye(3)])
     z = xi / np.sqrt(np.diag(found.covariance))
     return float(np.sum((J @ xi) ** 2)), float(np.trace(J @ found.covariance @ J.T)), float(np.mean(z**2))
-
-
-def _capture(m: Measured):
-    scans = [prepare_view(str(i), cloud.points) for i, cloud in enumerate(m.clouds)]
-    return place("blade", scans, m.T_base_flange, m.scene.mount)
 
 
 def speed() -> None:
@@ -128,7 +120,7 @@ def speed() -> None:
     scene = load_scene("blade")
     m = simulate(replace(scene, scanner=replace(scene.scanner, columns=330, rows=330)), {}, 0)
     marks = [time.perf_counter()]
-    c = _capture(m)
+    c = captured(m)
     marks.append(time.perf_counter())
     found = correct([c], m.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5])), 0.35 * part_size([c]))
     marks.append(time.perf_counter())

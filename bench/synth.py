@@ -11,12 +11,12 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import igl
 import numpy as np
 
+from data_synth.fixtures.part_distance import off_surface
+from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.nature import LAWS
-from data_synth.scanner import Scanner
-from data_synth.scene import Scene, load_scene
+from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session
 from stitch import frames
@@ -50,35 +50,24 @@ def speed_table(pixels: int, views: int) -> list[str]:
     ]  # fmt: skip
 
 
-def quiet(name: str) -> Scene:
-    """A scene without noise, scatter or small effects: what is left is the law."""
-    scene = load_scene(name)
-    tool: Scanner = replace(
-        scene.scanner, columns=60, rows=60, noise=0.0, field_error=0.0, mixed_pixels=0.0, dropout=0.0, quantisation=0.0
-    )
-    return replace(scene, scanner=tool, small=0.0, repeatability=(0.0, 0.0))
-
-
 def misfit(measured: Measured) -> tuple[float, float]:
     """µm from the part under the reported poses and the true hand-eye: rms and largest view's rms."""
-    scene, mesh = measured.scene, measured.mesh
+    scene = measured.scene
     T = measured.T_base_flange
     T_reference_scanner = (frames.inverse(T) if scene.mount == "eye_to_hand" else T) @ measured.T_mount
     T_part_scanner = frames.inverse(scene.T_reference_part) @ T_reference_scanner
     squares = []
     for cloud, pose in zip(measured.clouds, T_part_scanner, strict=True):
         y = frames.transform(pose, cloud.points)
-        _, face, _ = igl.point_mesh_squared_distance(y, np.array(mesh.vertices), np.array(mesh.faces))
-        off = np.einsum("ij,ij->i", y - mesh.triangles[face, 0], mesh.face_normals[face])
-        squares.append(np.mean(off**2))
+        squares.append(np.mean(off_surface(measured.mesh, y)[0] ** 2))
     return 1e3 * float(np.sqrt(np.mean(squares))), 1e3 * float(np.sqrt(np.max(squares)))
 
 
 def law_table() -> list[str]:
     lines = ["| law | parameters drawn at amplitude 1, seed 0 | rms / µm | worst view / µm |", "|---|---|---:|---:|"]
     for name in LAWS:
-        scene = quiet("line-sweep" if name == "latency" else "blade")
-        runs = [simulate(scene, {name: 1.0}, seed, 12) for seed in SEEDS]
+        scene = clean("line-sweep" if name == "latency" else "blade", noise=0.0)
+        runs = [simulated(scene, {name: 1.0}, seed, 12) for seed in SEEDS]
         found = np.array([misfit(run) for run in runs])
         parameters = ", ".join(f"{k} = {v:.2g}" for k, v in runs[0].hidden[name].items())
         rms, worst = np.sqrt((found**2).mean(axis=0))

@@ -1,14 +1,12 @@
 """The run: coarse → correct → register → fuse, for one session or several of one rig; and what changes its model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
-from stitch.frames import Array
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
@@ -19,12 +17,10 @@ from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
 from stitch.observations.linearise import linearise
 from stitch.runs.recorder import Recorder, Silent
-from stitch.runs.run import LedgerStep, Run, StageResult
+from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
-from stitch.stages import from_surfaces, from_targets
 from stitch.stages.coarse import COARSE_GATE, Coarse
-from stitch.stages.fitted import Course, Fitted
-from stitch.stages.observability import unobservable
+from stitch.stages.course import End, collected, course_of
 from stitch.stages.rig import require_effects, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
@@ -54,7 +50,7 @@ def run_rig(
     require_same_rig(sessions, model)
     recorders = recorders or [Silent() for _ in sessions]
     with library_threads_off():
-        clock, kind = Clock(), _observed(sessions[0])
+        clock, kind = Clock(), course_of(sessions[0])
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
         measurements = [measurement_of(session, capture(session)) for session in sessions]
@@ -71,9 +67,9 @@ def run_rig(
         else:
             terms_at = partial(_terms_at, sessions[0], effects) if effects else None
             fitted = kind.fit(sessions, measurements, begun, terms_at, recorders[0])
-        end = _End(begun, fitted, clock.lap(), model.effects_file if model else None)
+        end = End(begun, fitted, clock.lap(), model.effects_file if model else None)
         return [
-            _collected(session, i, end, before[i], recorder)
+            collected(session, i, end, before[i], recorder)
             for i, (session, recorder) in enumerate(zip(sessions, recorders, strict=True))
         ]
 
@@ -113,7 +109,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
     """
     recorder = recorder or Silent()
     with library_threads_off():
-        clock, kind = Clock(), _observed(state.session)
+        clock, kind = Clock(), course_of(state.session)
         session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
         recorder.start(session)
         require_effects([measurement], effects)
@@ -126,13 +122,8 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         clock.lap()
         fitted = kind.refit([session], [measurement], model, [state.gate])
         poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
-        end = _End(begun, fitted, clock.lap(), state.effects_file, state.ledger, poses_before)
-        return _collected(session, 0, end, before, recorder)
-
-
-def _observed(session: Session) -> Course:
-    """How a run goes with what was observed."""
-    return from_surfaces if session.has_clouds else from_targets
+        end = End(begun, fitted, clock.lap(), state.effects_file, state.ledger, poses_before)
+        return collected(session, 0, end, before, recorder)
 
 
 def _terms_at(
@@ -141,58 +132,3 @@ def _terms_at(
     """Terms for further effects, begun where the views suggest them."""
     linear = partial(linearise, measurement, model, gate, session.nominal)
     return initial_terms(measurement, [known(name) for name in effects], linear)
-
-
-@dataclass(frozen=True)
-class _End:
-    """What all sessions of a rig have in common at the end of the fit."""
-
-    begun: Coarse
-    fitted: Fitted
-    seconds: float
-    effects_file: str | None
-    ledger: tuple[LedgerStep, ...] = ()
-    poses_before: Array | None = None
-
-
-def _collected(session: Session, index: int, end: _End, before: StageResult, recorder: Recorder) -> Run:
-    """Register and fuse one session, collect its result with its line in the history, and show it."""
-    kind, fitted = _observed(session), end.fitted
-    finished = kind.finish(session, fitted, index, before, recorder, end.seconds)
-    own, model = fitted.sessions[index], fitted.model
-    joints = session.joints if len(fitted.captures) == 1 else None
-    step = LedgerStep(
-        effects=tuple(model.effects),
-        residual_rms=finished.residual_rms,
-        heldout_rms=finished.heldout_rms,
-        noise_floor=finished.noise_floor,
-        T_mount=model.T_mount,
-    )
-    result = Run(
-        session=session,
-        measurement=own.measurement,
-        model=model,
-        T_mount_coarse=end.begun.T_mount,
-        unobservable=unobservable(fitted.captures, model.T_mount, session.robot, joints),
-        stages=finished.stages,
-        poses_model=finished.poses_model,
-        poses=finished.poses,
-        corrections=finished.corrections,
-        view_rms=finished.view_rms,
-        residual_rms=finished.residual_rms,
-        heldout_rms=finished.heldout_rms,
-        noise_floor=finished.noise_floor,
-        fused=finished.fused,
-        repeatability=finished.repeatability,
-        overlaps=finished.overlaps,
-        verdict=finished.verdict,
-        ledger=(*end.ledger, step),
-        effects_file=end.effects_file,
-        poses_before=end.poses_before,
-        convergence=finished.convergence,
-        notes=kind.notes(session, fitted, index, end.begun),
-        targets=own.targets,
-        outliers=own.outliers,
-    )
-    recorder.finish(result)
-    return result

@@ -52,8 +52,9 @@ class _Rows:
             for sign, v, w, index in ((1.0, m.v, m.w, m.index_v), (-1.0, m.w, m.v, m.index_w)):
                 size = int(inside.sum())
                 points = state.measurement.capture.scans[v].points[index[inside]]
-                values = (np.full(size, v), np.full(size, w), sign * m.residual[inside], points,
-                          state.measurement.scan_views[v].cosine[index[inside]], m.middle[inside])  # fmt: skip
+                cosine = state.measurement.scan_views[v].cosine[index[inside]]
+                views = np.full(size, v), np.full(size, w)
+                values = (*views, sign * m.residual[inside], points, cosine, m.middle[inside])
                 for part, value in zip(parts, values, strict=True):
                     part.append(value)
         view, partner, self.residual, self.points, self.cosine, self.place = (np.concatenate(p) for p in parts)
@@ -101,24 +102,33 @@ def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
     n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
     v, w = np.nonzero(np.triu(n, 1))
     count, mean, square = n[v, w], s[v, w], q[v, w]
-    nothing = np.full(len(v), np.nan)
+    nothing, number = np.full(len(v), np.nan), np.arange(len(v), dtype=float)
     return Table(
-        "pair", "", np.arange(len(v), dtype=float), np.arange(len(v), dtype=float),
-        tuple(f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)), mean / count, nothing,
-        np.sqrt(square / count), nothing, count, np.full(len(v), 2),
-    )  # fmt: skip
+        name="pair",
+        unit="",
+        low=number,
+        high=number,
+        label=tuple(f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)),
+        mean=mean / count,
+        mean_sigma=nothing,
+        rms=np.sqrt(square / count),
+        rms_sigma=nothing,
+        count=count,
+        views=np.full(len(v), 2),
+    )
 
 
 def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     views, unit = state.measurement.views, state.session.length_unit
-    r = np.linalg.norm(rows.points, axis=1)
+    x, y, z = rows.points.T
     out = [
-        ("range", unit, r), ("incidence", "deg", np.degrees(np.arccos(np.clip(rows.cosine, -1, 1)))),
-        ("field a = x/z", "", rows.points[:, 0] / rows.points[:, 2]),
-        ("field b = y/z", "", rows.points[:, 1] / rows.points[:, 2]),
-        ("field ρ", "", np.hypot(rows.points[:, 0], rows.points[:, 1]) / rows.points[:, 2]),
-    ]  # fmt: skip
+        ("range", unit, np.linalg.norm(rows.points, axis=1)),
+        ("incidence", "deg", np.degrees(np.arccos(np.clip(rows.cosine, -1, 1)))),
+        ("field a = x/z", "", x / z),
+        ("field b = y/z", "", y / z),
+        ("field ρ", "", np.hypot(x, y) / z),
+    ]
     return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if np.ptp(values) > 1e-9]
 
 

@@ -84,25 +84,26 @@ def _table(
     key = bins * rows.views + rows.view
     n = np.bincount(key, minlength=size * rows.views).reshape(size, rows.views)
     of_view = np.bincount(key, along, size * rows.views).reshape(n.shape) / np.maximum(n, 1)
-    distance = np.bincount(key, np.linalg.norm(rows.offset, axis=1), size * rows.views).reshape(n.shape) / np.maximum(
-        n, 1
-    )
+    lengths = np.linalg.norm(rows.offset, axis=1)
+    distance = np.bincount(key, lengths, size * rows.views).reshape(n.shape) / np.maximum(n, 1)
     sigmas = [
         np.sqrt(np.where(n > 0, (x - m[:, None]) ** 2, 0).sum(axis=1) / np.maximum(views - 1, 1) / np.maximum(views, 1))
         for x, m in ((of_view, signed), (distance, np.sqrt(square)))
     ]
     unknown = np.where(views > 1, 1.0, np.nan)
+    low, high = edges
     return Table(
-        name,
-        unit,
-        *edges,
-        tuple(labels),
-        signed,
-        sigmas[0] * unknown,
-        np.sqrt(square),
-        sigmas[1] * unknown,
-        count,
-        views,
+        name=name,
+        unit=unit,
+        low=low,
+        high=high,
+        label=tuple(labels),
+        mean=signed,
+        mean_sigma=sigmas[0] * unknown,
+        rms=np.sqrt(square),
+        rms_sigma=sigmas[1] * unknown,
+        count=count,
+        views=views,
     )
 
 

@@ -82,13 +82,13 @@ def edges_of(values: Array) -> Array:
 
 def comparison_document(found: Comparison) -> dict[str, object]:
     """The tables as plain lists."""
+    floats, counts = "low high mean mean_sigma rms rms_sigma", "count views"
     return {
         "rms": found.rms,
         "tables": [
-            {"name": t.name, "unit": t.unit, "label": list(t.label), "low": t.low.tolist(), "high": t.high.tolist(),
-             "mean": t.mean.tolist(), "mean_sigma": t.mean_sigma.tolist(), "rms": t.rms.tolist(),
-             "rms_sigma": t.rms_sigma.tolist(), "count": t.count.astype(int).tolist(),
-             "views": t.views.astype(int).tolist(), "clearest": t.clearest}
+            {"name": t.name, "unit": t.unit, "label": list(t.label), "clearest": t.clearest}
+            | {key: getattr(t, key).tolist() for key in floats.split()}
+            | {key: getattr(t, key).astype(int).tolist() for key in counts.split()}
             for t in found.tables
         ],
-    }  # fmt: skip
+    }

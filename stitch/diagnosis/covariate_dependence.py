@@ -60,16 +60,22 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     share = float(np.sum((basis.T @ linear.white_residual) ** 2) / max(float(np.sum(linear.white_residual**2)), 1e-300))
     displacement = linear.displaced()
     # The direction in which the displacements follow the fitted shape most.
-    fitted = linear.at_part(scored.form.columns @ scored.values)
+    fitted = linear.observation.at_part(scored.form.columns @ scored.values)
     direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
     y = displacement @ direction
     if np.dot(y, fitted @ direction) < 0:
         y = -y
     centres, mean, sigma = binned(course, y)
+    effect = scored.candidate.effect
     return Dependence(
-        scored.candidate.effect.group if scored.candidate.effect.group != "an event" else "view order", share,
-        ranked.adjusted, centres, mean, sigma, scored.candidate.effect.formula,
-    )  # fmt: skip
+        covariate=effect.group if effect.group != "an event" else "view order",
+        score=share,
+        p_value=ranked.adjusted,
+        bins=centres,
+        mean=mean,
+        sigma=sigma,
+        shape=effect.formula,
+    )
 
 
 def binned(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:

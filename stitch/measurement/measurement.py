@@ -56,18 +56,25 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
     down = downwards(session.robot, T_base_flange, eye_to_hand)
     intensity = _intensities(session)
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
-    scan_views = tuple(
-        ScanView(v, views, np.maximum(scan.confidence, _SMALLEST_COSINE), intensity[v], down[v], size)
-        for v, scan in enumerate(capture.scans)
-    )  # fmt: skip
-    target_views: tuple[ScanView, ...] = ()
+    like = [ScanView(v, views, np.zeros(0), intensity[v], gravity=down[v], size=size) for v in range(views.count)]
+    scan_views = [
+        replace(like[v], cosine=np.maximum(scan.confidence, _SMALLEST_COSINE)) for v, scan in enumerate(capture.scans)
+    ]
+    target_views: list[ScanView] = []
     if capture.sightings is not None:
         # Nobody knows at what slant a target was seen, or how bright: effects of these have nothing to say about it.
         straight = np.ones(capture.sightings.used.shape[1])
         usual = None if intensity[0] is None else np.zeros(len(straight))
-        target_views = tuple(ScanView(v, views, straight, usual, down[v], size) for v in range(views.count))
+        target_views = [replace(view, cosine=straight, intensity=usual) for view in like]
     return Measurement(
-        capture, T_base_flange, eye_to_hand, session.robot, views, scan_views, session.length_unit, target_views
+        capture=capture,
+        T_base_flange=T_base_flange,
+        eye_to_hand=eye_to_hand,
+        robot=session.robot,
+        views=views,
+        scan_views=tuple(scan_views),
+        length_unit=session.length_unit,
+        target_views=tuple(target_views),
     )
 
 

@@ -71,7 +71,17 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
         tree = KDTree(own, leafsize=16)
         distance, _ = tree.query(own, k=2)
     area = np.pi * radius**2 / neighbours * (len(points) / len(own))
-    return Scan(name, own, normals, usable, area, confidence, tree, float(np.median(distance[:, 1])), noise)
+    return Scan(
+        name=name,
+        points=own,
+        normals=normals,
+        usable=usable,
+        area=area,
+        confidence=confidence,
+        tree=tree,
+        spacing=float(np.median(distance[:, 1])),
+        noise=noise,
+    )
 
 
 def _planes(centred: Array) -> tuple[Array, Array]:

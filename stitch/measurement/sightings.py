@@ -45,11 +45,9 @@ class Sightings:
     def without(self, left_out: Indices) -> "Sightings":
         """The sightings less some views."""
         keep = np.setdiff1d(np.arange(len(self.points)), left_out)
-        return replace(
-            self, target=self.target[keep], points=self.points[keep], sigma=self.sigma[keep], used=self.used[keep],
-            rotation=None if self.rotation is None else self.rotation[keep],
-            sigma_rotation=None if self.sigma_rotation is None else self.sigma_rotation[keep],
-        )  # fmt: skip
+        of_views = ("target", "points", "sigma", "used", "rotation", "sigma_rotation")
+        known = {name: values for name in of_views if (values := getattr(self, name)) is not None}
+        return replace(self, **{name: values[keep] for name, values in known.items()})
 
 
 def sightings_of(session: Session) -> Sightings | None:

@@ -118,17 +118,17 @@ def views_of(session: Session) -> Views:
     torques = torques_of(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
     first = {name: float(course[0]) for name, course in covariates.items()}
     return Views(
-        count,
-        time - time[0],
-        joints,
-        previous,
-        approach,
-        velocity,
-        torques,
-        covariates,
-        standoff,
-        first,
-        np.arange(count),
+        count=count,
+        time=time - time[0],
+        joints=joints,
+        previous=previous,
+        approach=approach,
+        velocity=velocity,
+        torques=torques,
+        covariates=covariates,
+        standoff=standoff,
+        first=first,
+        number=np.arange(count),
     )
 
 
@@ -150,10 +150,8 @@ def torques_of(robot: Robot, joints: Array) -> Torques:
     shapes = kinematics.unit_torques(robot, everywhere)
     keep = [(i, k) for i in range(n) for k in _different(shapes[:, i], range(i, n))]
     unit = kinematics.unit_torques(robot, joints)
-    return Torques(
-        tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep),
-        np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep)),
-    )  # fmt: skip
+    values = np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep))
+    return Torques(tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep), values)
 
 
 def _different(torques: Array, links: Sequence[int]) -> list[int]:

@@ -167,26 +167,10 @@ class LinearModel:
         """The model as it is."""
         return self.trial(self.design)
 
-    def touched(self, views: Indices) -> Mask:
-        """(units,) which squares of a trial some views have a part in."""
-        return self.observation.touched(views)
-
-    def folds(self) -> list[Indices]:
-        """Groups of views to leave out."""
-        return self.observation.folds()
-
-    def ends(self) -> list[JointEnd]:
-        """Ends of joints' ranges that may be left out."""
-        return self.observation.ends(self.measurement.views.joints)
-
-    def at_part(self, numbers: Array) -> Array:
-        """(V, 3) what numbers (n,) of the channel displace at the part, reference frame."""
-        return self.observation.at_part(numbers)
-
     def displaced(self) -> Array:
         """(V, 3) how far every view sits from where the model puts it, at the part, reference frame."""
         explained = self.reduce((self.design @ self.present.solve())[:, None])[:, 0]
-        return self.at_part(self.mixed.z.ravel() - explained)
+        return self.observation.at_part(self.mixed.z.ravel() - explained)
 
     def __repr__(self) -> str:
         return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"

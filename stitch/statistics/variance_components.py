@@ -8,6 +8,7 @@ block-diagonal in B blocks: one for the pose channel of scans, one a view for la
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
@@ -58,9 +59,12 @@ class VarianceFit:
 
 
 def fit_variances(
-    mixed: MixedModel, G: Array | None = None, prior: Array | None = None, start: Array | None = None,
+    mixed: MixedModel,
+    G: Array | None = None,
+    prior: Array | None = None,
+    start: Array | None = None,
     both_starts: bool = False,
-) -> VarianceFit:  # fmt: skip
+) -> VarianceFit:
     """Maximise over the three variances.
 
     Args:
@@ -76,11 +80,9 @@ def fit_variances(
     centre = np.log(_guess(mixed))
     flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else _FLAT
     bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
-    fits = [
-        minimize(_deviance, np.clip(s, *np.array(bounds).T), args=(problem,), jac=True, method="L-BFGS-B",
-                 bounds=bounds, options={"ftol": 1e-9, "gtol": flat, "maxiter": 60})
-        for s in begin
-    ]  # fmt: skip
+    options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
+    search = partial(minimize, _deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    fits = [search(np.clip(s, *np.array(bounds).T)) for s in begin]
     best = min(fits, key=lambda f: float(f.fun))
     return at_variances(mixed, np.exp(best.x), G, prior)
 

@@ -24,6 +24,7 @@ _REACH = 2.5
 # The mesh reaches at most so many cells beyond the last points.
 _OVERHANG = 2.0
 _BLOCK = 20_000
+_NO_SURFACE = "no mesh: the fused points span no surface; run without --mesh"
 # In the order in which libigl counts the corners of a cell.
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 
@@ -61,6 +62,8 @@ def mesh_of(points: Array, normals: Array) -> TriangleMesh:
     Raises:
         NoResultError: the points span no surface.
     """
+    if len(points) < _NEIGHBOURS:
+        raise NoResultError(_NO_SURFACE)
     tree = KDTree(np.ascontiguousarray(points, float))
     size = max(_spacing(points, tree), _CELL_SHARE * float(np.ptp(points, axis=0).max()))
     places, cells = _cells_about(points, size)
@@ -71,16 +74,15 @@ def mesh_of(points: Array, normals: Array) -> TriangleMesh:
     gap, _ = tree.query(vertices, k=1)
     triangles = triangles[(gap < _OVERHANG * size)[triangles].all(axis=1)]
     if not len(triangles):
-        raise NoResultError("no mesh: the fused points span no surface; run without --mesh")
+        raise NoResultError(_NO_SURFACE)
     kept, triangles = np.unique(triangles, return_inverse=True)
     return TriangleMesh(vertices[kept], triangles.reshape(-1, 3))
 
 
 def _spacing(points: Array, tree: Any) -> float:
     """Edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
-    count = min(9, len(points))
-    distance, _ = tree.query(points[:: max(1, len(points) // _BLOCK)], k=count)
-    return float(np.median(distance[:, -1]) * np.sqrt(np.pi / (count - 1)))
+    distance, _ = tree.query(points[:: max(1, len(points) // _BLOCK)], k=9)
+    return float(np.median(distance[:, -1]) * np.sqrt(np.pi / 8))
 
 
 def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
@@ -98,16 +100,20 @@ def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
 
 def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
     """Signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
-    count = min(_NEIGHBOURS, len(points))
 
     def of(block: Array) -> tuple[Array, Array]:
-        distance, index = tree.query(block, k=count)
+        distance, index = tree.query(block, k=_NEIGHBOURS)
         n = normals[index]
         # Of a thin sheet only the nearer side counts.
         agree = np.maximum(np.einsum("pki,pi->pk", n, n[:, 0]), 0)
         weight = agree * np.exp((distance[:, :1] ** 2 - distance**2) / size**2)
-        above = np.einsum("pki,pki->pk", n, block[:, None] - points[index])
-        return (weight * above).sum(axis=1) / weight.sum(axis=1), distance[:, 0]
+        weight /= weight.sum(axis=1, keepdims=True)
+        here = np.einsum("pk,pki->pi", weight, n)
+        here /= np.linalg.norm(here, axis=1, keepdims=True)
+        # Tangent planes at the points lie above a convex surface, one at the place itself below it: on a ball the
+        # mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
+        above = np.einsum("pki,pki->pk", (n + here[:, None]) / 2, block[:, None] - points[index])
+        return (weight * above).sum(axis=1), distance[:, 0]
 
     blocks = parallel(of, np.array_split(places, len(places) // _BLOCK + 1))
     heights, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))

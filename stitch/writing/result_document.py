@@ -1,5 +1,6 @@
 """result.json, ledger.json and the model of a run, as plain data."""
 
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -43,11 +44,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
         "hand_eye_covariance": run.mount_covariance.tolist(),
         "unobservable": list(run.unobservable),
-        "stages": [
-            {"name": s.name, "rms": s.rms, "correspondences": s.correspondences, "iterations": s.iterations,
-             "seconds": round(s.seconds, 3), "note": s.note}
-            for s in run.stages
-        ],
+        "stages": [asdict(s) | {"seconds": round(s.seconds, 3)} for s in run.stages],
         "residual_rms": run.residual_rms,
         "heldout_rms": run.heldout_rms,
         "noise_floor": run.noise_floor,
@@ -56,19 +53,14 @@ def result_document(run: Run) -> dict[str, Any]:
             term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
             for term in run.terms
         },
-        "views": [
-            {"view": view.name, "pose": pose.tolist(), "correction": correction.tolist(), "rms": float(rms),
-             "points": points_of(view)}
-            for view, pose, correction, rms in zip(
-                run.session.views, run.poses, run.corrections, run.view_rms, strict=True)
-        ],
+        "views": [_view(run, v) for v in range(len(run.session.views))],
         "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,
         "verdict": run.verdict,
         "notes": list(run.notes),
         "versions": _versions(),
-    }  # fmt: skip
+    }
 
 
 def points_of(view: View) -> int:
@@ -79,11 +71,22 @@ def points_of(view: View) -> int:
 
 def ledger(run: Run) -> list[dict[str, Any]]:
     """The model's history, one step per change."""
+    numbers = ["residual_rms", "heldout_rms", "noise_floor"]
     return [
-        {"step": i, "effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms,
-         "noise_floor": s.noise_floor, "hand_eye": s.T_mount.tolist()}
+        {"step": i, "effects": list(s.effects), "hand_eye": s.T_mount.tolist()}
+        | {key: getattr(s, key) for key in numbers}
         for i, s in enumerate(run.ledger)
-    ]  # fmt: skip
+    ]
+
+
+def _view(run: Run, v: int) -> dict[str, Any]:
+    return {
+        "view": run.session.views[v].name,
+        "pose": run.poses[v].tolist(),
+        "correction": run.corrections[v].tolist(),
+        "rms": float(run.view_rms[v]),
+        "points": points_of(run.session.views[v]),
+    }
 
 
 def _versions() -> dict[str, str]:

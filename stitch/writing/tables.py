@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from plyfile import PlyData, PlyElement
 
 from stitch.frames import Array
-from stitch.measurement.session import Session
+from stitch.measurement.session import Session, View
 from stitch.observations.surfaces.match import Match
 from stitch.runs.run import FusedCloud, Run
 from stitch.writing.target_rows import residual_columns
@@ -59,14 +59,11 @@ def _renamed(session: Session) -> Session:
     def free(values: dict[str, _Value]) -> dict[str, _Value]:
         return {f"covariate_{key}" if key in _OWN else key: value for key, value in values.items()}
 
-    views = [
-        replace(
-            view, covariates=free(view.covariates),
-            cloud=None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars)),
-        )
-        for view in session.views
-    ]  # fmt: skip
-    return replace(session, views=tuple(views))
+    def renamed(view: View) -> View:
+        cloud = None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars))
+        return replace(view, covariates=free(view.covariates), cloud=cloud)
+
+    return replace(session, views=tuple(renamed(view) for view in session.views))
 
 
 def _columns(session: Session, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:

@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 
 from data_synth.fixtures.ideal_scanner import ranges
 from data_synth.fixtures.quiet_scenes import clean, mesh_for, mesh_of, simulated, with_part
-from data_synth.scanner import cast, rays
+from data_synth.scanner import rays
+from data_synth.scanning import cast
 from stitch import frames
 
 

@@ -29,7 +29,7 @@ def test_hand_eye_error_is_what_the_covariance_predicts(mount):
     """From 5° and 30 mm, 4 draws of scatter and noise a mount: rms error at the part below 1.2 of the prediction, sigmas honest."""
     errors, predicted, z = [], [], []
     for seed in range(4):
-        measured, capture = captured_blade(seed, mount=mount, pixels=130, plan_seed=5)
+        measured, capture = captured_blade(seed, mount=mount, pixels=90, plan_seed=5)
         start = disturbed(measured.T_mount, seed)
         found = correct([capture], start, 0.35 * part_size([capture])).hand_eye
         xi = frames.log(frames.inverse(measured.T_mount) @ found.T_mount)
@@ -88,7 +88,7 @@ def test_several_captures_share_one_hand_eye():
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_a_hand_eye_is_found_from_nothing(mount):
-    measured, capture = captured_blade(5, mount=mount, pixels=110)
+    measured, capture = captured_blade(5, mount=mount, pixels=90)
     found = coarse([capture])
     assert found.runner_up_ratio > 1.1
     fine = correct([capture], found.T_mount, found.gate).hand_eye

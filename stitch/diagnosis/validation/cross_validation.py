@@ -37,8 +37,8 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     whole = trial.solve()
     shares, weights = [], []
     scatter = np.zeros((2, 0))
-    for fold in linear.folds():
-        touched = linear.touched(fold)
+    for fold in linear.observation.folds():
+        touched = linear.observation.touched(fold)
         without = [t.solve(fold) for t in (believed, present)]
         squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
         shares.append(squares[0] / max(squares[1], 1e-300))

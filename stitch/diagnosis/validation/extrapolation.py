@@ -50,7 +50,7 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     """The best form of a candidate at the ends; None where the views are too few to leave one out."""
     X = np.hstack([linear.design, scored.form.response])
     trials = linear.trial(X), linear.present, linear.trial(X, None, believed_size(linear, scored))
-    ends = linear.ends()
+    ends = linear.observation.ends(linear.measurement.views.joints)
     if not ends:
         return None
     squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]

@@ -10,6 +10,7 @@ O(pairs), never O(points x parameters).
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from stitch.statistics.robust import mad_sigma, tukey
 
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
 RMS_GATE = 4.0
+_OF_PAIRS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,20 @@ class Gram:
 
     def only(self, keep: Mask) -> "Gram":
         """The sums of some pairs (P,)."""
-        of_pairs = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
-        return replace(self, **{name: getattr(self, name)[keep] for name in of_pairs})
+        return replace(self, **{name: getattr(self, name)[keep] for name in _OF_PAIRS})
+
+    def followed_by(self, **sums: Any) -> "Gram":
+        """The sums, and after them those of further pairs of labelled points (P', ...) that have no surface."""
+        count = len(sums["pairs"])
+        nothing = np.zeros(count)
+        everything: dict[str, Any] = sums | {
+            "weight": nothing,
+            "count": nothing.astype(int),
+            "raw_square": nothing,
+            "labelled": nothing == 0,
+        }
+        joined: dict[str, Any] = {name: np.concatenate([getattr(self, name), everything[name]]) for name in _OF_PAIRS}
+        return replace(self, **joined)
 
     @property
     def variance(self) -> float:
@@ -70,22 +84,27 @@ def gram(
 ) -> Gram:
     """Accumulate the pairs; Tukey weights at `scale` unless `weights` gives them per match."""
     rows = [_accumulate(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
-    matrix, vector, square, weight, count, raw = (np.array(column) for column in zip(*rows, strict=True))
+    sums = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     pairs = np.array([(m.v, m.w) for m in matches])
-    return Gram(views, pairs, matrix, vector, square, weight, count, raw, scale, centre, np.zeros(len(pairs), bool))
+    return Gram(views=views, pairs=pairs, scale=scale, centre=centre, labelled=np.zeros(len(pairs), bool), **sums)
 
 
-def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> tuple[Array | float, ...]:
+def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> dict[str, Any]:
+    """The sums over one pair, by their names in `Gram`."""
     e = m.residual
     if weight is None:
         weight = m.weight * tukey(e, scale)
     B = np.concatenate([np.cross(m.middle - centre, m.normal), m.normal], axis=1)
     weighted = B * weight[:, None]
     inside = np.abs(e) < RMS_GATE * scale
-    return (
-        weighted.T @ B, weighted.T @ e, float(weight @ e**2), float(weight.sum()),
-        int(inside.sum()), float((e[inside] ** 2).sum()),
-    )  # fmt: skip
+    return {
+        "matrix": weighted.T @ B,
+        "vector": weighted.T @ e,
+        "square": float(weight @ e**2),
+        "weight": float(weight.sum()),
+        "count": int(inside.sum()),
+        "raw_square": float((e[inside] ** 2).sum()),
+    }
 
 
 def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:

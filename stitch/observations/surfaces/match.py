@@ -117,4 +117,4 @@ def _measure(scans: Sequence[Scan], poses: Array, v: int, w: int, index_v: Indic
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     weight = scans[v].confidence[index_v] * scans[w].confidence[index_w]
     residual = np.einsum("ij,ij->i", p - q, normal)
-    return Match(v, w, (p + q) / 2, normal, residual, weight, index_v, index_w)
+    return Match(v, w, (p + q) / 2, normal=normal, residual=residual, weight=weight, index_v=index_v, index_w=index_w)

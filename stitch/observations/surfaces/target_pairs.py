@@ -10,7 +10,7 @@ follow those of the surfaces in one Gram. Without one of n views the pairs that 
 below those of a new elimination: as little as surfaces change theirs.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -59,10 +59,8 @@ def target_pairs(sightings: Sightings, poses: Array) -> TargetPairs | None:
         information.append(w[a] * w[b] / w.sum())
     if not views:
         return None
-    return TargetPairs(
-        np.concatenate(views), np.concatenate(slots), np.concatenate(place), np.concatenate(apart),
-        np.concatenate(information),
-    )  # fmt: skip
+    of_pairs = [np.concatenate(parts) for parts in (place, apart, information)]
+    return TargetPairs(np.concatenate(views), np.concatenate(slots), *of_pairs)
 
 
 def joined(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
@@ -80,14 +78,7 @@ def joined(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
     pairs, matrix = by_pair(targets, np.einsum("nia,nib->nab", weighted, lever))
     vector = by_pair(targets, np.einsum("nia,ni->na", weighted, targets.apart))[1]
     square = by_pair(targets, weight * np.einsum("ni,ni->n", targets.apart, targets.apart))[1]
-    nothing = np.zeros(len(pairs))
-    return replace(
-        g, pairs=np.concatenate([g.pairs, pairs]), matrix=np.concatenate([g.matrix, matrix]),
-        vector=np.concatenate([g.vector, vector]), square=np.concatenate([g.square, square]),
-        weight=np.concatenate([g.weight, nothing]), count=np.concatenate([g.count, nothing.astype(int)]),
-        raw_square=np.concatenate([g.raw_square, nothing]),
-        labelled=np.concatenate([g.labelled, np.ones(len(pairs), bool)]),
-    )  # fmt: skip
+    return g.followed_by(pairs=pairs, matrix=matrix, vector=vector, square=square)
 
 
 def by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:

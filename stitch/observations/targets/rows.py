@@ -107,7 +107,18 @@ def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
     left[:V][absent[:V]], lever[absent[:V]], columns[:V][absent[:V]] = 0.0, 0.0, 0.0
     hand_eye = np.zeros((B, m, 6))
     hand_eye[:V] = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
-    return Rows(own, T_mount, centre, left, lever, hand_eye, columns, noise, fixed, 3 * S)
+    return Rows(
+        capture=own,
+        T_mount=T_mount,
+        centre=centre,
+        residual=left,
+        lever=lever,
+        hand_eye=hand_eye,
+        landmarks=columns,
+        noise=noise,
+        fixed=fixed,
+        positions=3 * S,
+    )
 
 
 def _draw(landmarks: Landmarks, views: int, left: Array, columns: Array, fixed: Array) -> None:

@@ -1,0 +1,77 @@
+"""Which way a run goes, from clouds or from labelled points, and its result collected at the end."""
+
+from dataclasses import dataclass
+
+from stitch.frames import Array
+from stitch.measurement.session import Session
+from stitch.runs.recorder import Recorder
+from stitch.runs.run import LedgerStep, Run, StageResult
+from stitch.stages import from_surfaces, from_targets
+from stitch.stages.coarse import Coarse
+from stitch.stages.finish import Finished
+from stitch.stages.fitted import Course, Fitted
+from stitch.stages.observability import unobservable
+
+
+def course_of(session: Session) -> Course:
+    """How a run goes with what was observed."""
+    return from_surfaces if session.has_clouds else from_targets
+
+
+@dataclass(frozen=True)
+class End:
+    """What all sessions of a rig have in common at the end of the fit."""
+
+    begun: Coarse
+    fitted: Fitted
+    seconds: float
+    effects_file: str | None
+    ledger: tuple[LedgerStep, ...] = ()
+    poses_before: Array | None = None  # (V, 4, 4) of the model before its last change
+
+
+def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
+    """Register and fuse one session, collect its result with its line in the history, and show it."""
+    course, fitted = course_of(session), end.fitted
+    finished = course.finish(session, fitted, index, before, recorder, end.seconds)
+    own, model = fitted.sessions[index], fitted.model
+    # With several sessions no joint has one place for all.
+    joints = session.joints if len(fitted.captures) == 1 else None
+    result = Run(
+        session=session,
+        measurement=own.measurement,
+        model=model,
+        T_mount_coarse=end.begun.T_mount,
+        unobservable=unobservable(fitted.captures, model.T_mount, session.robot, joints),
+        stages=finished.stages,
+        poses_model=finished.poses_model,
+        poses=finished.poses,
+        corrections=finished.corrections,
+        view_rms=finished.view_rms,
+        residual_rms=finished.residual_rms,
+        heldout_rms=finished.heldout_rms,
+        noise_floor=finished.noise_floor,
+        fused=finished.fused,
+        repeatability=finished.repeatability,
+        overlaps=finished.overlaps,
+        verdict=finished.verdict,
+        ledger=(*end.ledger, _step(fitted, finished)),
+        effects_file=end.effects_file,
+        poses_before=end.poses_before,
+        convergence=finished.convergence,
+        notes=course.notes(session, fitted, index, end.begun),
+        targets=own.targets,
+        outliers=own.outliers,
+    )
+    recorder.finish(result)
+    return result
+
+
+def _step(fitted: Fitted, finished: Finished) -> LedgerStep:
+    return LedgerStep(
+        effects=tuple(fitted.model.effects),
+        residual_rms=finished.residual_rms,
+        heldout_rms=finished.heldout_rms,
+        noise_floor=finished.noise_floor,
+        T_mount=fitted.model.T_mount,
+    )
