@@ -27,16 +27,15 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
-from stitch.pipeline import diagnose
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import linear_of_state
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
-from stitch.pipeline import change, run
+from stitch.pipeline import change, diagnose, run
 from stitch.runs.run import Run
-from stitch.stepwise import suggest
 from stitch.runs.state import State, state_of
+from stitch.stepwise import suggest
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]

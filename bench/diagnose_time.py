@@ -17,18 +17,18 @@ from pathlib import Path
 from subprocess import DEVNULL, Popen
 
 import numpy as np
+from stitch.observations.surfaces.point_effects import POINTS, point_gram
 
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
-from stitch.effects.in_session import lacking
 from stitch.diagnosis.candidates import _grid_terms
 from stitch.effects.contract import EFFECTS
+from stitch.effects.in_session import lacking
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
-from stitch.observations.surfaces.point_effects import POINTS, point_gram
 from stitch.stored.load_state import load_state
 from stitch.system.threads import library_threads_off
 
@@ -73,7 +73,7 @@ def streamed(run: Path, correspondences: int) -> None:
         per_view = round(1000 * correspondences / few.gram.count.sum())
         many = collect(own, poses, state.gate, [sample(scan, per_view) for scan in own.scans])
     before = _peak()
-    effects = [e for e in EFFECTS.values() if e.place in POINTS and not state.lacking(measurement, e)]
+    effects = [e for e in EFFECTS.values() if e.place in POINTS and not lacking(state.measurement, e)]
     terms = [t for e in effects for t in _grid_terms(e, state.measurement.parameters(e))]
     start = time.perf_counter()
     sums = point_gram(state.measurement, state.terms, terms, FreePoses(poses, np.zeros((len(poses), 6)), many))

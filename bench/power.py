@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from blind_cells import drawn, smallest
 from blind_trials import LIBRARY, cell_without, pin
+from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.diagnose import checked
@@ -20,7 +21,6 @@ from stitch.diagnosis.diagnosis import CandidateEffect
 from stitch.diagnosis.selection.verdict import implausible, select
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 from stitch.statistics.variance_components import fit_variances
 
 

@@ -1,0 +1,1 @@
+"""Hand-eyes from spheres and trackers, and an arm's own errors as DH rows and URDF."""

@@ -1,0 +1,1 @@
+"""Where model and measurements differ: the residual against everything that is known of it."""

@@ -1,1 +1,1 @@
-"""Which effect is missing: evidence counted in views, every candidate tried, aliases named, the next view proposed."""
+"""Which effect is missing: candidates scored, a verdict selected and validated, the next view designed."""

@@ -1,4 +1,4 @@
-"""Physical effects along the chain of frames: what nature does, in the form a user would write one.
+"""Physical effects along the chain of frames, each a short function: what nature does.
 
 Importing the package registers the library; `user_file.load` adds a user's own.
 """

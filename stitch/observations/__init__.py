@@ -1,0 +1,1 @@
+"""What was seen as one linear model: overlapping surfaces, or labelled targets."""

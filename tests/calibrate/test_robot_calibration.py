@@ -15,9 +15,9 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.calibrate.robot_calibration import calibrated, dh_rows
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
-from stitch.model.term import term_of
 from stitch.measurement.robot import forward
 from stitch.model.forward import corrected
+from stitch.model.term import term_of
 from stitch.pipeline import run
 from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.urdf import robot_from_urdf

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from stitch.writing.urdf_file import to_urdf
 from stitch import frames
 from stitch.measurement.robot import (
     forward,
@@ -15,6 +14,7 @@ from stitch.measurement.robot import (
 )
 from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.urdf import robot_from_urdf
+from stitch.writing.urdf_file import to_urdf
 
 ROWS = [
     {"a": 350, "alpha_deg": -90, "d": 815, "theta_deg": 0, "mass": 120, "com": [-175, 20, 10]},

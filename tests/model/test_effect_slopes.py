@@ -43,7 +43,9 @@ def test_twists_are_the_derivative_of_the_poses(still_cells, name):
         h = (0.001 if parameter.grid else 0.01) * parameter.typical
         carried = []
         for sign in (1, -1):
-            left, right = perturbed_frames(measurement, [term_of(measurement, effect).at(values + sign * h * np.eye(len(values))[i])])
+            left, right = perturbed_frames(
+                measurement, [term_of(measurement, effect).at(values + sign * h * np.eye(len(values))[i])]
+            )
             left0, right0 = perturbed_frames(measurement, [term_of(measurement, effect).at(values)])
             carried.append(frames.transform(left @ T @ right @ frames.inverse(left0 @ T @ right0), point[None])[:, 0])
         expected = (carried[0] - carried[1]) / (2 * h)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from stitch.system.native import load_open3d
 from stitch.errors import InputError
 from stitch.reading import lzf
 from stitch.reading.clouds import read_cloud

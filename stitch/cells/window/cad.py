@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import igl
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -11,7 +12,6 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.system.native import load_open3d
 
 # Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
 _SAME_SIDE = np.cos(np.radians(45.0))
@@ -24,7 +24,7 @@ class Surface:
     """A triangle mesh with two ways to search it; part frame."""
 
     mesh: Any  # trimesh.Trimesh
-    scene: Any  # Open3D ray-casting scene of the mesh about its centre, single precision
+    boxes: Any  # igl.AABB: tree of bounding boxes over the triangles
     centre: Array  # (3,)
     size: float  # diagonal of the bounding box
     spacing: float  # of the samples
@@ -62,17 +62,16 @@ def read_cad(file: Path) -> Surface:
 
 def surface(mesh: Any) -> Surface:
     """Make a trimesh ready for searching."""
-    o3d = load_open3d()
     centre = mesh.bounds.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.float32(mesh.vertices - centre), np.uint32(mesh.faces))
+    boxes = igl.AABB()
+    boxes.init(*_arrays(mesh))
     count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
     return Surface(
         mesh,
-        scene,
+        boxes,
         centre,
         size=size,
         spacing=float(np.sqrt(mesh.area / count)),
@@ -89,11 +88,7 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
     A normal that lies between is smeared over an edge and has no partner.
     """
-    o3d = load_open3d()
-    found = cad.scene.compute_closest_points(o3d.core.Tensor(np.float32(points - cad.centre)))
-    face = found["primitive_ids"].numpy().astype(np.int64)
-    # The scene works in single precision and only says which triangle; the place is computed in double.
-    place = trimesh.triangles.closest_point(cad.mesh.triangles[face], points)
+    _, face, place = cad.boxes.squared_distance(*_arrays(cad.mesh), np.ascontiguousarray(points, float))
     normal = np.array(cad.mesh.face_normals[face])
     distance, accept = _judge(points - place, normal, normals, 1e-3 * cad.spacing)
     other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) < _FAR_SIDE)
@@ -103,6 +98,11 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
         off = points[other] - cad.samples[index]
         distance[other], accept[other] = _judge(off, normal[other], normals[other], 2 * cad.spacing)
     return Nearest(distance, normal, accept)
+
+
+def _arrays(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices and faces as libigl takes them."""
+    return np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.int64)
 
 
 def sample_partners(cad: Surface, points: Array, normals: Array) -> NDArray[np.int64]:

@@ -9,15 +9,15 @@ from stitch import frames
 from stitch.cells.window.cad import Surface, sample_partners
 from stitch.cells.window.cad_fit import moved_about
 from stitch.cells.window.joined_scans import Joined
+from stitch.closed_form import feature_matching
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.system.native import load_open3d
 
 _FEWEST = 50
 _POINTS = 1500  # of the scan that judge a candidate
 _KEEP = 6  # candidates that are refined
 _REFINE = 20  # steps of a candidate's refinement
-_FEATURE_RUNS = 3
+_FEATURE_RUNS, _FEATURE_DRAWS, _FEATURE_SAMPLES = 3, 50_000, 6000
 # A start of which less than a third of the scan meets the CAD is none.
 _LEAST_SHARE = 1 / 3
 # A pose that so much of the scan agrees with needs no second opinion.
@@ -36,7 +36,7 @@ class Start:
 def find_start(scan: Joined, cad: Surface) -> Start:
     """Try the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets; refine.
 
-    Features are FPFH with RANSAC (Rusu et al. 2009, through Open3D): they serve where the scan shows only a piece of
+    Features are FPFH with RANSAC (Rusu et al. 2009): they serve where the scan shows only a piece of
     the part, principal axes where it is too smooth for features.
 
     Raises:
@@ -91,39 +91,15 @@ def _by_axes(points: Array, cad: Surface) -> list[Array]:
 
 
 def _by_features(points: Array, normals: Array, cad: Surface) -> list[Array]:
-    o3d = load_open3d()
+    """Poses (4, 4) from feature matching, one per seed."""
     size = cad.size / 60
-    step = max(1, len(cad.samples) // 6000)
-
-    def cloud(p: Array, n: Array):  # type: ignore[no-untyped-def]
-        made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
-        made.normals = o3d.utility.Vector3dVector(n)
-        search = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * size, max_nn=100)
-        return made, o3d.pipelines.registration.compute_fpfh_feature(made, search)
-
-    scan_points, scan_features = cloud(points, normals)
-    cad_points, cad_features = cloud(cad.samples[::step], cad.normals[::step])
-    registration = o3d.pipelines.registration
-    checks = [
-        registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-        registration.CorrespondenceCheckerBasedOnDistance(1.5 * size),
-    ]
+    step = max(1, len(cad.samples) // _FEATURE_SAMPLES)
+    scan = feature_matching.describe(points, normals, 5 * size)
+    part = feature_matching.describe(cad.samples[::step], cad.normals[::step], 5 * size)
     found = []
-    for run in range(_FEATURE_RUNS):
-        o3d.utility.random.seed(run)
-        result = registration.registration_ransac_based_on_feature_matching(
-            scan_points,
-            cad_points,
-            scan_features,
-            cad_features,
-            mutual_filter=True,
-            max_correspondence_distance=1.5 * size,
-            estimation_method=registration.TransformationEstimationPointToPoint(False),
-            ransac_n=3,
-            checkers=checks,
-            criteria=registration.RANSACConvergenceCriteria(50_000, 0.999),
-        )
-        found.append(frames.inverse(np.array(result.transformation)))
+    for seed in range(_FEATURE_RUNS):
+        T_part_base = feature_matching.register(scan, part, reach=1.5 * size, draws=_FEATURE_DRAWS, seed=seed)
+        found.append(frames.inverse(T_part_base))
     return found
 
 

@@ -1,11 +1,13 @@
 """Several parts of the same kind in one scan."""
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from stitch.cells.window.cad import Surface
 from stitch.cells.window.joined_scans import Joined
 from stitch.errors import NoResultError
-from stitch.system.native import load_open3d
 
 # Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
 _GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40
@@ -14,18 +16,19 @@ _LEAST = 0.1
 
 
 def split(scan: Joined, cad: Surface, wanted: int) -> list[Joined]:
-    """The scan's heaps of points (DBSCAN, Ester et al. 1996, through Open3D), largest first.
+    """The scan's heaps of points, linked where nearer than the gap between parts, largest first.
 
     Raises:
         NoResultError: fewer heaps of a part's size than wanted.
     """
     if wanted == 1:
         return [scan]
-    o3d = load_open3d()
     gap = max(_GAP_SPACINGS * scan.spacing, _GAP_SHARE * cad.size)
     cells, where = np.unique(np.floor(scan.points / (gap / 3)).astype(int), axis=0, return_inverse=True)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((cells + 0.5) * gap / 3))
-    labels = np.asarray(cloud.cluster_dbscan(eps=gap, min_points=1))[where.ravel()]
+    # Cells three to a gap: those whose centres lie within it belong together.
+    pairs = cKDTree(cells).query_pairs(3.0, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+    labels = connected_components(graph, directed=False)[1][where.ravel()]
     heaps = [labels == label for label in range(labels.max() + 1)]
     # Of a part at most one side is seen, so half its surface is the most a heap can hold.
     big = [heap for heap in heaps if scan.area[heap].sum() > _LEAST * cad.mesh.area / 2]

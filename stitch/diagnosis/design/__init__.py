@@ -1,0 +1,1 @@
+"""What to measure next: candidate views and what they would tell apart."""

@@ -1,0 +1,1 @@
+"""From scores to a verdict: ranking, forward selection, backward elimination."""

@@ -1,0 +1,1 @@
+"""What these views can show: detectable sizes, aliases, bias of the hand-eye by omitted effects."""

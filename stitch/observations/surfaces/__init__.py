@@ -1,0 +1,1 @@
+"""Overlapping surfaces: matches, sums over pairs of views, freed views, their linear model."""

@@ -1,0 +1,1 @@
+"""Labelled points and probes: landmarks, rows, outliers, their linear model."""

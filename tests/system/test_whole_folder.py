@@ -1,0 +1,117 @@
+"""A folder is there as it was or as it shall be, and a person's own files outlive every change."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from stitch.errors import InputError
+from stitch.system import whole_folder
+from stitch.system.locks import only_writer
+from stitch.system.whole_folder import claimed, rewritten
+
+
+def ours(inside):
+    return inside.name in ("model", "result")
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = tmp_path / "run"
+    (run / "own" / "empty").mkdir(parents=True)
+    for name in ("model", "result", "notes", "own/model.txt"):
+        (run / name).write_text(f"old {name}")
+    (run / "link").symlink_to("nowhere")
+    return run
+
+
+def contents(folder):
+    return {
+        str(p.relative_to(folder)): p.read_text() if p.is_file() else str(p.is_symlink()) for p in folder.rglob("*")
+    }
+
+
+KEPT = {
+    "notes": "old notes",
+    "own": "False",
+    "own/empty": "False",
+    "own/model.txt": "old own/model.txt",
+    "link": "True",
+}
+
+
+def rewrite(run):
+    with rewritten(run, ours) as scratch:
+        (scratch / "model").write_text("new")
+
+
+@pytest.mark.parametrize("way", ["exchange", "two renames", "in place", "link"])
+def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
+    path = run
+    if way == "two renames":
+        monkeypatch.setattr(whole_folder, "exchange", lambda *_: False)
+    elif way == "in place":
+        monkeypatch.chdir(run)
+    elif way == "link":
+        path = tmp_path / "link"
+        path.symlink_to(run)
+    before = run.stat().st_ino
+    rewrite(path)
+    assert contents(run) == KEPT | {"model": "new"}
+    assert path.is_symlink() == (way == "link")
+    assert {p.name for p in tmp_path.iterdir()} == {"run", *(["link"] if way == "link" else [])}
+    if way == "in place":
+        assert run.stat().st_ino == before, "who stands in it must not stand in a folder that is gone"
+
+
+def test_a_block_that_fails_changes_nothing(run, tmp_path):
+    before = contents(run)
+    with pytest.raises(OSError, match="disk full") as error, rewritten(run, ours) as scratch:
+        (scratch / "model").write_text("new")
+        raise OSError(28, "disk full", str(scratch / "model"))
+    assert contents(run) == before and list(tmp_path.iterdir()) == [run]
+    assert error.value.filename == str(run / "model"), "the scratch folder is nobody's business"
+
+
+@pytest.mark.parametrize("moment", range(12))
+def test_an_end_at_any_moment_of_a_change_in_place_is_made_good(run, monkeypatch, moment):
+    """The process ends before its n-th call that changes the disk; whoever comes next finishes or clears away."""
+    before = contents(run)
+    monkeypatch.chdir(run)
+    process = os.fork()
+    if not process:
+        calls = iter(range(moment))
+        for name in ("rename", "replace", "unlink"):
+            true = getattr(type(run), name)
+            monkeypatch.setattr(
+                type(run),
+                name,
+                lambda *a, true=true, **k: true(*a, **k) if next(calls, None) is not None else os._exit(9),
+            )
+        rewrite(run)
+        os._exit(0)
+    os.waitpid(process, 0)
+    with claimed(run):
+        pass
+    assert contents(run) in (before, KEPT | {"model": "new"})
+
+
+def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path):
+    lock = tmp_path / ".r.lock"
+    code = f"""
+import sys, time
+from pathlib import Path
+from stitch.system.locks import only_writer
+with only_writer(Path({str(lock)!r}), Path("r")):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(InputError, match="r: another stitch is writing there"), only_writer(lock, "r"):
+            pass
+        other.kill()
+    with only_writer(lock, "r"), only_writer(lock, "r"):
+        assert lock.exists()
+    assert not lock.exists()
