@@ -26,8 +26,8 @@ _BAD_KEYS = {
     "robot.dh": ('"craig"', "5"),
     "robot.urdf": ('"nowhere.urdf"', "5", '"."'),
 }
-_NAMES = ("..", "../x", "/abs", "a/b", "", " ", ".hid", "a\\u0000b", "a\\nb", "x" * 300, "y" * 100_000, "a:b")
-_ODD_NAMES = ("[red]x[/red]", ":smile: part", "Größe µ 7", "O'Brien & Söhne", "a" * 150)
+_NAMES = ("..", "../x", "/abs", "a/b", "", " ", ".hid", "a\\u0000b", "a\\nb", "x" * 300, "y" * 100_000)
+_ODD_NAMES = ("[red]x[red]", ":smile: part", "Größe µ 7", "O'Brien & Söhne", "a" * 150)
 
 
 def _toml(change: Callable[[str], str | bytes], command: list[str] = RUN) -> Callable[[Path], list[str]]:

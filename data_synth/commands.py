@@ -2,18 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from data_synth.judgement import judge
 from data_synth.nature import LAWS
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session, write_truth
-from stitch import frames
 from stitch.errors import InputError
 
 
@@ -93,68 +93,3 @@ def reveal(
     for key, value in judged.items():
         table.add_row(key.replace("_", " "), value if isinstance(value, str) else json.dumps(value))
     Console(stderr=True).print(table)
-
-
-def judge(run: Path, truth: Path) -> dict[str, Any]:
-    """Hidden, named and fitted effects, and the hand-eye's true error (mm at 400 mm before the scanner).
-
-    Raises:
-        InputError: a file is missing, not JSON or without what belongs there.
-    """
-    told = _read(truth, "hidden", "hand_eye")
-    result = _read(run / "result.json", "length_unit", "hand_eye", "hand_eye_coarse")
-    diagnosis = _read(run / "diagnosis.json") if (run / "diagnosis.json").is_file() else {}
-    hidden, fitted = told["hidden"], result.get("effects", {})
-    place = np.array([[0.0, 0.0, 400.0]])
-    scale = {"mm": 1.0, "m": 1000.0}[result["length_unit"]]
-
-    def off(T: Any) -> float:
-        T = np.array(T)
-        T[:3, 3] *= scale
-        difference = frames.transform(T, place) - frames.transform(np.array(told["hand_eye"]), place)
-        return round(float(np.linalg.norm(difference)), 4)
-
-    named = set(diagnosis.get("effects", []))
-    judged: dict[str, Any] = {
-        "hidden": hidden,
-        "verdict": diagnosis.get("verdict", "not diagnosed"),
-        "named": sorted(named),
-        "judgement": _judgement(set(hidden), diagnosis.get("verdict"), named, set(fitted)),
-        "hand_eye_error_coarse_mm": off(result["hand_eye_coarse"]),
-        "hand_eye_error_mm": off(result["hand_eye"]),
-    }
-    for effect, parameters in hidden.items():
-        for name, value in parameters.items():
-            got = fitted.get(effect, {}).get(name)
-            if got:
-                sigma = "" if got["sigma"] is None else f" ± {got['sigma']:.1g}"
-                judged[f"{effect}.{name}"] = f"{got['value']:.3g}{sigma}, true {value:.3g}"
-    return judged
-
-
-def _judgement(hidden: set[str], verdict: str | None, named: set[str], fitted: set[str]) -> str:
-    left = hidden - fitted
-    if fitted - hidden:
-        return f"wrong: {', '.join(sorted(fitted - hidden))} was added and is not there"
-    if verdict is None:
-        return "complete" if not left else f"not found yet: {', '.join(sorted(left))}"
-    if verdict == "adequate":
-        return "right" if not left else f"missed: {', '.join(sorted(left))}"
-    if verdict == "unknown_effect":
-        return "right: something is there" if left else "wrong: nothing is left"
-    if named & left:
-        return "right" if verdict == "missing_effect" else "right: among those that cannot be told apart"
-    return "wrong name"
-
-
-def _read(path: Path, *needed: str) -> dict[str, Any]:
-    try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: not found") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(f"{path}: not a JSON file: {error}") from None
-    for key in needed:
-        if not isinstance(document, dict) or key not in document:
-            raise InputError(f"{path}: {key} is missing; is it the right file?")
-    return document

@@ -136,3 +136,11 @@ def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
 def angle_between(T_a: Array, T_b: Array) -> Array:
     """Rotation angle (rad) between transforms (..., 4, 4)."""
     return np.asarray(np.linalg.norm(log(inverse(T_a) @ T_b)[..., :3], axis=-1))
+
+
+def right_jacobian_inverse(rotation: Array) -> Array:
+    """(3, 3) with log(exp(r)·exp(φ)) = r + J⁻¹φ for a rotation vector r (3,) and a small turn φ (Barfoot, 7.1.4)."""
+    angle, hat = float(np.linalg.norm(rotation)), skew(rotation)
+    if angle < _SMALL_ANGLE:
+        return np.asarray(np.eye(3) + hat / 2 + hat @ hat / 12)
+    return np.asarray(np.eye(3) + hat / 2 + (1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))) * hat @ hat)

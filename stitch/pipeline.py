@@ -7,6 +7,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
+from stitch.frames import Array
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
@@ -100,8 +101,13 @@ def diagnose(run: Run | State) -> Diagnosis:
     return diagnose_state(state_of(run) if isinstance(run, Run) else run)
 
 
-def change(state: State, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+def change(
+    state: State, effects: Sequence[str], recorder: Recorder | None = None, poses_before: Array | None = None
+) -> Run:
     """The run with these effects in its model: hand-eye and all effects fitted together, matched anew.
+
+    Args:
+        poses_before: (V, 4, 4) T_reference_scanner to compare with; default those of the model before.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.
@@ -121,7 +127,8 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = kind.refit([session], [measurement], model, [state.gate])
-        poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
+        if poses_before is None:
+            poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
         end = End(begun, fitted, clock.lap(), state.effects_file, state.ledger, poses_before)
         return collected(session, 0, end, before, recorder)
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES, rounded
@@ -33,6 +34,8 @@ def _content(run: Run) -> dict[str, object]:
         "um": MICROMETRES[run.session.length_unit],
         "views": rows,
         "hand_eye": _hand_eye(run),
+        "hand_eye_matrix": _matrix(run),
+        "mount_frame": "base" if run.session.mount == "eye_to_hand" else "flange",
         "effects": _effects(run),
         "history": _history(run),
         "largest": max((row["shift"] for row in rows), default=1.0) or 1.0,
@@ -119,15 +122,20 @@ def _history(run: Run) -> list[tuple[str, str, str]]:
 
 
 def _hand_eye(run: Run) -> list[dict[str, object]]:
-    """Rows of the hand-eye table: name, coarse, corrected, sigma, unit."""
+    """Rows of the hand-eye table: name, coarse, corrected, U (k = 2), unit; all in the mount frame."""
     mm = MICROMETRES[run.session.length_unit] / 1e3
-    sigma = np.sqrt(np.diag(run.mount_covariance))
     values = []
     for T in (run.T_mount_coarse, run.T_mount):
         values.append([*(T[:3, 3] * mm), *np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec())])
-    sigmas = [*(sigma[3:] * mm), *np.degrees(sigma[:3])]
+    U = expanded(run.T_mount, run.mount_covariance)
+    expanded_units = [*(U[3:] * mm), *np.degrees(U[:3])]
     names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "°") for axis in "xyz"]
     return [
-        {"name": name, "unit": unit, "coarse": coarse, "corrected": corrected, "sigma": s}
-        for (name, unit), coarse, corrected, s in zip(names, values[0], values[1], sigmas, strict=True)
+        {"name": name, "unit": unit, "coarse": coarse, "corrected": corrected, "U": u}
+        for (name, unit), coarse, corrected, u in zip(names, values[0], values[1], expanded_units, strict=True)
     ]
+
+
+def _matrix(run: Run) -> str:
+    """The corrected hand-eye as four rows to copy, in the form of session.toml."""
+    return "pose = " + "[\n  " + ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount) + ",\n]"

@@ -41,7 +41,9 @@ def add(
 ) -> None:
     """Add effects to the model of a run, fit hand-eye and all effects anew, and show what it brought."""
     if bool(effects) == suggested:
-        raise InputError("name the effects to add, or let the diagnosis choose with --suggested (one of the two)")
+        raise InputError(
+            "add what? to fix: name the effects, or let --suggested choose; one of the two"
+        )
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
         if suggested:
@@ -51,7 +53,7 @@ def add(
         for name in effects or []:
             require(state.measurement, known(name))
             if name in used:
-                raise InputError(f"{name} is in the model of {run} already")
+                raise InputError(f"{name} is in the model of {run} already; to fix: leave it out")
         _change(run, state, [*used, *(effects or [])], recording, as_json)
 
 
@@ -65,8 +67,7 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
                 before = replace(state_of(result), ledger=result.ledger[:-1])
-                again = change(before, list(result.effects), recorder_for(scratch, recording))
-                result = replace(again, poses_before=result.poses_before)
+                result = change(before, result.effects, recorder_for(scratch, recording), result.poses_before)
             run_folder.write_with_page(result, scratch)
         _show(result, as_json)
     elif as_json:

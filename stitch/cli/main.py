@@ -26,6 +26,7 @@ from stitch.cli.report import report
 from stitch.cli.run import run
 from stitch.cli.streams import results_alone, speak_any_terminal
 from stitch.errors import StitchError
+from stitch.reading.text_file import shortened
 from stitch.system import time_limit
 
 _COMMANDS: dict[str, Callable[..., Any]] = {
@@ -86,7 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
     except OSError as error:
         fix = _FIXES.get(error.errno or 0, "")
-        _end(f"{error.filename or 'file system'}: {error.strerror or error}{fix}", 2)
+        place = shortened(error.filename, 200).strip("'") if error.filename else "file system"
+        _end(f"{place}: {error.strerror or error}{fix}", 2)
     except MemoryError:
         _end("not enough memory; leave out views, or thin the scans", 1)
     except Exception as error:

@@ -53,7 +53,7 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
         NoResultError: no points in the file.
     """
     if not file.is_file():
-        raise InputError(f"{file}: no such file")
+        raise InputError(f"{file}: no such file; to fix: name an export of the controller")
     if unit not in _SCALE:
         raise InputError(f"--unit {unit}: use mm or m")
     reader = _READERS.get(file.suffix.lower())

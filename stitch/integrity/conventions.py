@@ -25,6 +25,8 @@ _SAMPLES = 60
 # from it: (1 − score) counts open motions.
 _CLOSES = 0.6
 _CLEARER = 0.6
+# Poses whose motions nearly all close need no other convention.
+_ALL = 0.95
 # Motions: below, chance agrees.
 _FEWEST = 4
 
@@ -45,9 +47,10 @@ def explained(session: Session, motions: RelativeScans) -> list[Explained]:
     if len(motions.pairs) < _FEWEST:
         return []
     length = TRANSLATION_M / METRES[session.length_unit]
-    tried = distinct(hypotheses(session), 1e-3, 1e-3 * length)
-    out = [_fit(h, motions, length, False) for h in tried]
-    out += [_fit(h, motions, length, True) for h in tried[:1]]
+    tried_all = hypotheses(session)
+    out = [_fit(tried_all[0], motions, length, scaled) for scaled in (False, True)]
+    if out[0].closed < _ALL:
+        out += [_fit(h, motions, length, False) for h in distinct(tried_all, 1e-3, 1e-3 * length)[1:]]
     return sorted(out, key=lambda e: (e.open, e.hypothesis.kind != "stated"))
 
 

@@ -8,9 +8,9 @@ from scipy.optimize import minimize_scalar
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.linkage import only
-from stitch.integrity.placing import surface_of
+from stitch.integrity.placing import shows_no_surface, surface_of
 from stitch.integrity.problems import Problem
-from stitch.integrity.scan_faults import copies, same_poses, scan_fault
+from stitch.integrity.scan_faults import ScanFault, copies, same_poses, scale_fault, scan_fault
 from stitch.integrity.snooping import Misplaced, Snooping
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.robot import forward
@@ -100,15 +100,10 @@ def _single(
 ) -> Problem:  # fmt: skip
     names = [view.name for view in session.views]
     own = (names[m.view],)
+    fault = _fault(capture, T_mount, found, m)
+    if fault is not None:
+        return Problem(fault.kind, own, fault.fix)
     if m.T is None:
-        poses = found.freed.poses
-        core = [v for v in found.linkage.core if v != m.view]
-        surface = surface_of(capture.scans, poses, core, found.tolerance)
-        fault = scan_fault(
-            capture.scans[m.view], capture.poses(T_mount)[m.view], surface, part_size([capture]), found.needed
-        )
-        if fault is not None:
-            return Problem(fault.kind, own, fault.fix)
         return Problem("foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out")
     amount = f"{m.distance:.4g} {session.length_unit} and {np.degrees(m.rotation):.3g}°"
     partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
@@ -125,6 +120,17 @@ def _single(
         return Problem(kind, own, f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit ({amount} off): "
                        "correct it or leave the view out")  # fmt: skip
     return Problem("displaced", own, f"its pose is off by {amount}: correct the row, scan again or leave the view out")
+
+
+def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> ScanFault | None:
+    """What is wrong with the cloud of a view, rather than with its pose."""
+    scan, T_pose = capture.scans[m.view], capture.poses(T_mount)[m.view]
+    if shows_no_surface(scan):
+        return None
+    others = [v for v in found.linkage.core if v != m.view]
+    surface = surface_of(capture.scans, found.freed.poses, others, found.tolerance)
+    look = scan_fault if m.T is None else scale_fault
+    return look(scan, T_pose, surface, part_size([capture]), found.needed)
 
 
 def _one_joint(

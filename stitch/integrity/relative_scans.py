@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.placing import Placement, place, shows_no_surface, surface_of
-from stitch.measurement.capture import Capture
-from stitch.measurement.capture import part_size
+from stitch.measurement.capture import Capture, part_size
 
 # A pair counts if this share of the surface near lies on it, and this share of the scan is near.
 _CLOSES, _SHARED = 0.75, 0.35

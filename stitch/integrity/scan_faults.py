@@ -5,11 +5,14 @@ from itertools import combinations
 
 import numpy as np
 
+from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.hypotheses import UNITS
 from stitch.integrity.placing import Surface, judge, place, starts_about
 from stitch.measurement.capture import Capture
 from stitch.measurement.scan import Scan, prepare_view
+from stitch.observations.surfaces.match import sample
+from stitch.statistics.robust import tukey
 
 # Reflections of the scanner frame, with what was done.
 _FLIPS = {
@@ -20,9 +23,10 @@ _FLIPS = {
     "y and z are exchanged": np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]),
     "x and z are exchanged": np.array([[0.0, 0, 1], [0, 1, 0], [1, 0, 0]]),
 }
-# Factors near one that a wrong calibration or shrinkage makes.
-_SCALES = np.geomspace(0.8, 1.25, 31)
-_NEAR_ONE = 1e-3
+# Factors that are looked for; nearer to one than the last, scanners differ from robots.
+_LEAST_SCALE, _NEAR_ONE = 0.5, 1e-3
+# Of the shift that a scale makes along the ray, the share that its own uncertainty may leave.
+_RANGE_LEFT = 0.3
 
 
 @dataclass(frozen=True)
@@ -55,17 +59,48 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
     for factor, words in UNITS.items():
         if closes(scan.points * factor, True) > needed:
             return ScanFault("unit", f"this cloud is in another unit ({words}): multiply it by {factor:.6g}")
-    if scan.tree.n < 20:
+    return scale_fault(scan, T_pose, surface, size, needed)
+
+
+def scale_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed: float) -> ScanFault | None:
+    """A factor on the cloud under which it closes at its own pose; None if there is none."""
+    begin = place(scan, surface, np.concatenate([T_pose[None], starts_about(T_pose, scan, size)]), size)[0]
+    scale = _similarity(scan, begin.T, surface, size)
+    if not (_LEAST_SCALE < scale < 1 / _LEAST_SCALE) or abs(scale - 1) < _NEAR_ONE:
         return None
-    first = [closes(scan.points * s, False) for s in _SCALES]
-    about = _SCALES[np.argsort(first)[-3:]]
-    fine = np.geomspace(about.min() / 1.008, about.max() * 1.008, 40)
-    found = [closes(scan.points * s, False) for s in fine]
-    best = float(fine[int(np.argmax(found))])
-    closed = max(max(found), closes(scan.points * best, True))
-    if closed > needed and abs(best - 1) > _NEAR_ONE:
-        return ScanFault("scale", f"this cloud is {1 / best:.4g} times too large: multiply it by {best:.5g}")
-    return None
+    other = prepare_view(scan.name, scan.points * scale)
+    found = judge(other, T_pose, surface)
+    if found.closure < needed:
+        # The factor from the shape is good to a thousandth; the range that it leaves is one of millimetres.
+        found = place(other, surface, T_pose[None], 0.2 * size)[0]
+        middle = other.points.mean(axis=0)[None]
+        moved = np.linalg.norm(frames.transform(found.T, middle) - frames.transform(T_pose, middle))
+        if found.closure < needed or moved > _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(middle):
+            return None
+    return ScanFault("scale", f"this cloud is {1 / scale:.4g} times as large as the part: multiply it by {scale:.5g}")
+
+
+def _similarity(scan: Scan, T: Array, surface: Surface, size: float) -> float:
+    """Factor on the scan's points that fits a surface best, with its pose: point-to-plane, seven unknowns."""
+    index = sample(scan, 600)
+    points, normals = scan.points[index], scan.normals[index]
+    centre, scale = points.mean(axis=0), 1.0
+    lever = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
+    for gate in np.maximum(size * np.geomspace(0.1, 0.01, 25), 1.5 * surface.spacing):
+        shown = centre + scale * (points - centre)
+        residual, normal, found = (x[0] for x in surface.meets(T[None], shown, normals, gate))
+        arm = frames.transform(T, shown) - frames.transform(T, centre[None])
+        along = np.einsum("nj,nj->n", arm, normal)[:, None] / lever
+        J = np.concatenate([np.cross(arm, normal) / lever, normal, along], axis=1)
+        spread = 1.4826 * np.median(np.abs(residual[found])) if found.any() else gate
+        weight = found * tukey(residual, max(spread, surface.tolerance / 4))
+        H = J.T @ (weight[:, None] * J)
+        step = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1e-9) * np.eye(7), J.T @ (weight * residual))
+        step[[0, 1, 2, 6]] /= lever
+        to = frames.make(np.eye(3), -frames.transform(T, centre[None])[0])
+        T = frames.inverse(to) @ frames.exp(step[:6]) @ to @ T
+        scale *= 1 + float(step[6])
+    return scale
 
 
 def copies(capture: Capture) -> list[tuple[int, int]]:

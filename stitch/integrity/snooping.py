@@ -24,9 +24,8 @@ from stitch.integrity.placing import (
     surface_of,
 )
 from stitch.integrity.view_test import ViewModel, view_model
-from stitch.measurement.capture import Capture
+from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
-from stitch.measurement.capture import part_size
 
 # On the surface of the others: four robust sigmas of the overlaps.
 _TOLERANCE_SIGMAS = 4.0

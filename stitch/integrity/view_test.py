@@ -32,6 +32,7 @@ class ViewModel:
     views: Array  # (V, n, 6) response to a left twist of one view about `centre`, rotations in 1/lever
     carried: Array  # (V, 6, 6) from a twist of the flange to that twist, rotations in 1/lever
     mounts: Array  # (V, n, 6) response of one view to a correction of its own hand-eye
+    mount_twists: Array  # (V, 6, 6) the twist of a view that such a correction makes, rotations in 1/lever
     noise: Array  # (n, n) covariance of the sensor noise within overlaps
     centre: Array  # (3,) reference frame
     lever: float  # length_unit: rotations about `centre` count as displacements at this distance
@@ -89,6 +90,7 @@ def view_model(capture: Capture, T_mount: Array, freed: FreePoses) -> ViewModel:
         views=left @ unit,
         carried=np.linalg.inv(unit) @ carried,
         mounts=left @ J,
+        mount_twists=np.linalg.inv(unit) @ J,
         noise=np.diag(g.variance / values),
         centre=g.centre,
         lever=lever,

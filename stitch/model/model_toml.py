@@ -69,7 +69,7 @@ def read_model(path: Path) -> ModelFile:
     path = path / "model.toml" if path.is_dir() else path
     document = read_toml(path, "name a run folder that `stitch run` wrote")
     if document.get("format") != FORMAT:
-        raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"')
+        raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"; to fix: name a model that `stitch run` wrote')
     hand_eye = document.get("hand_eye", {})
     corrected = _matrix(path, hand_eye, "corrected", 4)
     coarse = _matrix(path, hand_eye, "coarse", 4) if "coarse" in hand_eye else corrected
@@ -102,9 +102,9 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
             out[str(name)] = Target(np.array(t["position"], float), np.array(t["sigma"], float), orientation)
             if out[name].position.shape != (3,) or (orientation is not None and orientation.shape != (3, 3)):
                 raise ValueError
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{path}: targets must be tables such as [targets.ball1] with position and sigma, three numbers each"
+            f"{path}: targets must be tables such as [targets.ball1] with position and sigma; to fix: write three numbers each"
         ) from None
     return out
 
@@ -126,17 +126,18 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
             }
             for name, parameters in table.items()
         }
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{path}: effects must be tables such as [effects.joint_compliance.c2] with value, sigma, unit"
+            f"{path}: effects must be tables such as [effects.joint_compliance.c2]; to fix: write value, sigma and unit in each"
         ) from None
 
 
 def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
     try:
         matrix = np.array(table[key], float)
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{path}: hand_eye.{key} must be a {size}x{size} list of numbers") from None
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(f"{path}: hand_eye.{key} is no {size}x{size} list of numbers; to fix: write one") from None
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise InputError(f"{path}: hand_eye.{key} must be {size}x{size} finite numbers, is {matrix.shape}")
+        shape = "x".join(map(str, matrix.shape))
+        raise InputError(f"{path}: hand_eye.{key} is {shape}, or not finite; to fix: write {size}x{size} finite numbers")
     return matrix

@@ -108,6 +108,8 @@ def _read_text(path: Path) -> dict[str, Array]:
     names = first if header or not above else _names(above[-1].lstrip(" #"), separator)
     if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
         names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
+    if len(lines) == header:
+        return {name: np.empty(0) for name in names}
     table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
     return dict(zip(names, table.T, strict=True))
 

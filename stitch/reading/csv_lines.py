@@ -12,7 +12,7 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Names of the columns, and line number and cells of every line that is not empty.
 
     Raises:
-        InputError: the file is not text, or a quote stays open.
+        InputError: the file is not text, a quote stays open, or a row has more or fewer cells than the header.
     """
     require_file(file, "write the table")
     rows: list[tuple[int, list[str]]] = []
@@ -24,6 +24,7 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             first = reader.line_num + 1
             for row in reader:
                 if any(cell.strip() for cell in row):
+                    _require_cells(file, reader.line_num, row, header)
                     rows.append((reader.line_num, row))
                 first = reader.line_num + 1
     except UnicodeDecodeError as error:
@@ -32,3 +33,11 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         # A quote that stays open swallows lines until a cell is larger than the csv module allows.
         raise InputError(f"{file} line {first}: {error}; close the quote that opens there") from None
     return header, rows
+
+
+def _require_cells(file: Path, line: int, row: list[str], header: list[str]) -> None:
+    if len(row) != len(header):
+        raise InputError(
+            f"{file} line {line}: {len(row)} cells, the header has {len(header)}; to fix: write one cell a column, in "
+            "quotes where it holds a comma"
+        )

@@ -46,8 +46,6 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
     spread = {name: np.empty(len(rows)) for name in _SIGMA if name in header}
     allowed = set(known)
     for i, (line, cells) in enumerate(rows):
-        if len(cells) != len(header):
-            raise InputError(f"{file} line {line}: {len(cells)} cells, the header has {len(header)}")
         row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
         _check_name(file, line, row["view"], names, allowed)
         table[i] = [number(file, line, name, row[name]) for name in _POSE]

@@ -4,7 +4,7 @@ from stitch.errors import InputError
 from stitch.reading.text_file import shortened
 
 _LONGEST = 200  # characters of an id; a folder's name may have 255 bytes, and scratch folders lengthen it
-_RESERVED = '/\\:*?"<>|'
+_RESERVED = "/\\"
 
 
 def require_name(where: str, name: str, what: str) -> str:

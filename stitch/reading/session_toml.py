@@ -105,7 +105,7 @@ def _pose(file: Path, value: Any) -> Array:
     except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
     if T.shape != (4, 4) or not (np.abs(T) < _LARGEST).all():
-        raise InputError(f"{file}: scanner.pose must be four rows of four numbers")
+        raise InputError(f"{file}: scanner.pose is no 4×4 matrix; to fix: write four rows of four numbers")
     off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
     if off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise InputError(
@@ -148,5 +148,5 @@ def cad(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
     name = text(file, table, "part", "cad")
     path = None if name is None else file.parent / name
     if path is not None and not path.is_file():
-        raise InputError(f"{file}: part.cad names {path}, which does not exist")
+        raise InputError(f"{file}: part.cad names {path}, which is no file; to fix: correct the path")
     return path, choice(file, table, "cad_unit", tuple(METRES)) if "cad_unit" in table else None

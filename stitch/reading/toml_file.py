@@ -24,7 +24,7 @@ def read_toml(file: Path, hint: str) -> dict[str, Any]:
     try:
         return tomllib.loads(told)
     except ValueError as error:  # wrong TOML, and integers of thousands of digits
-        raise InputError(f"{file}: not valid TOML: {error}") from None
+        raise InputError(f"{file}: not valid TOML: {error}; to fix: correct it there") from None
     except RecursionError:
         raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
 

@@ -40,7 +40,7 @@ def robot_from_urdf(
     try:
         robot = ElementTree.parse(path).getroot()
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: not a readable URDF: {error}") from None
+        raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
         return _robot(path, robot, base_link, flange_link, 1 / METRES[length_unit], gravity, payload)
     except InputError as error:
@@ -121,7 +121,7 @@ def _chain(root: Element, base_link: str | None, flange_link: str | None) -> lis
 def _end(joint: Element, kind: str) -> str:
     element = joint.find(kind)
     if element is None or not element.get("link"):
-        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>")
+        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>; to fix: write it")
     return str(element.get("link"))
 
 
@@ -174,7 +174,7 @@ def _turn_to_z(joint: Element) -> Array:
     direction = _values(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
     length = np.linalg.norm(direction)
     if length < 1e-9:
-        raise InputError(f"axis of joint {joint.get('name')} has no direction")
+        raise InputError(f"axis of joint {joint.get('name')} has no direction; to fix: write its axis")
     direction /= length
     helper = np.eye(3)[np.abs(direction).argmin()]
     x = np.cross(helper, direction)

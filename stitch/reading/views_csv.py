@@ -55,7 +55,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     _check_header(file, header, robot)
     if not lines:
         raise InputError(f"{file}: no views; write one row per scan")
-    cells = [(line, _row_cells(file, line, header, row)) for line, row in lines]
+    cells = [(line, _row_cells(header, row)) for line, row in lines]
     covariates = _covariate_names(header, cells)
     joints = [_joints(file, line, row, header) for line, row in cells]
     rows: list[Row] = []
@@ -105,14 +105,12 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
     if numbers and numbers != list(range(1, len(numbers) + 1)):
         raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
     if numbers and robot and len(numbers) != robot.n_joints:
-        raise InputError(f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints} joints")
+        raise InputError(f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints}; to fix: one a joint")
     if numbers and not pose and not robot:
         raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
 
 
-def _row_cells(file: Path, line: int, header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
-    if len(row) != len(header):
-        raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
+def _row_cells(header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
     return {name: cell.strip() for name, cell in zip(header, row, strict=True)}
 
 

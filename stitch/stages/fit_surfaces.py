@@ -12,9 +12,10 @@ from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import split, stacked
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.gram import pair_squares
 from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
 from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.observations.surfaces.pose_channel import whitened
 from stitch.observations.surfaces.scanner_field import field_scatters
 from stitch.observations.surfaces.view_responses import view_columns
@@ -82,7 +83,7 @@ class _Linearised:
         return _Step(
             model=Model(found.T_mount, split(self.model.terms, values), found.covariance),
             moved=moved,
-            rms=float(np.median([f.overlaps.gram.rms for f in self.freed])),
+            rms=_model_rms(self.freed),
             hand_eye=found,
             fitted=fitted,
             freed=self.freed,
@@ -134,9 +135,19 @@ def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Seque
         hand_eye=last.hand_eye,
         overlaps=tuple(overlaps),
         freed=tuple(f.poses for f in freed),
-        history=tuple(history),
+        history=(*history, pooled_rms(overlaps)),
         captures=captures,
     )
+
+
+def _model_rms(freed: Sequence[FreePoses]) -> float:
+    """What a model leaves between the surfaces, from the correspondences of the freed views."""
+    squares, weights = np.zeros(2)
+    for f in freed:
+        g = f.overlaps.gram
+        squares += pair_squares(g, -f.twists)[~g.labelled].sum()
+        weights += g.weight.sum()
+    return float(np.sqrt(squares / max(weights, 1e-300)))
 
 
 def _free(

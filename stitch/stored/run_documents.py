@@ -31,7 +31,7 @@ _VIEW = {"view": _TEXT, "pose": _MATRIX, "correction": _list(_NUMBER, 6), "rms":
 _PARAMETER = _table({"value": _NUMBER})
 RESULT = _table(
     {
-        "session": {"type": "string", "pattern": "^[^\\u0000]+$"},
+        "session": {"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000},
         "hand_eye": _MATRIX,
         "residual_rms": _NUMBER,
         "heldout_rms": _MAYBE,

@@ -14,7 +14,7 @@ from stitch.cells.base_to_base.stand import Stand, Touched
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "base_to_base.toml"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "base_to_base.toml"
 DRAWS = 1000
 
 

@@ -28,7 +28,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 JOBS = {
     "base": EXAMPLES / "base_to_base.toml",
     "drill": EXAMPLES / "drilling" / "job.toml",

@@ -24,7 +24,7 @@ from stitch.cells.panel.shape_control import ControlPoints, shape_step
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "panel"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "panel"
 LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
 LEGS = Legs(hexapod.BASE, hexapod.PLATFORM)
 

@@ -27,7 +27,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.measurement.scan import prepare_view
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "window"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "window"
 NOISE = 0.05
 # A door of half the size: the same shapes, a quarter of the triangles.
 DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from data_synth.commands import judge
+from data_synth.judgement import judge
 from stitch.cli.main import main
 from stitch.errors import InputError
 
@@ -51,6 +51,10 @@ def judged(tmp_path, hidden=HIDDEN, diagnosis=None, fitted=None, unit="mm", off=
 FITTED = {"joint_compliance": {"c2": {"value": 1.1e-6, "sigma": 2e-7, "unit": "rad/(N m)"}}}
 
 
+WHOLE = {"joint_compliance": {name: FITTED["joint_compliance"]["c2"] for name in ("c2", "c3")}}
+OWN = "humidity_bias: an effect of your own, its name says nothing here; judge it by the hand-eye's error"
+
+
 @pytest.mark.parametrize(
     ("hidden", "verdict", "named", "fitted", "judgement"),
     [
@@ -61,10 +65,14 @@ FITTED = {"joint_compliance": {"c2": {"value": 1.1e-6, "sigma": 2e-7, "unit": "r
         (HIDDEN, "adequate", [], {}, "missed: joint_compliance"),
         (HIDDEN, "unknown_effect", [], {}, "right: something is there"),
         (HIDDEN, None, [], {}, "not found yet: joint_compliance"),
-        (HIDDEN, None, [], FITTED, "complete"),
-        (HIDDEN, "adequate", [], FITTED, "right"),
-        (HIDDEN, "unknown_effect", [], FITTED, "wrong: nothing is left"),
-        (HIDDEN, "missing_effect", ["backlash"], FITTED, "wrong name"),
+        (HIDDEN, None, [], WHOLE, "complete"),
+        (HIDDEN, "adequate", [], WHOLE, "right"),
+        (HIDDEN, "unknown_effect", [], WHOLE, "wrong: nothing is left"),
+        (HIDDEN, "missing_effect", ["backlash"], WHOLE, "wrong name"),
+        (HIDDEN, None, [], FITTED, "complete, but joint_compliance.c3 (true 2e-06) stayed at zero"),
+        (HIDDEN, "adequate", [], FITTED, "right, but joint_compliance.c3 (true 2e-06) stayed at zero"),
+        (HIDDEN, "unknown_effect", [], FITTED, "right: something is there"),
+        ({"covariate_bias": {"k": 0.1}}, "adequate", [], {"humidity_bias": {}}, OWN),
         (HIDDEN, "adequate", [], {"backlash": {}}, "wrong: backlash was added and is not there"),
         ({}, "adequate", [], {}, "right"),
         ({}, "missing_effect", ["backlash"], {}, "wrong name"),

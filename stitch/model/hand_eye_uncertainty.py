@@ -1,0 +1,32 @@
+"""The uncertainty of a hand-eye in the frame in which it is printed.
+
+Its covariance Σ belongs to a right perturbation T·exp(ξ) in the scanner frame. Rotation vector and translation of T
+in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so that theirs is J·Σ·Jᵀ (to first order).
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.frames import Array
+
+# Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
+COVERAGE_FACTOR = 2.0
+
+
+def printed_covariance(T_mount: Array, covariance: Array) -> Array:
+    """(6, 6) of (rotation vector in rad, translation in length_unit), both in the mount frame.
+
+    Args:
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    J = np.zeros((6, 6))
+    J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
+    J[3:, 3:] = T_mount[:3, :3]
+    return J @ covariance @ J.T
+
+
+def expanded(T_mount: Array, covariance: Array) -> Array:
+    """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
+    return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
