@@ -8,6 +8,8 @@ RANGE := >=3.11,<3.14
 # True for a Python that all wheels serve.
 SERVES := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do $$p $(SERVES) && { echo $$p; break; }; done)
+# What only the system can bring is installed where that asks nobody: for root, with apt.
+ROOT_APT := test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -q
 PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
 
 export RERUN_ANALYTICS ?= off
@@ -24,9 +26,11 @@ ifdef UV
 	uv pip install --quiet --python $(PYTHON) --require-hashes -r constraints.txt
 	uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
 else
-	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path" >&2; exit 2; }
-	@{ $(PYTHON) $(SERVES) && $(PIP) --version >/dev/null 2>&1; } || $(BASE) -m venv --clear $(VENV) || \
-		{ echo "$(BASE) has no venv module: on Debian it is in python3-venv" >&2; exit 2; }
+	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path; on Debian 12 or \
+	Ubuntu 24.04: apt-get install python3-venv" >&2; exit 2; }
+	@$(BASE) -c 'import ensurepip' 2>/dev/null || { $(ROOT_APT) && apt-get install -y -q $(BASE)-venv; } || \
+		{ echo "$(BASE) has no venv module: apt-get install $(BASE)-venv" >&2; exit 2; }
+	@{ $(PYTHON) $(SERVES) && $(PIP) --version >/dev/null 2>&1; } || $(BASE) -m venv --clear $(VENV)
 	$(PIP) install --require-hashes -r constraints.txt
 	$(PIP) install --no-deps --no-build-isolation -e .
 endif

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
 from data_synth import kinematics, nature
 from data_synth.fixtures.quiet_scenes import plan_for
@@ -17,9 +16,11 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import lacking
 from stitch.effects.user_file import load
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
+from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import Run
 
 # Evidence counts in views: a few thousand points a view show what millions would.
@@ -96,14 +97,14 @@ def user_effect(law: str) -> str:
     return load(_USER / f"{OUTSIDE[law]}.py")[0]
 
 
-def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> float | None:
+def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float | None:
     """Factor on the parameters `true` that is detectable at the least; None where cell or belief cannot hold it."""
-    if evidence.measurement.lacks(EFFECTS[effect]) or not true:
+    if lacking(linear.measurement, EFFECTS[effect]) or not true:
         return None
-    candidate = candidate_of(evidence, EFFECTS[effect])
+    candidate = candidate_of(linear, EFFECTS[effect])
     if candidate is None:
         return None
-    e, tests = evidence.evidence, len(EFFECTS)
+    e, tests = linear.mixed, len(EFFECTS)
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])
     found = []
@@ -111,8 +112,8 @@ def smallest(evidence: PoseEvidence, effect: str, true: dict[str, float]) -> flo
         # Forms that hold all of the truth, at the value of the grid that is nearest to it.
         off = np.abs(form.term.values - values)[~fitted].sum()
         if not values[fitted & ~form.keep].any():
-            white = evidence.whiten_channel(form.columns)
-            degrees_of_freedom = evidence.degrees_of_freedom.of(evidence.in_blocks(white))
+            white = linear.residual(form.columns)
+            degrees_of_freedom = linear.satterthwaite.of(linear.in_blocks(white))
             least = least_noncentrality(
                 white * form.sizes, float(weight), tests, e.size - e.A.shape[2], degrees_of_freedom
             )

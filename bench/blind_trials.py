@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import Any
 from zlib import crc32
 
-import numpy as np
 from blind_cells import (
     OUTSIDE,
     drawn,
@@ -21,17 +20,17 @@ from blind_cells import (
     smallest,
     user_effect,
 )
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
+from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.initial_values import linear_of_state
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
+from stitch.observations.linear_model import LinearModel
 from stitch.pipeline import change, diagnose, run
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
@@ -64,7 +63,7 @@ class EmptyCell:
     """A cell with nothing hidden: what can be seen in it."""
 
     plan: Plan
-    evidence: PoseEvidence
+    linear: LinearModel
 
 
 @lru_cache(maxsize=8)
@@ -72,7 +71,7 @@ def cell_without(scene: str, seed: int, chance: int | None = None) -> EmptyCell:
     """The cell of a scene and a seed, with nothing hidden; `chance` as in `measure`."""
     measured = measure(scene, seed, {}, chance=chance)
     calm = run(session_of(measured))
-    return EmptyCell(measured.plan, linear_of_state(state_of(calm)))
+    return EmptyCell(measured.plan, linear_model_of(state_of(calm)))
 
 
 def _chance(job: Row) -> int:
@@ -89,7 +88,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     out = {}
     for law in laws:
         effect = user_effect(law) if law in OUTSIDE else law
-        found = smallest(cell.evidence, effect, true[law])
+        found = smallest(cell.linear, effect, true[law])
         if law in OUTSIDE:
             del EFFECTS[effect]
         if found is None:
@@ -109,7 +108,7 @@ def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measu
         "p": min((s.ranked.adjusted for s in found.candidates if s.name in found.effects), default=1.0),
         "follows": [d.covariate for d in found.depends_on[:3] if d.p_value < 0.05], "notes": list(found.notes),
         "scatter": [found.rotation * 1e6, found.translation * 1e3],
-        "top": [(s.name, round(float(s.ranked.score.log_bayes_factor), 2), float(s.ranked.adjusted)) for s in found.candidates[:3]],
+        "top": [(s.name, round(s.ranked.score.log_bayes_factor, 2), s.ranked.adjusted) for s in found.candidates[:3]],
         "left": [_left(s.cross_validation) for s in found.candidates[:3]],
         "hand_eye_chi_square": hand_eye_chi_square(measured, first),
     }  # fmt: skip
@@ -138,17 +137,14 @@ def _effect(job: Row) -> Row:
 def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
     """What the change brought: held-out residual, hand-eye against the truth, amplitudes in sigmas."""
     true = in_session_units(measured)[job["effect"]]
-    parameters = added.measurement.parameters(added.terms[0].effect)
-    names = [p.name for p in parameters if not p.grid]
-    values = dict(zip([p.name for p in parameters], added.terms[0].values, strict=True))
-    sigmas = dict(zip([p.name for p in parameters], added.sigmas[0], strict=True))
+    fitted = {p.name: p for p in added.terms[0].parameters if not p.grid and p.name in true}
     return {
         "heldout": [first.heldout_rms, added.heldout_rms],
         "hand_eye": [hand_eye_error(measured, first.T_mount), hand_eye_error(measured, added.T_mount)],
         "hand_eye_sigma": hand_eye_sigma(measured, added.mount_covariance),
         "hand_eye_chi_square": hand_eye_chi_square(measured, added),
-        "z": {n: (values[n] - true.get(n, 0.0)) / sigmas[n] for n in names if n in true and np.isfinite(sigmas[n])},
-        "unseen": [n for n in names if n in true and not np.isfinite(sigmas[n])],
+        "z": {n: (p.value - true[n]) / p.sigma for n, p in fitted.items() if p.fitted},
+        "unseen": [n for n, p in fitted.items() if not p.fitted],
     }
 
 

@@ -17,18 +17,18 @@ from pathlib import Path
 from subprocess import DEVNULL, Popen
 
 import numpy as np
-from stitch.observations.surfaces.point_effects import POINTS, point_gram
 
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
-from stitch.diagnosis.candidates import _grid_terms
 from stitch.effects.contract import EFFECTS
 from stitch.effects.in_session import lacking
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected, moves_points
+from stitch.model.term import term_of
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.view_responses import view_responses
 from stitch.stored.load_state import load_state
 from stitch.system.threads import library_threads_off
 
@@ -67,17 +67,18 @@ def streamed(run: Path, correspondences: int) -> None:
     """The sums over many correspondences, in this process."""
     state = load_state(run)
     with library_threads_off():
-        own = corrected(state.measurement, state.terms, state.T_mount)
-        poses = own.poses(state.T_mount)
+        own = corrected(state.measurement, state.model)
+        poses = own.poses(state.model.T_mount)
         few = collect(own, poses, state.gate, [sample(scan, 1000) for scan in own.scans])
         per_view = round(1000 * correspondences / few.gram.count.sum())
         many = collect(own, poses, state.gate, [sample(scan, per_view) for scan in own.scans])
     before = _peak()
-    effects = [e for e in EFFECTS.values() if e.place in POINTS and not lacking(state.measurement, e)]
-    terms = [t for e in effects for t in _grid_terms(e, state.measurement.parameters(e))]
+    library = [term_of(state.measurement, e) for e in EFFECTS.values() if not lacking(state.measurement, e)]
+    terms = [term for term in library if moves_points([term])]
     start = time.perf_counter()
-    sums = point_gram(state.measurement, state.terms, terms, FreePoses(poses, np.zeros((len(poses), 6)), many))
-    count, columns = sum(len(m.residual) for m in many.matches), sums.residual.shape[1]
+    freed = FreePoses(poses, np.zeros((len(poses), 6)), many)
+    found = view_responses(state.measurement, state.model, terms, freed)
+    count, columns = sum(len(m.residual) for m in many.matches), sum(r.columns.shape[1] for r in found)
     print(
         f"{count:,} correspondences × {columns} columns: {time.perf_counter() - start:.1f} s, peak {_peak():.2f} GB, "
         f"{before:.2f} GB before (a matrix of all would be {count * columns * 8e-9:.1f} GB more)"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from fault_room import Case
-from fault_sessions import RUN, _instead, _key, _toml
+from fault_sessions import RUN, instead, with_key, with_toml
 from plyfile import PlyData
 
 _HEADER = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -50,7 +50,7 @@ def _at(row: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
 def clouds() -> Iterator[Case]:
     """Scans that are no scans, promise too much, or hold what no scanner measures."""
     for what in ("pipe", "folder", "dangling link", "device", "empty", "noise"):
-        yield Case("cloud is no file", what, _instead("s/clouds/v001.ply", what, RUN))
+        yield Case("cloud is no file", what, instead("s/clouds/v001.ply", what, RUN))
     for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
         for count in (_HUGE, 10**30, 7, -3, "x"):
             yield Case("PLY headers", f"{encoding} {count}", _as("c.ply", _HEADER.format(encoding, count) + "1 2 3\n"))
@@ -153,13 +153,13 @@ def robots() -> Iterator[Case]:
         "deep": f"[{{ a = {'[' * 90}{']' * 90} }}]",
         "one joint": "[{ a = 5 }]",
     }.items():
-        yield Case("DH rows", name, _toml(_key("robot.joints", rows)))
+        yield Case("DH rows", name, with_toml(with_key("robot.joints", rows)))
 
 
 def _urdf(text: str) -> Callable[[Path], list[str]]:
     def spoil(room: Path) -> list[str]:
         (room / "s" / "arm.urdf").write_text(text)
         value = '"arm.urdf"\nbase_link = "a"\nflange_link = "b"'
-        return _toml(_key("robot.urdf", value))(room)
+        return with_toml(with_key("robot.urdf", value))(room)
 
     return spoil

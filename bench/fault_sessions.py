@@ -30,7 +30,7 @@ _NAMES = ("..", "../x", "/abs", "a/b", "", " ", ".hid", "a\\u0000b", "a\\nb", "x
 _ODD_NAMES = ("[red]x[red]", ":smile: part", "Größe µ 7", "O'Brien & Söhne", "a" * 150)
 
 
-def _toml(change: Callable[[str], str | bytes], command: list[str] = RUN) -> Callable[[Path], list[str]]:
+def with_toml(change: Callable[[str], str | bytes], command: list[str] = RUN) -> Callable[[Path], list[str]]:
     def spoil(room: Path) -> list[str]:
         file = room / command[1] / "session.toml"
         new = change(file.read_text())
@@ -40,7 +40,7 @@ def _toml(change: Callable[[str], str | bytes], command: list[str] = RUN) -> Cal
     return spoil
 
 
-def _key(key: str, value: str) -> Callable[[str], str]:
+def with_key(key: str, value: str) -> Callable[[str], str]:
     def change(text: str) -> str:
         import tomllib
 
@@ -59,7 +59,7 @@ def _key(key: str, value: str) -> Callable[[str], str]:
     return change
 
 
-def _instead(file: str, what: str, command: list[str]) -> Callable[[Path], list[str]]:
+def instead(file: str, what: str, command: list[str]) -> Callable[[Path], list[str]]:
     """Something else where a file should be."""
 
     def spoil(room: Path) -> list[str]:
@@ -88,11 +88,13 @@ def session_files() -> Iterator[Case]:
     """session.toml as a file and as TOML."""
     for key, values in _BAD_KEYS.items():
         for value in values:
-            yield Case(f"session.toml: {key.split('.')[0]}", f"{key} = {value[:20]}", _toml(_key(key, value)))
+            yield Case(f"session.toml: {key.split('.')[0]}", f"{key} = {value[:20]}", with_toml(with_key(key, value)))
     for name in _NAMES:
-        yield Case("name of a session", name[:20], _toml(_key("name", f'"{name}"'), ["run", "s", "--no-recording"]))
+        yield Case(
+            "name of a session", name[:20], with_toml(with_key("name", f'"{name}"'), ["run", "s", "--no-recording"])
+        )
     for name in _ODD_NAMES:
-        spoil = _toml(_key("name", f'"{name}"'), ["run", "s", "--no-recording"])
+        spoil = with_toml(with_key("name", f'"{name}"'), ["run", "s", "--no-recording"])
         yield Case("odd names that are right", name[:20], spoil, fine=True)
     broken: dict[str, Callable[[str], str | bytes]] = {
         "open bracket": lambda t: t + "[",
@@ -106,11 +108,11 @@ def session_files() -> Iterator[Case]:
         "no format": lambda t: t.replace("stitch-session/1", "stitch-session/9"),
     }
     for name, change in broken.items():
-        yield Case("TOML", name, _toml(change))
-    yield Case("TOML that is right", "BOM", _toml(lambda t: b"\xef\xbb\xbf" + t.encode()), fine=True)
-    yield Case("TOML that is right", "CRLF", _toml(lambda t: t.replace("\n", "\r\n")), fine=True)
+        yield Case("TOML", name, with_toml(change))
+    yield Case("TOML that is right", "BOM", with_toml(lambda t: b"\xef\xbb\xbf" + t.encode()), fine=True)
+    yield Case("TOML that is right", "CRLF", with_toml(lambda t: t.replace("\n", "\r\n")), fine=True)
     for what in ("pipe", "folder", "dangling link", "device", "empty", "noise"):
-        yield Case("session.toml is no file", what, _instead("s/session.toml", what, RUN))
+        yield Case("session.toml is no file", what, instead("s/session.toml", what, RUN))
 
 
 def _cell(column: str, value: str, row: int = 2) -> Callable[[Path], list[str]]:
@@ -121,7 +123,7 @@ def _cell(column: str, value: str, row: int = 2) -> Callable[[Path], list[str]]:
     return spoil
 
 
-def _text(file: str, change: Callable[[str], str], command: list[str]) -> Callable[[Path], list[str]]:
+def with_text(file: str, change: Callable[[str], str], command: list[str]) -> Callable[[Path], list[str]]:
     def spoil(room: Path) -> list[str]:
         path = room / file
         path.write_text(change(path.read_text()))
@@ -150,13 +152,13 @@ def tables() -> Iterator[Case]:
         "row twice": lambda t: t + t.splitlines()[-1] + "\n",
     }
     for name, change in changes.items():
-        yield Case("views.csv: rows", name, _text("s/views.csv", change, RUN))
+        yield Case("views.csv: rows", name, with_text("s/views.csv", change, RUN))
     for file, command in (("s/views.csv", RUN), ("p/views.csv", POINTS), ("p/points.csv", POINTS)):
         for what in ("pipe", "folder", "dangling link", "device", "empty", "noise", "UTF-16"):
-            yield Case(f"{Path(file).name} is no table", f"{file} {what}", _instead(file, what, command))
+            yield Case(f"{Path(file).name} is no table", f"{file} {what}", instead(file, what, command))
     for what in ("pipe", "folder", "dangling link", "empty"):
-        yield Case("targets.csv", what, _instead("p/targets.csv", what, POINTS))
-        yield Case("frames.csv", what, _instead("p/frames.csv", what, POINTS))
+        yield Case("targets.csv", what, instead("p/targets.csv", what, POINTS))
+        yield Case("frames.csv", what, instead("p/frames.csv", what, POINTS))
     more: dict[str, Callable[[str], str]] = {
         "unknown view": lambda t: t + "nobody,ball0,1,2,3\n",
         "target twice": lambda t: t + t.splitlines()[1] + "\n",
@@ -168,7 +170,7 @@ def tables() -> Iterator[Case]:
         "micrometres": lambda t: "\n".join([t.splitlines()[0], *(_in_metres(x, 1e3) for x in t.splitlines()[1:])]),
     }
     for name, change in more.items():
-        yield Case("points.csv: rows", name, _text("p/points.csv", change, POINTS))
+        yield Case("points.csv: rows", name, with_text("p/points.csv", change, POINTS))
 
 
 def _in_metres(row: str, factor: float = 1e-3) -> str:

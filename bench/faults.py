@@ -18,8 +18,10 @@ from itertools import chain
 from pathlib import Path
 
 from fault_clouds import clouds, robots
-from fault_folders import command_lines, effects_files, foreign_code, models, outputs, run_folders
+from fault_code import effects_files, foreign_code
+from fault_folders import models, run_folders
 from fault_kills import COMMANDS, Kills, kill_at_random
+from fault_places import command_lines, outputs
 from fault_room import Case, Outcome, judge
 from fault_sessions import session_files, tables
 
@@ -125,8 +127,9 @@ def main() -> None:
             outcomes.append(outcome)
             if outcome.faults:
                 said = " ".join(outcome.error.split())[-300:]
-                print(f"{', '.join(outcome.faults)}: {outcome.case.kind}: {outcome.case.name!r} "
-                      f"(exit {outcome.code}, {outcome.seconds:.1f} s): {said}", flush=True)  # fmt: skip
+                case = f"{outcome.case.kind}: {outcome.case.name!r}"
+                ended = f"exit {outcome.code}, {outcome.seconds:.1f} s"
+                print(f"{', '.join(outcome.faults)}: {case} ({ended}): {said}", flush=True)
         each = given.kills // len(COMMANDS)
         kills = [kill_at_random(command, each, material, rooms, given.seed) for command in COMMANDS if each]
         for line in chain.from_iterable(k.neither for k in kills):

@@ -13,34 +13,34 @@ from dataclasses import replace
 import numpy as np
 from blind_cells import drawn, smallest
 from blind_trials import LIBRARY, cell_without, pin
-from stitch.observations.surfaces.pose_evidence import PoseEvidence
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.diagnose import checked
-from stitch.diagnosis.diagnosis import CandidateEffect
-from stitch.diagnosis.selection.verdict import implausible, select
+from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
+from stitch.diagnosis.selection.verdict import select, validated
+from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
+from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 
 
-def verdict(evidence: PoseEvidence, candidates: list[Candidate]) -> str:
+def verdict(linear: LinearModel, candidates: list[Candidate]) -> str:
     """As `diagnose` judges, less what it says about it."""
-    selection = select(evidence, candidates, "mm")
+    limit = ScatterLimit(*IMPLAUSIBLE)
+    selection = select(linear, candidates, limit)
     asked = {r.name: r for r in (*selection.named, selection.second) if r is not None}
-    candidates = [CandidateEffect(r, (), cross_validate(evidence, r.score, None), {}, None) for r in asked.values()]
-    return checked(selection, candidates, implausible(evidence, "mm"))[0].verdict
+    left_out = {name: cross_validate(linear, r.score) for name, r in asked.items()}
+    return validated(selection, left_out, implausible(linear, limit))[0].verdict
 
 
-def redrawn(evidence: PoseEvidence, shift: Array, rng: np.random.Generator) -> PoseEvidence:
+def redrawn(linear: LinearModel, shift: Array, rng: np.random.Generator) -> LinearModel:
     """The same views with other noise and a shift (n,) of what they see."""
-    z = evidence.half @ rng.standard_normal(len(evidence.half)) + shift
-    own = replace(evidence.evidence, z=z[None])
-    return replace(evidence, channel=replace(evidence.channel, z=z), evidence=own,
-                   null=fit_variances(own, both_starts=True))  # fmt: skip
+    half = np.linalg.cholesky(linear.covariance[0])
+    mixed = replace(linear.mixed, z=(half @ rng.standard_normal(len(half)) + shift)[None])
+    return replace(linear, mixed=mixed, null=fit_variances(mixed, both_starts=True))
 
 
-def shift_of(evidence: PoseEvidence, candidate: Candidate, true: dict[str, float]) -> Array:
+def shift_of(linear: LinearModel, candidate: Candidate, true: dict[str, float]) -> Array:
     """(n,) what true parameters do to what the views see."""
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])
@@ -60,17 +60,17 @@ def main() -> None:
     shares = []
     for scene in options.scenes.split(","):
         cell = cell_without(scene, 0)
-        candidates, rng = candidates_of(cell.evidence)[0], np.random.default_rng(1)
+        candidates, rng = candidates_of(cell.linear)[0], np.random.default_rng(1)
         true = drawn(scene, cell.plan, cell.linear.measurement, LIBRARY, 0)
         for candidate in candidates:
-            size = smallest(cell.evidence, candidate.name, true[candidate.name]) if candidate.name in true else None
+            size = smallest(cell.linear, candidate.name, true[candidate.name]) if candidate.name in true else None
             if size is None:
                 continue
-            shift = options.multiple * size * shift_of(cell.evidence, candidate, true[candidate.name])
-            drawn_again = (redrawn(cell.evidence, shift, rng) for _ in range(options.draws))
+            shift = options.multiple * size * shift_of(cell.linear, candidate, true[candidate.name])
+            drawn_again = (redrawn(cell.linear, shift, rng) for _ in range(options.draws))
             shares.append(np.mean([verdict(e, candidates) != "adequate" for e in drawn_again]))
             print(f"{scene:12} {candidate.name:24} {shares[-1]:.2f}", flush=True)
-        empty = [verdict(redrawn(cell.evidence, np.zeros(1), rng), candidates) for _ in range(10 * options.draws)]
+        empty = [verdict(redrawn(cell.linear, np.zeros(1), rng), candidates) for _ in range(10 * options.draws)]
         print(f"{scene:12} {'nothing':24} {np.mean([v != 'adequate' for v in empty]):.3f}", flush=True)
     print(f"mean over {len(shares)} effects: {np.mean(shares):.3f}")
 

@@ -5,6 +5,7 @@ Run: python bench/window_example.py
 
 from pathlib import Path
 
+import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +13,6 @@ from data_synth import window_job, window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import Pane
 from stitch import frames
-from stitch.system.native import load_open3d
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "window"
 NOISE = 0.05
@@ -58,11 +58,9 @@ def truth(seed: int) -> np.ndarray:
 def main() -> None:
     """A pane to fit, coarse enough to be small, and the seam of a pane set a little wrong."""
     EXAMPLE.mkdir(exist_ok=True)
-    o3d = load_open3d()
     pane = car_door.build_pane()
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(pane.vertices), o3d.utility.Vector3iVector(pane.faces))
-    small = mesh.simplify_quadric_decimation(3000)
-    pane.__init__(np.asarray(small.vertices), np.asarray(small.triangles))
+    vertices, faces, _, _ = igl.qslim(np.asfortranarray(pane.vertices), np.asfortranarray(pane.faces, np.int32), 3000)
+    pane.__init__(vertices, faces)
     pane.export(EXAMPLE / "pane.stl")
     T, nominal = truth(1), truth(1) @ frames.exp(np.array([0.01, -0.006, 0.004, 6.0, -4.0, 9.0]))
     overview, poses = window_scans.scan_outside(pane, T, NOISE, 1, (3, 1), rays=60)

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from data_synth.judgement import judge
@@ -15,6 +14,7 @@ from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session, write_truth
 from stitch.errors import InputError
+from stitch.system.console import console
 
 
 def synth(
@@ -43,7 +43,7 @@ def synth(
     write_truth(target, measured, seed)
     points = sum(len(cloud.points) for cloud in measured.clouds)
     summary = f"{len(measured.clouds)} views, {points:,} points → {out}\ntruth → {target}"
-    Console(stderr=True).print(summary, soft_wrap=True, highlight=False)
+    console().print(summary, soft_wrap=True)
 
 
 def make(scene: str | Path, hidden: dict[str, float], seed: int, views: int | None = None) -> Measured:
@@ -92,4 +92,4 @@ def reveal(
     table = Table("", "", show_header=False, box=None)
     for key, value in judged.items():
         table.add_row(key.replace("_", " "), value if isinstance(value, str) else json.dumps(value))
-    Console(stderr=True).print(table)
+    console().print(table)

@@ -41,9 +41,7 @@ def add(
 ) -> None:
     """Add effects to the model of a run, fit hand-eye and all effects anew, and show what it brought."""
     if bool(effects) == suggested:
-        raise InputError(
-            "add what? to fix: name the effects, or let --suggested choose; one of the two"
-        )
+        raise InputError("add what? to fix: name the effects, or let --suggested choose; one of the two")
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
         if suggested:

@@ -52,6 +52,7 @@ _FIXES = {
     errno.EACCES: _RIGHTS,
     errno.EPERM: _RIGHTS,
     errno.EROFS: _RIGHTS,
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.ENOENT), "; to fix: name another folder, or make it"),
     errno.ENAMETOOLONG: "; to fix: shorten it",
 }
 

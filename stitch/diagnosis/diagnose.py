@@ -8,7 +8,8 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.selection.verdict import Selection, implausible, select, validated
+from stitch.diagnosis.plausible_scatter import implausible, scatter_limit
+from stitch.diagnosis.selection.verdict import Selection, select, validated
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
@@ -28,15 +29,15 @@ def diagnose_state(state: State) -> Diagnosis:
     Raises:
         NoResultError: no two views overlap.
     """
-    unit = state.session.length_unit
+    unit, limit = state.session.length_unit, scatter_limit(state.session)
     with library_threads_off():
         linear = linear_model_of(state)
         candidates, missing = candidates_of(linear)
-        selection = select(linear, candidates, unit)
+        selection = select(linear, candidates, limit)
         matrix = alias_matrix(linear, [r.score for r in selection.ranked])
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
-        selection, notes = validated(selection, left_out, implausible(linear, unit))
+        selection, notes = validated(selection, left_out, implausible(linear, limit))
         rotation, translation = np.sqrt(linear.null.variances[:2])
         found = Diagnosis(
             verdict=selection.verdict,
@@ -53,6 +54,8 @@ def diagnose_state(state: State) -> Diagnosis:
             missing=missing,
             linear=linear,
             notes=notes,
+            scatter_limit=limit,
+            implausible=implausible(linear, limit),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from stitch.diagnosis.covariate_dependence import Dependence
 from stitch.diagnosis.design.next_view import Proposal
+from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
 from stitch.diagnosis.validation.cross_validation import CrossValidation
@@ -44,6 +45,8 @@ class Diagnosis:
     next: tuple[Proposal, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
     linear: LinearModel
+    scatter_limit: ScatterLimit  # what "adequate" is measured against
+    implausible: bool  # the poses scatter by more than that
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -4,7 +4,6 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.units import MICROMETRES, rounded
 
 
@@ -16,7 +15,7 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     if d.verdict == "adequate":
         return (
             f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}, and a pose "
-            f"repeatability of {scatter} explains the rest."
+            f"repeatability of {scatter} (standard deviations) explains the rest, {_judged_by(d, to_um)}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
         return _missing(d, to_um, now, floor, second)
@@ -48,14 +47,29 @@ def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> 
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
-    notes = "".join(f"; {note}" for note in d.notes)
-    wild = d.rotation > IMPLAUSIBLE[0] or d.translation * to_um > 1e3 * IMPLAUSIBLE[1]
-    if not wild:
-        return f"{start}{follows}the poses scatter by {scatter} otherwise{notes}{_lack(d)}."
+    if not d.implausible:
+        return f"{start}{follows}the poses scatter by {scatter} otherwise{_notes(d)}{_lack(d)}."
+    than = f"more than {_limits(d, to_um)} as stated" if d.scatter_limit.stated else "which no sound arm does"
     return (
-        f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, which no sound arm does; such "
-        f"errors repeat at the same poses, so that those found on one object mend another{notes}{_lack(d)}."
+        f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
+        f"the same poses, so that those found on one object correct another{_notes(d)}{_lack(d)}."
     )
+
+
+def _judged_by(d: Diagnosis, to_um: float) -> str:
+    """What "adequate" is measured against."""
+    if d.scatter_limit.stated:
+        return f"within {_limits(d, to_um)} as stated"
+    return f"judged by what is usual for an arm (up to {_limits(d, to_um)}): no repeatability is stated under [robot]"
+
+
+def _limits(d: Diagnosis, to_um: float) -> str:
+    return f"{d.scatter_limit.translation * to_um:.3g} µm and {d.scatter_limit.rotation * 1e6:.3g} µrad"
+
+
+def _notes(d: Diagnosis) -> str:
+    """Effects that explain much and are not named, and why: an alarm that did not stand is no silence."""
+    return "".join(f"; {note}" for note in d.notes)
 
 
 def _lack(d: Diagnosis) -> str:

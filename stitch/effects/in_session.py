@@ -68,4 +68,5 @@ def require(measurement: Measurement, effect: Effect) -> None:
         words = [_WHERE_FROM.get(need, f"a column {need} in views.csv") for need in missing]
         raise InputError(
             f"effect {effect.name} needs {' and '.join(words)}, which session {measurement.capture.name} does not have"
+            "; to fix: state it, or leave the effect out"
         )

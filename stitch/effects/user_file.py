@@ -83,10 +83,12 @@ def _named(path: Path, what: str) -> Iterator[None]:
             yield
     except InputError as error:
         told = str(error)
-        raise InputError(told if told.startswith(str(path)) else f"{path}:{what} {told}") from None
-    except (Exception, SystemExit) as error:  # whatever a user's file may raise
+        raise InputError(told if told.startswith(str(path)) else f"{path}:{what} {told}; to fix: correct it") from None
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever a user's file may raise, the end of the program too
         reason = "ends the program" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}{_line(error, path)}:{what} {reason}") from None
+        raise InputError(f"{path}{_line(error, path)}:{what} {reason}; to fix: correct it there") from None
 
 
 def _seconds() -> float:
@@ -101,7 +103,7 @@ def _seconds() -> float:
 
 def _line(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
-        return f" line {error.lineno}"
+        return "" if error.lineno is None else f" line {error.lineno}"
     trace, found = error.__traceback__, ""
     while trace is not None:
         if os.path.abspath(trace.tb_frame.f_code.co_filename) == os.path.abspath(path):

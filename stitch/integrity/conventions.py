@@ -27,6 +27,10 @@ _CLOSES = 0.6
 _CLEARER = 0.6
 # Poses whose motions nearly all close need no other convention.
 _ALL = 0.95
+# A hypothesis is tried if as many angles of rotation agree as this share of the best one's.
+_SCREEN = 0.6
+# A factor is one between units if it is this near.
+_UNIT_NEAR = 0.05
 # Motions: below, chance agrees.
 _FEWEST = 4
 
@@ -50,7 +54,8 @@ def explained(session: Session, motions: RelativeScans) -> list[Explained]:
     tried_all = hypotheses(session)
     out = [_fit(tried_all[0], motions, length, scaled) for scaled in (False, True)]
     if out[0].closed < _ALL:
-        out += [_fit(h, motions, length, False) for h in distinct(tried_all, 1e-3, 1e-3 * length)[1:]]
+        screened = _screened(tried_all, motions)
+        out += [_fit(h, motions, length, False) for h in distinct(screened, 1e-3, 1e-3 * length)[1:]]
     return sorted(out, key=lambda e: (e.open, e.hypothesis.kind != "stated"))
 
 
@@ -64,6 +69,26 @@ def verdict(found: Sequence[Explained]) -> tuple[Explained, ...]:
         return ()
     close = [e for e in found if e.open <= best.open / _CLEARER + 0.01 and e.closed >= 0.9 * best.closed]
     return tuple(e for e in close if e.hypothesis.kind != "stated" or e.scale != 1.0)
+
+
+def _screened(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
+    """The stated poses, and what could close: motions keep their angle of rotation under any hand-eye (Chen 1991)."""
+    v, w = np.array(motions.pairs).T
+    seen = _turn(motions.T)
+    share = []
+    for h in tried:
+        T = h.T_reference_mount
+        used = np.ones(len(T), bool) if h.used is None else np.isin(np.arange(len(T)), h.used)
+        kept = used[v] & used[w]
+        near = np.abs(_turn(frames.inverse(T[v]) @ T[w]) - seen) < ROTATION
+        share.append(float(near[kept].mean()) if kept.any() else 0.0)
+    limit = _SCREEN * max(share)
+    return [tried[0]] + [h for h, agree in zip(tried[1:], share[1:], strict=True) if agree >= limit]
+
+
+def _turn(T: Array) -> Array:
+    """Angles of rotation (M,) of motions (M, 4, 4)."""
+    return np.asarray(np.arccos(np.clip((np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
 
 
 def _fit(hypothesis: Hypothesis, motions: RelativeScans, length: float, scaled: bool) -> Explained:
@@ -85,12 +110,14 @@ def _fit(hypothesis: Hypothesis, motions: RelativeScans, length: float, scaled: 
 def _named_unit(found: Explained) -> Explained:
     """The stated poses with another unit of length."""
     s = found.scale
-    factor = min(UNITS, key=lambda u: abs(np.log(max(abs(s), 1e-9) * u)))
     h = found.hypothesis
-    if s > 0 and abs(s * factor - 1) < 0.05:
-        fix = f"lengths of poses and clouds differ by {1 / factor:.6g} ({UNITS[factor]}): check cloud_unit and length_unit"
+    if s <= 0:
+        return replace(found, open=1.0, closed=0.0)
+    factor = min(UNITS, key=lambda u: abs(np.log(s / u)))
+    if abs(s / factor - 1) < _UNIT_NEAR:
+        fix = f"the clouds are {factor:.6g} times as large as the poses say ({UNITS[factor]}): check cloud_unit and length_unit"
         return replace(found, hypothesis=replace(h, kind="unit", fix=fix))
-    fix = f"the clouds are {1 / s:.5g} times as large as the robot's motions say: check their scale"
+    fix = f"the clouds are {s:.5g} times as large as the robot's motions say: check their scale"
     return replace(found, hypothesis=replace(h, kind="scale", fix=fix))
 
 

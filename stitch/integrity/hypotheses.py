@@ -18,9 +18,15 @@ from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
 
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")
-# Factors between units that people mix up.
-UNITS = {1000.0: "m for mm", 0.001: "mm for m", 25.4: "inches for mm", 1 / 25.4: "mm for inches", 10.0: "cm for mm",
-         0.1: "mm for cm"}  # fmt: skip
+# Factors by which lengths are too large when units are mixed up, and how that comes about.
+UNITS = {
+    1000.0: "mm where m are stated",
+    0.001: "m where mm are stated",
+    25.4: "mm where inches are stated",
+    1 / 25.4: "inches where mm are stated",
+    10.0: "mm where cm are stated",
+    0.1: "cm where mm are stated",
+}
 _OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
 _HANDED = "the scans are left-handed: two of their columns are exchanged, or one has the wrong sign"
 # Rows that a list may be shifted by.

@@ -13,6 +13,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.placing import Placement, place, shows_no_surface, surface_of
 from stitch.measurement.capture import Capture, part_size
+from stitch.system.threads import parallel
 
 # A pair counts if this share of the surface near lies on it, and this share of the scan is near.
 _CLOSES, _SHARED = 0.75, 0.35
@@ -38,15 +39,12 @@ def relative_scans(capture: Capture) -> RelativeScans:
     views = len(capture.scans)
     pairs = [(v, v + step) for step in _STEPS for v in range(views - step)]
     starts = _turns()
-    kept, motions = [], []
-    for v, w in pairs:
-        if shows_no_surface(capture.scans[v]) or shows_no_surface(capture.scans[w]):
-            continue
-        best = _between(capture, v, w, starts, size)
-        if best.closure > _CLOSES and best.near > _SHARED:
-            kept.append((v, w))
-            motions.append(best.T)
-    return RelativeScans(tuple(kept), np.array(motions).reshape(-1, 4, 4), len(pairs))
+    usable = [not shows_no_surface(scan) for scan in capture.scans]
+    tried = [(v, w) for v, w in pairs if usable[v] and usable[w]]
+    found = list(parallel(lambda pair: _between(capture, *pair, starts, size), tried))
+    good = [i for i, best in enumerate(found) if best.closure > _CLOSES and best.near > _SHARED]
+    motions = np.array([found[i].T for i in good]).reshape(-1, 4, 4)
+    return RelativeScans(tuple(tried[i] for i in good), motions, len(pairs))
 
 
 def _between(capture: Capture, v: int, w: int, turns: Array, size: float) -> Placement:

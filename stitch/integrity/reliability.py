@@ -70,28 +70,28 @@ def pose_covariance(model: ViewModel, found: Found) -> Array:
     return np.asarray(np.einsum("vij,j,vkj->vik", model.carried, unit, model.carried))
 
 
-def blunder_sizes(normal: Array, view: int, direction: Array) -> tuple[float, float]:
-    """Minimal detectable and minimal identifiable factor on a displacement (6,), rotations in 1/lever.
+def blunder_sizes(normal: Array, view: int, directions: Array) -> tuple[Array, Array]:
+    """Minimal detectable and minimal identifiable factors (K,) on displacements (K, 6), rotations in 1/lever.
 
     Args:
         normal: (V, V, 6, 6) of `normal_blocks`.
     """
     views = len(normal)
-    own = float(direction @ normal[view, view] @ direction)
-    if own <= 0:
-        return np.inf, np.inf
-    detectable = np.sqrt(noncentrality(6, views) / own)
-    shared = [
-        float(c @ np.linalg.pinv(normal[w, w], rcond=1e-9, hermitian=True) @ c)
-        for w in range(views)
-        if w != view and (c := normal[w, view] @ direction).any()
-    ]
+    own = np.einsum("ki,ij,kj->k", directions, normal[view, view], directions)
+    seen = own > 1e-12 * max(float(own.max()), 1e-300)
+    safe = np.where(seen, own, 1.0)
+    detectable = np.where(seen, np.sqrt(noncentrality(6, views) / safe), np.inf)
+    others = [w for w in range(views) if w != view]
+    shown = np.einsum("wij,kj->wki", normal[others, view], directions)
+    inverse = np.linalg.pinv(normal[others, others], rcond=1e-9, hermitian=True)
+    shared = np.einsum("wki,wij,wkj->wk", shown, inverse, shown, optimize=True).max(axis=0)
     # The statistics of the right view and of the most similar one differ by own − shared, with a standard deviation
     # of 2√(own − shared) for a blunder much larger than the scatter.
-    lead = own - max(shared, default=0.0)
+    lead = np.maximum(own - shared, 0.0)
     needed = 2 * stats.norm.isf((1 - NAMED) / max(views - 1, 1))
-    identifiable = needed / np.sqrt(lead) if lead > 1e-12 * own else np.inf
-    return float(detectable), float(max(detectable, identifiable))
+    told = seen & (lead > 1e-9 * safe)
+    identifiable = np.where(told, needed / np.sqrt(np.where(told, lead, 1.0)), np.inf)
+    return detectable, np.maximum(detectable, identifiable)
 
 
 def _of_view(model: ViewModel, normal: Array, covariance: Array, pull: Array, view: int) -> Reliability:
@@ -101,17 +101,22 @@ def _of_view(model: ViewModel, normal: Array, covariance: Array, pull: Array, vi
     weak = tuple(_named(root @ vectors[:, i]) for i in range(6) if values[i] < WEAK_REDUNDANCY)
     shifts = np.concatenate([np.zeros((_DIRECTIONS, 3)), _sphere(_DIRECTIONS)], axis=1)
     turns = np.concatenate([_sphere(_DIRECTIONS), np.zeros((_DIRECTIONS, 3))], axis=1)
-    sizes = np.array([blunder_sizes(normal, view, d) for d in shifts])
-    rotation = max(blunder_sizes(normal, view, d)[0] for d in turns) / model.lever
-    finite = np.where(np.isfinite(sizes[:, :1]), sizes[:, :1], 0.0) * shifts
+    detectable, identifiable = blunder_sizes(normal, view, shifts)
+    rotation = blunder_sizes(normal, view, turns)[0].max() / model.lever
+    finite = np.where(np.isfinite(detectable), detectable, 0.0)[:, None] * shifts
     # Registration weighs the robot's pose against the overlaps: what stays is the share that only the robot knows.
     kept = np.eye(6) - covariance @ N
     left = np.linalg.norm((finite @ kept.T)[:, 3:], axis=1)
     pushed = np.linalg.norm((finite @ pull[view].T)[:, 3:], axis=1)
     return Reliability(
-        np.clip(values, 0, 1), weak, float(sizes[:, 0].max()), float(rotation), float(sizes[:, 1].max()),
-        float(pushed.max()), float(left.max()),
-    )  # fmt: skip
+        redundancy=np.clip(values, 0, 1),
+        weak=weak,
+        detectable=float(detectable.max()),
+        detectable_rotation=float(rotation),
+        identifiable=float(identifiable.max()),
+        hand_eye=float(pushed.max()),
+        cloud=float(left.max()),
+    )
 
 
 def _hand_eye_pull(model: ViewModel, found: Found) -> Array:

@@ -57,8 +57,8 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
         if closes(scan.points @ flip, True) > needed:
             return ScanFault("mirrored", f"{words} in this cloud: export it again")
     for factor, words in UNITS.items():
-        if closes(scan.points * factor, True) > needed:
-            return ScanFault("unit", f"this cloud is in another unit ({words}): multiply it by {factor:.6g}")
+        if closes(scan.points / factor, True) > needed:
+            return ScanFault("unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit")
     return scale_fault(scan, T_pose, surface, size, needed)
 
 

@@ -67,7 +67,7 @@ def _tried(session: Session, length: float) -> Iterator[Hypothesis]:
     for factor, words in UNITS.items():
         T = np.array(stated.T_base_flange)
         T[:, :3, 3] *= factor
-        fix = f"lengths of poses and sightings differ by {factor:.6g} ({words}): check length_unit"
+        fix = f"the sightings are {factor:.6g} times as large as the poses say ({words}): check length_unit"
         yield replace(stated, kind="unit", T_base_flange=T, fix=fix)
 
 

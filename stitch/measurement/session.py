@@ -12,6 +12,8 @@ from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.robot import Robot
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
+# ISO 9283: RP = l̄ + 3·S_l; for isotropic scatter σ a coordinate l̄ = 2σ√(2/π) and S_l = σ√(3 − 8/π).
+_RP_OF_SIGMA = float(2 * np.sqrt(2 / np.pi) + 3 * np.sqrt(3 - 8 / np.pi))
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,24 @@ class Scanner:
 
 
 @dataclass(frozen=True)
+class StatedRepeatability:
+    """The arm's pose repeatability as a data sheet or a test by ISO 9283 states it."""
+
+    position: float | None = None  # RP, length_unit
+    rotation: float | None = None  # RP of an angle, rad
+
+    @property
+    def sigma_translation(self) -> float | None:
+        """Of each coordinate: RP = mean + 3 standard deviations of distances that are Maxwell distributed."""
+        return None if self.position is None else self.position / _RP_OF_SIGMA
+
+    @property
+    def sigma_rotation(self) -> float | None:
+        """Of each angle: RP = ±3 standard deviations."""
+        return None if self.rotation is None else self.rotation / 3.0
+
+
+@dataclass(frozen=True)
 class Session:
     """What was measured. Lengths in length_unit, angles in rad."""
 
@@ -54,6 +74,7 @@ class Session:
     views: tuple[View, ...]
     warnings: tuple[str, ...] = field(default=())
     nominal: Nominal | None = None  # targets in the part frame
+    repeatability: StatedRepeatability = field(default_factory=StatedRepeatability)
 
     @property
     def has_clouds(self) -> bool:

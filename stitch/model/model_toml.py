@@ -69,7 +69,7 @@ def read_model(path: Path) -> ModelFile:
     path = path / "model.toml" if path.is_dir() else path
     document = read_toml(path, "name a run folder that `stitch run` wrote")
     if document.get("format") != FORMAT:
-        raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"; to fix: name a model that `stitch run` wrote')
+        raise InputError(f'{path}: format is {document.get("format")!r}, expected "{FORMAT}"; to fix: name a run')
     hand_eye = document.get("hand_eye", {})
     corrected = _matrix(path, hand_eye, "corrected", 4)
     coarse = _matrix(path, hand_eye, "coarse", 4) if "coarse" in hand_eye else corrected
@@ -104,7 +104,7 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
                 raise ValueError
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{path}: targets must be tables such as [targets.ball1] with position and sigma; to fix: write three numbers each"
+            f"{path}: targets must be tables such as [targets.ball1] with position, sigma; to fix: three numbers each"
         ) from None
     return out
 
@@ -128,7 +128,7 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
         }
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{path}: effects must be tables such as [effects.joint_compliance.c2]; to fix: write value, sigma and unit in each"
+            f"{path}: effects must be tables such as [effects.joint_compliance.c2]; to fix: value, sigma, unit in each"
         ) from None
 
 
@@ -139,5 +139,5 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
         raise InputError(f"{path}: hand_eye.{key} is no {size}x{size} list of numbers; to fix: write one") from None
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         shape = "x".join(map(str, matrix.shape))
-        raise InputError(f"{path}: hand_eye.{key} is {shape}, or not finite; to fix: write {size}x{size} finite numbers")
+        raise InputError(f"{path}: hand_eye.{key} is {shape}, or not finite; to fix: {size}x{size} finite numbers")
     return matrix

@@ -52,6 +52,7 @@ def load_session(path: Path | str) -> Session:
         cad_unit=cad_unit,
         views=views,
         nominal=_nominal(path, sightings),
+        repeatability=session_toml.repeatability(file, document.get("robot")),
     )
     check_scale(session, cloud_unit)
     return session

@@ -10,8 +10,8 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot
-from stitch.measurement.session import Scanner
-from stitch.reading.dh_rows import numbers, robot_from_dh
+from stitch.measurement.session import Scanner, StatedRepeatability
+from stitch.reading.dh_rows import known_keys, numbers, robot_from_dh
 from stitch.reading.names import require_folder_name, require_name
 from stitch.reading.text_file import shortened
 from stitch.reading.toml_file import choice, read_toml, text
@@ -129,6 +129,8 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
     urdf, base, flange = (text(file, table, "robot", key) for key in ("urdf", "base_link", "flange_link"))
     if urdf is not None:
         return robot_from_urdf(file.parent / urdf, base, flange, unit, gravity, payload)
+    if "joints" not in table and "repeatability" in table:
+        return None
     if "joints" not in table:
         raise InputError(f"{file}: [robot] needs joints (DH rows) or urdf")
     try:
@@ -137,6 +139,21 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
         raise InputError(f"{file}: {error}") from None
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
+
+
+def repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatability:
+    """[robot] repeatability = { position, rotation_mrad }; position in length_unit.
+
+    Raises:
+        InputError: another key, or no positive number.
+    """
+    stated = (table or {}).get("repeatability")
+    if stated is None:
+        return StatedRepeatability()
+    where = f"{file}: robot.repeatability"
+    known_keys(where, stated, ("position", "rotation_mrad"))
+    position, turn = (positive(file, stated, "robot.repeatability", key) for key in ("position", "rotation_mrad"))
+    return StatedRepeatability(position, None if turn is None else turn / 1e3)
 
 
 def cad(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:

@@ -105,7 +105,9 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
     if numbers and numbers != list(range(1, len(numbers) + 1)):
         raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
     if numbers and robot and len(numbers) != robot.n_joints:
-        raise InputError(f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints}; to fix: one a joint")
+        raise InputError(
+            f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints}; one a joint"
+        )
     if numbers and not pose and not robot:
         raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
 

@@ -12,7 +12,7 @@ from stitch.runs.run import Run
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
 FORMAT = "stitch-run/1"
-_VERSIONS = ("stitch", "numpy", "scipy", "open3d-cpu", "open3d", "pykdtree", "rerun-sdk", "kiss-icp", "trimesh")
+_VERSIONS = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
 
 def model_of(run: Run) -> ModelFile:

@@ -10,12 +10,22 @@ from stitch.system.whole_folder import Ours
 _FORMAT = "stitch-run/1"
 # Every file that a command writes into a run folder. What is not listed here is never removed.
 FILES = {
-    "model.toml", "result.json", "ledger.json", "stitched.ply", "mesh.ply", "residuals.parquet", "recording.rrd",
-    "report.html", "compare.json", "diagnosis.json", "diagnosis.rrd", "robot.toml", "robot.urdf",
-}  # fmt: skip
-_PICTURES = {
-    "budget", "suspects", "candidates", "added_variable", "shape", "aliases", "views", "compare",
-}  # fmt: skip
+    "model.toml",
+    "result.json",
+    "ledger.json",
+    "stitched.ply",
+    "mesh.ply",
+    "residuals.parquet",
+    "recording.rrd",
+    "report.html",
+    "compare.json",
+    "diagnosis.json",
+    "diagnosis.rrd",
+    "robot.toml",
+    "robot.urdf",
+}
+# "suspects" is what "candidates" was called once.
+_PICTURES = {"budget", "candidates", "suspects", "added_variable", "shape", "aliases", "views", "compare"}
 
 
 def ours(path: Path) -> Ours:

@@ -88,7 +88,7 @@ def test_several_captures_share_one_hand_eye():
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_a_hand_eye_is_found_from_nothing(mount):
-    measured, capture = captured_blade(5, mount=mount, pixels=90)
+    measured, capture = captured_blade(5, mount=mount, pixels=110)
     found = coarse([capture])
     assert found.runner_up_ratio > 1.1
     fine = correct([capture], found.T_mount, found.gate).hand_eye

@@ -14,6 +14,8 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
 import rerun.blueprint as rrb
 
+from viz.rrd_file import RecordingFile
+
 Colours = NDArray[np.uint8] | Sequence[tuple[int, int, int]]
 Recording = rr.RecordingStream
 GREY, BLUE, GREEN, RED = (150, 150, 150), (72, 120, 168), (80, 150, 80), (196, 60, 40)
@@ -21,18 +23,16 @@ GREY, BLUE, GREEN, RED = (150, 150, 150), (72, 120, 168), (80, 150, 80), (196, 6
 
 @contextmanager
 def stage(path: Path, system: str, words: str) -> Iterator[rr.RecordingStream]:
-    """A recording that opens on the scene `world` with the words beside it; closed when the block ends."""
+    """A recording that opens on the scene `world` with the words beside it; written when the block has ended well."""
     scene = rrb.Spatial3DView(origin="world", name=system)
     side = rrb.TextDocumentView(origin="words", name="What was found")
     layout = rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 1]), collapse_panels=True)
-    recording = rr.RecordingStream(f"stitch_{system.replace(' ', '_')}")
-    recording.save(str(path), default_blueprint=layout)
+    file = RecordingFile(f"stitch_{system.replace(' ', '_')}", path, layout)
+    recording = file.stream
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("words", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
-    try:
-        yield recording
-    finally:
-        recording.disconnect()
+    yield recording
+    file.write()
 
 
 def frame(recording: rr.RecordingStream, name: str, T: Array, size: float) -> None:

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from stitch import frames
@@ -14,6 +13,7 @@ from stitch.cells.base_to_base import BaseResult, read_stand, rod_session, solve
 from stitch.cells.base_to_base.stand_solution import describe, document
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
 from stitch.errors import NoResultError
+from stitch.system.console import console
 from stitch.writing.session_files import write_session
 
 
@@ -42,7 +42,7 @@ def base(
 
 
 def _print(result: BaseResult) -> None:
-    console = Console(stderr=True)
+    terminal = console()
     unit, solution = result.length_unit, result.fit
     table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
     for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
@@ -51,12 +51,12 @@ def _print(result: BaseResult) -> None:
     table.add_row("  sigma", _numbers(solution.sigma[3:], 5), _numbers(solution.sigma[:3], 6))
     if result.projection is not None:
         table.add_row("projection", *_pose(result.projection.T_base1_base2))
-    console.print(table)
-    console.print(f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings.")
+    terminal.print(table)
+    terminal.print(f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings.")
     for comparison in result.comparisons:
-        console.print(describe(comparison, unit) + ".")
+        terminal.print(describe(comparison, unit) + ".")
     if result.no_projection:
-        console.print(f"No projection: {result.no_projection}.")
+        terminal.print(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:
         print(" ".join(f"{value:.9g}" for value in row))
 

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from stitch.cells.drilling import hole_session
@@ -14,6 +13,7 @@ from stitch.cells.drilling.drill_job import read_job
 from stitch.cells.drilling.drill_output import document, write_drives
 from stitch.cells.drilling.drill_solution import JobResult, solve_job
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
+from stitch.system.console import console
 from stitch.writing.session_files import write_session
 
 
@@ -40,30 +40,30 @@ def drill(
 
 
 def _print(result: JobResult, unit: str) -> None:
-    console = Console(stderr=True)
+    terminal = console()
     if len(result.leave_one_out_errors):
         sizes = np.linalg.norm(result.leave_one_out_errors, axis=1)
-        console.print(f"Homography, one hole left out: mean {sizes.mean():.3f}, largest {sizes.max():.3f} {unit}.")
+        terminal.print(f"Homography, one hole left out: mean {sizes.mean():.3f}, largest {sizes.max():.3f} {unit}.")
     for name, c in result.groups.items():
         errors, residuals = (np.linalg.norm(values, axis=1) for values in (c.errors, c.residuals))
-        console.print(
+        terminal.print(
             f"Group {name}: drive errors {errors.min():.3f} to {errors.max():.3f} {unit} at {len(errors)} reference "
             f"holes; {residuals.max():.3f} {unit} at most are left."
         )
     for trial in result.effects.trials if result.effects else ():
         verdict = "found" if trial.accepted else "not found"
-        console.print(
+        terminal.print(
             f"{trial.effect}: {verdict}, {trial.value:.4g} ± {trial.sigma:.2g} (F {trial.F:.1f}, "
             f"p {trial.p_value:.1e}, BIC {trial.bic_change:+.1f})."
         )
     if (tool := result.tool_axis) is not None:
         verdict = "found" if tool.accepted else "not found"
-        console.print(
+        terminal.print(
             f"tool axis: {verdict}, {np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}° off z "
             f"(p {tool.p_value:.1e})."
         )
     for name, r in result.rangers.items():
-        console.print(
+        terminal.print(
             f"Ranger {name}: origin {_numbers(r.origin)}, direction {_numbers(r.direction)}, rms {r.rms:.3f}."
         )
     table = Table(title="Drives", title_justify="left")
@@ -73,7 +73,7 @@ def _print(result: JobResult, unit: str) -> None:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
         angles = _numbers(np.degrees(drive.angles), 3)
         table.add_row(drive.hole.name, drive.hole.group, _numbers(drive.position, 3), angles, f"{shift:.3f}")
-    console.print(table)
+    terminal.print(table)
 
 
 def _numbers(values: np.ndarray, digits: int = 4) -> str:

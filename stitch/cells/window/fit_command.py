@@ -11,6 +11,7 @@ from rich.console import Console
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
 from stitch.cells.window import fit_parts, read_fit_job, scan_session
 from stitch.cells.window.window_solution import Part, fit_document, write_fit
+from stitch.system.console import console
 from stitch.writing.session_files import write_session
 
 
@@ -32,22 +33,22 @@ def fit(
     if as_json:
         print(json.dumps(fit_document(job, parts), indent=1))
         return
-    console = Console(stderr=True)
+    terminal = console()
     for i, part in enumerate(parts):
-        _print(console, i + 1, part)
+        _print(terminal, i + 1, part)
     for name in written:
         print(f"{output}/{name}")
 
 
-def _print(console: Console, number: int, part: Part) -> None:
+def _print(terminal: Console, number: int, part: Part) -> None:
     found, cells = part.fit, part.deviations.cells
     x, y, z = found.T_base_part[:3, 3]
-    console.print(
+    terminal.print(
         f"Part {number}: origin {x:.3f} {y:.3f} {z:.3f} in the base, σ {found.sigma[3:].max():.4f} and "
         f"{np.degrees(found.sigma[:3]).max():.5f}°; distances {found.scale:.3f} robust, {found.rms:.3f} rms."
     )
     if part.start.runner_up > 0.9 * part.start.share:
-        console.print(
+        terminal.print(
             f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part "
             "is nearly symmetric, or too little of it was scanned."
         )
@@ -55,12 +56,12 @@ def _print(console: Console, number: int, part: Part) -> None:
     if bad.any():
         worst = int(np.argmax(np.abs(cells.mean)))
         at = " ".join(f"{value:.0f}" for value in cells.middle[worst])
-        console.print(
+        terminal.print(
             f"  {bad.sum()} of {len(bad)} cells beyond {part.deviations.tolerance:g}; worst "
             f"{cells.mean[worst]:+.2f} at {at}."
         )
     else:
-        console.print(f"  All {len(bad)} cells within {part.deviations.tolerance:g}.")
+        terminal.print(f"  All {len(bad)} cells within {part.deviations.tolerance:g}.")
     for name, count in part.forbidden.items():
         if count:
-            console.print(f"  {count} points in forbidden region {name}; they did not count.")
+            terminal.print(f"  {count} points in forbidden region {name}; they did not count.")

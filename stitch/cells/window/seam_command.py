@@ -7,13 +7,13 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
 from stitch.cells.window import read_seam_job, scan_session, solve_seam
 from stitch.cells.window.seam import Limits, Seam
 from stitch.cells.window.window_solution import write_seam
+from stitch.system.console import console
 from stitch.writing.session_files import write_session
 
 
@@ -52,4 +52,4 @@ def _print(seams: list[Seam], limits: Limits) -> None:
         table.add_row(
             s.station, *(("", "") if s.reason else values), f"{s.verdict}{': ' if s.reason else ''}{s.reason}"
         )
-    Console(stderr=True).print(table)
+    console().print(table)

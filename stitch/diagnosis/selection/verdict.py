@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
 from stitch.diagnosis.selection.forward_selection import forward_selection
 from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     BEYOND_CHANCE,
-    IMPLAUSIBLE,
     LOG_BAYES_FACTOR,
     MANY_VIEWS,
     ODDS,
@@ -20,7 +20,6 @@ from stitch.diagnosis.thresholds import (
 )
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.observations.linear_model import LinearModel
-from stitch.units import METRES
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
 _GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
@@ -38,7 +37,7 @@ class Selection:
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
 
 
-def select(linear: LinearModel, candidates: Sequence[Candidate], length_unit: str) -> Selection:
+def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = ranked_all(linear, candidates)
     contenders = [r for r in ranked if contends(r)]
@@ -46,7 +45,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], length_unit: st
     adequate = Selection("adequate", (), ranked, empirical)
     unknown = replace(adequate, verdict="unknown_effect")
     if stray is None and not any(certain(r) for r in contenders):
-        return unknown if implausible(linear, length_unit) else adequate
+        return unknown if implausible(linear, limit) else adequate
     if not contenders:
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
@@ -83,12 +82,6 @@ def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
         if r.adjusted < ALPHA_UNKNOWN and r.score.log_bayes_factor > LOG_BAYES_FACTOR:
             return r
     return None
-
-
-def implausible(linear: LinearModel, length_unit: str) -> bool:
-    """True if the poses scatter as no arm does."""
-    rotation, translation = np.sqrt(linear.null.variances[:2])
-    return bool(rotation > IMPLAUSIBLE[0] or translation * METRES[length_unit] > IMPLAUSIBLE[1] * METRES["mm"])
 
 
 def validated(

@@ -1,0 +1,154 @@
+"""What `stitch check --deep` and data snooping find in sessions with one mistake, and in sessions without any.
+
+Usage: python bench/integrity.py good|sizes|kinds|real FILE [--seeds 0 5] [--minutes 30] [--real FOLDER]
+
+Rows are appended to FILE (a JSON line each) as they come; what stands there already is not computed again.
+Seeds 0 to 99 were used while the code was written, 1000 and above are run once.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from integrity_faults import Fault, displaced, faults, in_base_frame
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import simulated, with_part
+from data_synth.scene import load_scene
+from data_synth.simulate import Measured
+from stitch import frames
+from stitch.errors import StitchError
+from stitch.integrity.deep_check import deep_check
+from stitch.integrity.reliability import blunder_sizes, normal_blocks
+from stitch.integrity.snooping import Snooping, snoop
+from stitch.measurement.capture import Capture, capture
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.stages.correct import close_in
+from stitch.system.threads import library_threads_off
+
+PARTS: dict[str, dict[str, Any]] = {
+    "blade": {},
+    "curved_drill_plate": {"length": 150.0, "width": 120.0, "pitch": 36.0, "radius": 150.0},
+    "sphere_plate": {},
+}
+MOUNTS = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
+VIEWS, RAYS = 14, 120
+# Effects that a model may lack while a session is good: they must not cost it a view.
+_HIDDEN: tuple[dict[str, float], ...] = ({}, {}, {"joint_compliance": 0.5}, {"scanner_thermal": 0.5})
+_START_GATE = 6.0  # mm: the hand-eye starts near its end
+
+
+def measured(part: str, mount: str, seed: int, hidden: dict[str, float] | None = None) -> Measured:
+    """One cell."""
+    scene = load_scene(MOUNTS[mount])
+    scene = replace(scene, scanner=replace(scene.scanner, columns=RAYS, rows=RAYS))
+    if part != "blade":
+        scene = with_part(scene, part, **PARTS[part])
+    return simulated(scene, hidden or {}, seed, VIEWS)
+
+
+def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray, Snooping]:
+    """What a run would see: hand-eye corrected, views freed, tests."""
+    own = capture(session)
+    T_mount, overlaps, _ = close_in([own], T_mount, [_START_GATE])
+    freed = free_poses(own, own.poses(T_mount), overlaps[0].gate)
+    return own, T_mount, snoop(own, T_mount, overlaps[0].gate, freed)
+
+
+def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
+    """A session without a mistake: what is left out wrongly."""
+    hidden = _HIDDEN[seed % len(_HIDDEN)]
+    try:
+        m = measured(part, mount, seed, hidden)
+    except ValueError:
+        hidden, m = {}, measured(part, mount, seed)
+    start = time.perf_counter()
+    _, _, found = snooped(session_of(m), m.T_mount)
+    block = None if found.block is None else found.block.start
+    yield {
+        "case": f"good {'+'.join(hidden)}", "left_out": list(found.left_out), "block": block,
+        "groups": len(found.disconnected), "seconds": time.perf_counter() - start,
+    }  # fmt: skip
+
+
+def sizes(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
+    """One view off by a multiple of its minimal detectable and identifiable blunder, in a random direction."""
+    m = measured(part, mount, seed)
+    session, rng = session_of(m), np.random.default_rng([seed, 7])
+    own, T_mount, clean = snooped(session, m.T_mount)
+    normal = normal_blocks(clean.model, clean.found)
+    v = int(rng.integers(VIEWS))
+    flange = rng.standard_normal(6) * [1, 1, 1, clean.model.lever, clean.model.lever, clean.model.lever]
+    # A right twist of the flange, as a left twist of the view about the centre: A·exp(ξ) or, inverted, exp(−ξ)·A⁻¹.
+    sign = -1.0 if mount == "eye_to_hand" else 1.0
+    detectable, identifiable = blunder_sizes(normal, v, (sign * clean.model.carried[v] @ flange)[None])
+    for times, unit, size in [(k, "detectable", detectable[0]) for k in (1, 2, 10)] + [(2, "identifiable", identifiable[0])]:
+        if not np.isfinite(size):
+            yield {"case": f"{times} x {unit}", "skipped": "the others do not hold this direction"}
+            continue
+        _, _, found = snooped(displaced({v: times * size * flange})(session), T_mount)
+        yield {"case": f"{times} x {unit}", "detected": bool(found.left_out), "named": found.left_out == (v,),
+               "size_mm": float(times * size * np.linalg.norm(flange[3:]))}  # fmt: skip
+
+
+def kinds(part: str, mount: str, seed: int, done: set[str] = frozenset()) -> Iterator[dict[str, Any]]:  # type: ignore[assignment]
+    """Every mistake of the table in one session."""
+    m = measured(part, mount, seed)
+    session = session_of(m)
+    own = capture(session)
+    table = {"nothing": Fault(lambda s: s, ())}
+    table |= faults(VIEWS, np.random.default_rng([seed, 8])) | {"clouds in base frame": in_base_frame(own.poses(m.T_mount))}
+    for case, fault in table.items():
+        if case not in done:
+            yield {"case": case} | judged(fault.apply(session), fault)
+
+
+def judged(session: Session, fault: Fault) -> dict[str, Any]:
+    """What the deep check says of a session with a mistake."""
+    start = time.perf_counter()
+    try:
+        found = [(p.kind, list(p.views), p.fix) for p in deep_check(session)]
+    except StitchError as error:
+        found = [("refused", [], str(error))]
+    culprits = {session.views[v].name for v in fault.views}
+    named = any(kind in fault.kinds and (not culprits or culprits & set(views)) for kind, views, _ in found)
+    touched = set().union(*(set(views) for _, views, _ in found)) if found else set()
+    return {
+        "said": found, "silent": not found, "named": named, "culprit": culprits <= touched,
+        "seconds": time.perf_counter() - start,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Run one part of the bench."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=("good", "sizes", "kinds"))
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1))
+    parser.add_argument("--minutes", type=float, default=30)
+    given = parser.parse_args()
+    library_threads_off()
+    end = time.monotonic() + 60 * given.minutes
+    rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
+    done = {(r["part"], r["mount"], r["seed"], r["case"]) for r in rows}
+    cells = [(p, m, s) for s in range(*given.seeds) for p in PARTS for m in MOUNTS]
+    for part, mount, seed in cells:
+        cases = {case for p, m, s, case in done if (p, m, s) == (part, mount, seed)}
+        if given.what != "kinds" and cases:
+            continue
+        found = kinds(part, mount, seed, cases) if given.what == "kinds" else globals()[given.what](part, mount, seed)
+        for row in found:
+            with given.file.open("a") as file:
+                file.write(json.dumps({"part": part, "mount": mount, "seed": seed} | row, default=float) + "\n")
+            if time.monotonic() > end:
+                return
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""A Python file that a model names is run only where somebody allows it."""
+
+import numpy as np
+import pytest
+
+from stitch.effects import EFFECTS
+from stitch.errors import InputError
+from stitch.stored.trusted_model import trusted_model
+
+EFFECT = """
+from pathlib import Path
+from stitch.effects import effect, number
+Path(__file__).with_name("executed").touch()
+
+@effect("sensor", k=number("mm", typical=0.02, limit=1.0))
+def of_a_stranger(points, view, k):
+    "x"
+    return points
+"""
+
+
+@pytest.fixture
+def model(tmp_path):
+    (tmp_path / "sent.py").write_text(EFFECT)
+    file = tmp_path / "model.toml"
+    rows = [list(map(float, row)) for row in np.eye(4)]
+    file.write_text(
+        f'format = "stitch-model/1"\nlength_unit = "mm"\nmount = "eye_to_hand"\n'
+        f'effects_file = "{tmp_path / "sent.py"}"\n[hand_eye]\ncorrected = {rows}\n'
+    )
+    yield file
+    EFFECTS.pop("of_a_stranger", None)
+
+
+@pytest.mark.parametrize("whole_folder", [False, True])
+def test_nothing_of_it_runs_by_itself(model, whole_folder):
+    with pytest.raises(InputError, match=r"names effects in .*sent.py.*--trust.*--effects-file"):
+        trusted_model(model.parent if whole_folder else model)
+    assert not (model.parent / "executed").exists() and "of_a_stranger" not in EFFECTS
+
+
+def test_it_runs_where_it_is_trusted(model):
+    assert trusted_model(model, trust=True)[1] == str(model.parent / "sent.py")
+    assert "of_a_stranger" in EFFECTS
+
+
+def test_a_file_of_ones_own_takes_its_place(model):
+    own = model.parent / "own.py"
+    own.write_text(EFFECT.replace("of_a_stranger", "of_my_own").replace("executed", "mine"))
+    try:
+        assert trusted_model(model, effects_file=own)[1] == str(own)
+        assert "of_my_own" in EFFECTS and not (model.parent / "executed").exists()
+    finally:
+        EFFECTS.pop("of_my_own", None)
+
+
+def test_values_must_be_numbers(model):
+    model.write_text(model.read_text() + '[effects.range_scale.s]\nvalue = nan\nunit = ""\n')
+    with pytest.raises(InputError, match=r"effects.range_scale.s is nan; to fix"):
+        trusted_model(model, trust=True)
