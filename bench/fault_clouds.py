@@ -47,10 +47,8 @@ def _at(row: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def clouds() -> Iterator[Case]:
-    """Scans that are no scans, promise too much, or hold what no scanner measures."""
-    for what in ("pipe", "folder", "dangling link", "device", "empty", "noise"):
-        yield Case("cloud is no file", what, instead("s/clouds/v001.ply", what, RUN))
+def cloud_headers() -> Iterator[Case]:
+    """Headers that promise too much, or nothing that can be read."""
     for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
         for count in (_HUGE, 10**30, 7, -3, "x"):
             yield Case("PLY headers", f"{encoding} {count}", _as("c.ply", _HEADER.format(encoding, count) + "1 2 3\n"))
@@ -79,6 +77,12 @@ def clouds() -> Iterator[Case]:
     yield Case(
         "PCD headers", "large counts", _as("c.pcd", _PCD.format(3, "binary").replace("COUNT 1", f"COUNT {_HUGE}"))
     )
+
+
+def clouds() -> Iterator[Case]:
+    """Scans that are no scans, or hold what no scanner measures."""
+    for what in ("pipe", "folder", "dangling link", "device", "empty", "noise"):
+        yield Case("cloud is no file", what, instead("s/clouds/v001.ply", what, RUN))
     for name, text in {
         "words": "a b c\nd e f\n",
         "two columns": "1 2\n3 4\n",

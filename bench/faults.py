@@ -17,7 +17,7 @@ from datetime import date
 from itertools import chain
 from pathlib import Path
 
-from fault_clouds import clouds, robots
+from fault_clouds import cloud_headers, clouds, robots
 from fault_code import effects_files, foreign_code
 from fault_folders import models, run_folders
 from fault_kills import COMMANDS, Kills, kill_at_random
@@ -35,6 +35,7 @@ _FAULTS = ("traceback", "hang", "silent", "leftovers", "refused though right", "
 _SOURCES = (
     session_files,
     tables,
+    cloud_headers,
     clouds,
     robots,
     models,

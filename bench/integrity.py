@@ -21,7 +21,6 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
-from stitch import frames
 from stitch.errors import StitchError
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.reliability import blunder_sizes, normal_blocks
@@ -40,7 +39,7 @@ PARTS: dict[str, dict[str, Any]] = {
 MOUNTS = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
 VIEWS, RAYS = 14, 120
 # Effects that a model may lack while a session is good: they must not cost it a view.
-_HIDDEN: tuple[dict[str, float], ...] = ({}, {}, {"joint_compliance": 0.5}, {"scanner_thermal": 0.5})
+_HIDDEN: tuple[dict[str, float], ...] = ({}, {}, {"joint_compliance": 0.5}, {"scanner_thermal_scale": 0.5})
 _START_GATE = 6.0  # mm: the hand-eye starts near its end
 
 
@@ -64,10 +63,7 @@ def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray,
 def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
     """A session without a mistake: what is left out wrongly."""
     hidden = _HIDDEN[seed % len(_HIDDEN)]
-    try:
-        m = measured(part, mount, seed, hidden)
-    except ValueError:
-        hidden, m = {}, measured(part, mount, seed)
+    m = measured(part, mount, seed, hidden)
     start = time.perf_counter()
     _, _, found = snooped(session_of(m), m.T_mount)
     block = None if found.block is None else found.block.start
@@ -81,14 +77,16 @@ def sizes(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
     """One view off by a multiple of its minimal detectable and identifiable blunder, in a random direction."""
     m = measured(part, mount, seed)
     session, rng = session_of(m), np.random.default_rng([seed, 7])
-    own, T_mount, clean = snooped(session, m.T_mount)
+    _, T_mount, clean = snooped(session, m.T_mount)
     normal = normal_blocks(clean.model, clean.found)
     v = int(rng.integers(VIEWS))
     flange = rng.standard_normal(6) * [1, 1, 1, clean.model.lever, clean.model.lever, clean.model.lever]
     # A right twist of the flange, as a left twist of the view about the centre: A·exp(ξ) or, inverted, exp(−ξ)·A⁻¹.
     sign = -1.0 if mount == "eye_to_hand" else 1.0
     detectable, identifiable = blunder_sizes(normal, v, (sign * clean.model.carried[v] @ flange)[None])
-    for times, unit, size in [(k, "detectable", detectable[0]) for k in (1, 2, 10)] + [(2, "identifiable", identifiable[0])]:
+    for times, unit, size in [(k, "detectable", detectable[0]) for k in (1, 2, 10)] + [
+        (2, "identifiable", identifiable[0])
+    ]:
         if not np.isfinite(size):
             yield {"case": f"{times} x {unit}", "skipped": "the others do not hold this direction"}
             continue
@@ -97,15 +95,17 @@ def sizes(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
                "size_mm": float(times * size * np.linalg.norm(flange[3:]))}  # fmt: skip
 
 
-def kinds(part: str, mount: str, seed: int, done: set[str] = frozenset()) -> Iterator[dict[str, Any]]:  # type: ignore[assignment]
-    """Every mistake of the table in one session."""
+def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, int]) -> Iterator[dict[str, Any]]:
+    """The mistakes of the table in one session; with share (k, n) every n-th of them, from k on."""
     m = measured(part, mount, seed)
     session = session_of(m)
     own = capture(session)
     table = {"nothing": Fault(lambda s: s, ())}
-    table |= faults(VIEWS, np.random.default_rng([seed, 8])) | {"clouds in base frame": in_base_frame(own.poses(m.T_mount))}
-    for case, fault in table.items():
-        if case not in done:
+    table |= faults(VIEWS, np.random.default_rng([seed, 8])) | {
+        "clouds in base frame": in_base_frame(own.poses(m.T_mount))
+    }
+    for number, (case, fault) in enumerate(table.items()):
+        if case not in done and (number + share[0]) % share[1] == 0:
             yield {"case": case} | judged(fault.apply(session), fault)
 
 
@@ -132,17 +132,24 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1))
     parser.add_argument("--minutes", type=float, default=30)
+    parser.add_argument(
+        "--every", type=int, default=1, help="of the mistakes, every n-th in a cell, another in the next"
+    )
     given = parser.parse_args()
     library_threads_off()
     end = time.monotonic() + 60 * given.minutes
     rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
     done = {(r["part"], r["mount"], r["seed"], r["case"]) for r in rows}
     cells = [(p, m, s) for s in range(*given.seeds) for p in PARTS for m in MOUNTS]
-    for part, mount, seed in cells:
+    for number, (part, mount, seed) in enumerate(cells):
         cases = {case for p, m, s, case in done if (p, m, s) == (part, mount, seed)}
         if given.what != "kinds" and cases:
             continue
-        found = kinds(part, mount, seed, cases) if given.what == "kinds" else globals()[given.what](part, mount, seed)
+        found = (
+            kinds(part, mount, seed, cases, (number, given.every))
+            if given.what == "kinds"
+            else globals()[given.what](part, mount, seed)
+        )
         for row in found:
             with given.file.open("a") as file:
                 file.write(json.dumps({"part": part, "mount": mount, "seed": seed} | row, default=float) + "\n")

@@ -137,7 +137,7 @@ def faults(views: int, rng: np.random.Generator) -> dict[str, Fault]:
     table |= {
         "turn 2 deg": Fault(displaced({a: np.r_[np.radians(2) * u, none]}), one, (a,)),
         "two shifted 5 mm": Fault(displaced({a: shift(5.0), b: shift(-5.0)}), one, (a, b)),
-        "three shifted 1 mm": Fault(displaced({v: shift(d) for v, d in ((a, 1.0), (b, -1.0), (c, 1.0))}), one, (a, b, c)),
+        "three shifted 1 mm": Fault(displaced({a: shift(1.0), b: shift(-1.0), c: shift(1.0)}), one, (a, b, c)),
         "two exchanged": Fault(moved_clouds({a: b, b: a}), ("exchanged",), (a, b)),
         "three exchanged": Fault(moved_clouds({a: b, b: c, c: a}), ("exchanged",), (a, b, c)),
         "shifted by 1": Fault(_rows(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),

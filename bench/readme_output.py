@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 import tempfile
+import textwrap
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -55,7 +56,15 @@ def _output(arguments: list[str]) -> str:
             if ended.code:
                 raise RuntimeError(f"stitch {' '.join(arguments)}: {out.getvalue()}") from None
     text = _SECONDS.sub(lambda m: m[1] + "…".rjust(len(m[2])) + m[3], out.getvalue())
-    return "\n".join(line.rstrip() for line in text.rstrip().splitlines())
+    return "\n".join(_wrapped(line.rstrip()) for line in text.rstrip().splitlines())
+
+
+def _wrapped(line: str) -> str:
+    """A long sentence over several lines, as a terminal shows it."""
+    if len(line) <= WIDTH:
+        return line
+    margin = line[: len(line) - len(line.lstrip())]
+    return textwrap.fill(line, WIDTH, subsequent_indent=margin, break_on_hyphens=False)
 
 
 @contextmanager

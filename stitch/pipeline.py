@@ -1,6 +1,7 @@
 """The run: coarse → correct → register → fuse, for one session or several of one rig; and what changes its model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from stitch.diagnosis.diagnose import diagnose_state
@@ -8,6 +9,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
 from stitch.frames import Array
+from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
@@ -27,18 +29,23 @@ from stitch.system.threads import Clock, library_threads_off
 
 
 def run(
-    session: Session, model: ModelFile | None = None, recorder: Recorder | None = None, effects: Sequence[str] = ()
+    session: Session,
+    model: ModelFile | None = None,
+    recorder: Recorder | None = None,
+    effects: Sequence[str] = (),
+    keep: bool = False,
 ) -> Run:
     """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
 
     Args:
         effects: names of effects to fit together with the hand-eye.
+        keep: fuse also the views that do not belong.
 
     Raises:
         InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
-    return run_rig([session], model, [recorder or Silent()], effects)[0]
+    return run_rig([session], model, [recorder or Silent()], effects, keep)[0]
 
 
 def run_rig(
@@ -46,6 +53,7 @@ def run_rig(
     model: ModelFile | None = None,
     recorders: Sequence[Recorder] | None = None,
     effects: Sequence[str] = (),
+    keep: bool = False,
 ) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
     require_same_rig(sessions, model)
@@ -64,15 +72,21 @@ def run_rig(
         before = [kind.begin(m, begun, seconds, r) for m, r in zip(measurements, recorders, strict=True)]
         clock.lap()
         if model:
-            fitted = kind.apply(sessions, measurements, model)
+            fit = partial(kind.apply, file=model)
         else:
             terms_at = partial(_terms_at, sessions[0], effects) if effects else None
-            fitted = kind.fit(sessions, measurements, begun, terms_at, recorders[0])
-        end = End(begun, fitted, clock.lap(), model.effects_file if model else None)
-        return [
-            collected(session, i, end, before[i], recorder)
-            for i, (session, recorder) in enumerate(zip(sessions, recorders, strict=True))
-        ]
+            fit = partial(kind.fit, begun=begun, terms_at=terms_at, recorder=recorders[0])
+        found = admitted_fit(sessions, measurements, fit, keep)
+        end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
+        runs = []
+        for i, (session, own) in enumerate(zip(found.sessions, found.admissions, strict=True)):
+            if len(session.views) < len(sessions[i].views):
+                recorders[i].start(session)
+            last = replace(
+                end, left_out=() if keep else own.left_out, kept=own.left_out if keep else (), links=own.links
+            )
+            runs.append(collected(session, i, last, before[i], recorders[i]))
+        return runs
 
 
 def add(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -129,7 +143,16 @@ def change(
         fitted = kind.refit([session], [measurement], model, [state.gate])
         if poses_before is None:
             poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
-        end = End(begun, fitted, clock.lap(), state.effects_file, state.ledger, poses_before)
+        end = End(
+            begun=begun,
+            fitted=fitted,
+            seconds=clock.lap(),
+            effects_file=state.effects_file,
+            ledger=state.ledger,
+            poses_before=poses_before,
+            left_out=state.left_out,
+            links=state.links,
+        )
         return collected(session, 0, end, before, recorder)
 
 

@@ -46,7 +46,8 @@ class RerunRecorder:
     def start(self, session: Session) -> None:
         """Log the scans and the robot's path."""
         self.to_um = MICROMETRES[session.length_unit]
-        self.names = [view.name for view in session.views]
+        # A run that leaves views out begins again with the others.
+        self.names, self.picked, self.clouds = [view.name for view in session.views], [], []
         rec = self.recording
         rec.log("scans", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         colours = view_colours(len(self.names))
@@ -94,7 +95,7 @@ class RerunRecorder:
         rec.log("fused", points, static=True)
         if run.targets is not None:
             self._sticks(run)
-        rec.log("views/rms_um", rr.BarChart(run.view_rms * self.to_um), static=True)
+        rec.log("views/rms_um", rr.BarChart(np.nan_to_num(run.view_rms) * self.to_um), static=True)
         shift = np.linalg.norm(view_shifts(run), axis=1) * self.to_um
         rec.log("views/correction_um", rr.BarChart(shift), static=True)
         rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)

@@ -19,6 +19,7 @@ from stitch.cli.change import show_ledger
 from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.options import Force, Json
 from stitch.cli.streams import emit, results_alone
+from stitch.errors import InputError
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
@@ -45,6 +46,8 @@ def sphere(
     as_json: Json = False,
 ) -> None:
     """Hand-eye from laser-line or area scans of one sphere of known radius."""
+    if output is not None and output.exists() and output.suffix != ".json":
+        raise InputError(f"{output}: exists and is no JSON file; name another, or remove it")
     loaded = load_session(session)
     document = document_of(calibrate_sphere(loaded, radius_free), loaded)
     if output is not None:

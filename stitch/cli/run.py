@@ -57,21 +57,11 @@ def run(
             "--effects and --hand-eye: a model that is used as it is brings its own effects; name one of the two"
         )
     loaded = [load_session(path) for path in sessions]
-    names = [session.name for session in loaded]
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"two sessions are named {max(names, key=names.count)!r}; give each its own name in session.toml"
-        )
-    if len(names) > 1 and (taken := FILES & set(names)):
-        raise InputError(
-            f"a session is named {taken.pop()!r}, as a file of the run is; give it another in session.toml"
-        )
+    names = _names(loaded)
     target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
     model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
     with run_folder.new_folder(target, sessions, force) as scratch:
-        folders = [scratch] if len(loaded) == 1 else [scratch / name for name in names]
-        for folder in folders:
-            folder.mkdir(exist_ok=True)
+        folders = _folders(scratch, names)
         runs = run_rig(loaded, model, [recorder_for(folder, recording) for folder in folders], names_of_effects)
         if effects_file:
             runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
@@ -84,6 +74,25 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
+
+
+def _names(sessions: list[Session]) -> list[str]:
+    """Names of the sessions: their folders in the folder of a rig."""
+    names = [session.name for session in sessions]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
+        raise InputError(f"two sessions are named {twice!r}; give each its own name in session.toml")
+    if len(names) > 1 and (taken := FILES & set(names)):
+        named = taken.pop()
+        raise InputError(f"a session is named {named!r}, as a file of the run is; give it another in session.toml")
+    return names
+
+
+def _folders(scratch: Path, names: list[str]) -> list[Path]:
+    folders = [scratch] if len(names) == 1 else [scratch / name for name in names]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+    return folders
 
 
 def recorder_for(folder: Path, recording: bool) -> Recorder:

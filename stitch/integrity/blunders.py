@@ -105,7 +105,9 @@ def _block(model: ViewModel, first: Array | None, plain: Found) -> Block | None:
     start = model.fit(first)
     under = projector(model, start, first)
     tried = {
-        (k, what): test(under, _block_columns(model, k, what)) for k in range(2, views - 1) for what in ("part", "scanner")
+        (k, what): test(under, _block_columns(model, k, what))
+        for k in range(2, views - 1)
+        for what in ("part", "scanner")
     }
     k, what = max(tried, key=lambda key: tried[key].statistic)
     both = [_likelihood(model, _beside(first, _block_columns(model, k, w))) for w in ("part", "scanner")]

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.measurement.session import Session
@@ -115,7 +115,10 @@ def _named_unit(found: Explained) -> Explained:
         return replace(found, open=1.0, closed=0.0)
     factor = min(UNITS, key=lambda u: abs(np.log(s / u)))
     if abs(s / factor - 1) < _UNIT_NEAR:
-        fix = f"the clouds are {factor:.6g} times as large as the poses say ({UNITS[factor]}): check cloud_unit and length_unit"
+        fix = (
+            f"the clouds are {factor:.6g} times as large as the poses say ({UNITS[factor]}): "
+            "check cloud_unit and length_unit"
+        )
         return replace(found, hypothesis=replace(h, kind="unit", fix=fix))
     fix = f"the clouds are {s:.5g} times as large as the robot's motions say: check their scale"
     return replace(found, hypothesis=replace(h, kind="scale", fix=fix))
@@ -152,7 +155,7 @@ def _angles(A: Array, B: Array, R: Array) -> Array:
     return np.asarray(2 * np.arcsin(np.clip(np.linalg.norm(off, axis=(2, 3)) / np.sqrt(8), 0, 1)))
 
 
-def _translation(A: Array, B: Array, R: Array, near: Array, scaled: bool) -> tuple[Array, float, Array]:
+def _translation(A: Array, B: Array, R: Array, near: Mask, scaled: bool) -> tuple[Array, float, Array]:
     """t_X (3,), scale and per motion what is left: R_A t_X + s t_A = R_X t_B + t_X, least absolute sum (IRLS)."""
     M = len(A)
     rows = A[:, :3, :3] - np.eye(3)

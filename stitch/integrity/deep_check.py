@@ -1,6 +1,5 @@
 """`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
 
-
 from stitch.frames import Array
 from stitch.integrity.conventions import Explained, explained, verdict
 from stitch.integrity.linkage import only
@@ -21,7 +20,7 @@ from stitch.units import METRES
 _POINTS = 8000
 # No arm scatters by more.
 ROTATION, TRANSLATION_M = 0.010, 0.005
-# A hand-eye from the scans' own motions starts within this share of the part's size; one that is stated may be off more.
+# A hand-eye from the scans' own motions is right within this share of the part's size, a stated one within the other.
 _GATE, _STATED_GATE = 0.15, 0.35
 _CLOSES = 0.5
 
@@ -82,9 +81,7 @@ def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
 def _unexplained(session: Session, found: Snooping) -> Problem:
     off = f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
     fix = (
-        f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and clouds "
-        "belong together and how the poses were converted"
+        f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and "
+        "clouds belong together and how the poses were converted"
     )
     return Problem("displaced", tuple(view.name for view in session.views), fix)
-
-

@@ -1,10 +1,8 @@
 """What people do wrong with the poses of a session, written out: each mistake undone gives other poses.
 
-Poses that are right after one of these changes, and only then, say which mistake was made. Orders of Euler angles are
-those of Diebel (2006), "Representing Attitude": six with three axes, six with two.
+Poses that are right after one of these changes, and only then, say which mistake was made.
 """
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -14,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array, Indices
+from stitch.integrity.misread_rotations import degrees_for_radians, other_angles, other_quaternions
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
 
-ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")
 # Factors by which lengths are too large when units are mixed up, and how that comes about.
 UNITS = {
     1000.0: "mm where m are stated",
@@ -71,22 +69,28 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
         q = np.array(joints)
         assert robot is not None
         for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
-            yield Hypothesis("degrees", forward(robot, q * factor), mount, f"the joint angles are {words}: convert them")
+            yield Hypothesis(
+                "degrees", forward(robot, q * factor), mount, f"the joint angles are {words}: convert them"
+            )
     else:
         yield Hypothesis("inverse", frames.inverse(T), mount, _mount_or_inverse(mount))
     position, R = T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])
     transposed = frames.make(R.inv().as_matrix(), position)
     yield Hypothesis("quaternion", transposed, mount, "the quaternions turn the other way: negate qx, qy, qz")
-    for name, q in _quaternions(R.as_quat()):
-        yield Hypothesis("quaternion", frames.make(q.as_matrix(), position), mount, f"the quaternion columns are {name}")
-    for name, turned in _euler(R):
+    for name, q in other_quaternions(R.as_quat()):
+        yield Hypothesis(
+            "quaternion", frames.make(q.as_matrix(), position), mount, f"the quaternion columns are {name}"
+        )
+    for name, turned in other_angles(R):
         yield Hypothesis("euler", frames.make(turned.as_matrix(), position), mount, name)
-    for name, turned in _degrees(R):
+    for name, turned in degrees_for_radians(R):
         yield Hypothesis("degrees", frames.make(turned.as_matrix(), position), mount, name)
     flip = np.diag([-1.0, 1, 1])
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
     still = np.broadcast_to(np.eye(4), T.shape)
-    yield Hypothesis("frame", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them")
+    yield Hypothesis(
+        "frame", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them"
+    )
 
 
 def _mount_or_inverse(mount: str) -> str:
@@ -94,55 +98,6 @@ def _mount_or_inverse(mount: str) -> str:
         f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER[mount]}" in session.toml '
         "(these scans cannot tell the two apart, the size of the hand-eye can)"
     )
-
-
-def _quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
-    """Readings (V, 4) x, y, z, w taken for another order."""
-    yield "w, x, y, z, not x, y, z, w", Rotation.from_quat(q[:, [1, 2, 3, 0]])
-    yield "x, y, z, w but were reordered as if w came first", Rotation.from_quat(q[:, [3, 0, 1, 2]])
-
-
-def _euler(R: Rotation) -> Iterator[tuple[str, Rotation]]:
-    """Angles that were composed in one order and belong into another; columns by place, and by the axis they name."""
-    for order in (*ORDERS, *(o.lower() for o in ORDERS)):
-        angles = _angles(R, order)
-        for right in (*ORDERS, *(o.lower() for o in ORDERS)):
-            if right != order:
-                yield _order_fix(order, right), Rotation.from_euler(right, angles)
-        if len(set(order.upper())) == 3:
-            for right in ORDERS[:6]:
-                if right != order:
-                    named = np.column_stack([angles[:, order.upper().index(axis)] for axis in right])
-                    yield _order_fix(order, right), Rotation.from_euler(right, named)
-        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(angles)
-    for right in (*ORDERS, *(o.lower() for o in ORDERS)):
-        yield f"the rotation vectors are Euler angles in the order {_named(right)}", Rotation.from_euler(
-            right, R.as_rotvec()
-        )
-
-
-def _order_fix(order: str, right: str) -> str:
-    return f"the Euler angles were turned in the order {_named(order)} and belong into {_named(right)}"
-
-
-def _named(order: str) -> str:
-    """Capitals turn about the axes that turned already (intrinsic)."""
-    return f"{order.lower()}-{'intrinsic' if order.isupper() else 'extrinsic'}"
-
-
-def _degrees(R: Rotation) -> Iterator[tuple[str, Rotation]]:
-    """Angles in radians that were taken for degrees."""
-    words = "the angles are radians, and were read as degrees"
-    yield words, Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
-    for order in ORDERS:
-        yield f"{words} ({_named(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
-
-
-def _angles(R: Rotation, order: str) -> Array:
-    with warnings.catch_warnings():
-        # Gimbal lock sets an angle to zero: that reading is one of those to try.
-        warnings.simplefilter("ignore")
-        return np.asarray(R.as_euler(order))
 
 
 def _rows(T: Array, mount: str) -> Iterator[Hypothesis]:

@@ -1,4 +1,4 @@
-"""What views that do not belong say about their rows: exchanged, a neighbour's joints, a copy, a wrong digit, another part."""
+"""Views that do not belong, explained: exchanged rows, a neighbour's joints, a copy, a wrong digit, another part."""
 
 from collections.abc import Sequence
 
@@ -104,15 +104,17 @@ def _single(
     if fault is not None:
         return Problem(fault.kind, own, fault.fix)
     if m.T is None:
-        return Problem("foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out")
+        return Problem(
+            "foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out"
+        )
     amount = f"{m.distance:.4g} {session.length_unit} and {np.degrees(m.rotation):.3g}°"
     partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
     if partner is not None:
         joint = session.views[m.view].joints is not None and abs(partner - m.view) == 1
         kind = "joint_row" if joint else "duplicate_pose"
         what = "joint angles" if joint else "pose"
-        return Problem(kind, (*own, names[partner]), f"{own[0]} has the {what} of {names[partner]}, and is off by {amount}: "
-                       f"put in its own")  # fmt: skip
+        fix = f"{own[0]} has the {what} of {names[partner]}, and is off by {amount}: put in its own"
+        return Problem(kind, (*own, names[partner]), fix)
     digit = _one_joint(session, capture, T_mount, m)
     if digit is not None:
         joint_name, stated, fits, neighbour = digit
@@ -136,7 +138,7 @@ def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> S
 def _one_joint(
     session: Session, capture: Capture, T_mount: Array, m: Misplaced
 ) -> tuple[str, float, float, bool] | None:
-    """The joint whose angle alone explains a displacement: name, degrees stated and that fit, neighbour's angle or not."""
+    """The joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
     robot, joints = session.robot, session.views[m.view].joints
     if robot is None or joints is None or m.T is None:
         return None

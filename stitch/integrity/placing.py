@@ -73,7 +73,9 @@ def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolera
     picked = {v: sample(scans[v], max(_SURFACE_POINTS // max(len(views), 1), 200)) for v in views}
     points = np.concatenate([frames.transform(poses[v], scans[v].points[picked[v]]) for v in views])
     normals = np.concatenate([frames.rotate(poses[v], scans[v].normals[picked[v]]) for v in views])
-    spacing = float(np.median([scans[v].spacing * np.sqrt(len(scans[v].points) / max(len(picked[v]), 1)) for v in views]))
+    spacing = float(
+        np.median([scans[v].spacing * np.sqrt(len(scans[v].points) / max(len(picked[v]), 1)) for v in views])
+    )
     return Surface(points, normals, KDTree(np.ascontiguousarray(points), leafsize=16), spacing, tolerance)
 
 

@@ -4,9 +4,26 @@ from dataclasses import dataclass
 from typing import Any
 
 KINDS = (
-    "exchanged", "shifted", "reversed", "inverse", "mount", "euler", "degrees", "quaternion", "unit", "scale", "mirrored",
-    "joint_row", "duplicate_scan", "duplicate_pose", "displaced", "foreign", "reclamped", "disconnected", "frame",
-)  # fmt: skip
+    "exchanged",
+    "shifted",
+    "reversed",
+    "inverse",
+    "mount",
+    "euler",
+    "degrees",
+    "quaternion",
+    "unit",
+    "scale",
+    "mirrored",
+    "joint_row",
+    "duplicate_scan",
+    "duplicate_pose",
+    "displaced",
+    "foreign",
+    "reclamped",
+    "disconnected",
+    "frame",
+)
 
 
 @dataclass(frozen=True)

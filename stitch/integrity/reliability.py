@@ -1,4 +1,4 @@
-"""What could be wrong without being seen: redundancy, minimal detectable and identifiable blunder, and what it would do.
+"""What could be wrong unseen: redundancy, minimal detectable and identifiable blunder, and what it would do.
 
 Baarda (1968), "A testing procedure for use in geodetic networks". Redundancy numbers of a view are the eigenvalues of
 Σ^½ N Σ^½, Σ the covariance of its pose and N the normal matrix of its own displacement: 0 where only the robot knows
@@ -34,7 +34,9 @@ class Reliability:
     detectable: float  # length_unit: a shift this large is found whatever its direction
     detectable_rotation: float  # rad, about the middle of all correspondences
     identifiable: float  # length_unit: … and the right view is named
-    hand_eye: float  # length_unit: largest shift of the part that the smallest detectable one, missed, makes by the hand-eye
+    hand_eye: (
+        float  # length_unit: largest shift of the part that the smallest detectable one, missed, makes by the hand-eye
+    )
     cloud: float  # length_unit: the same of the view in the stitched cloud, after registration
 
 
@@ -120,13 +122,15 @@ def _of_view(model: ViewModel, normal: Array, covariance: Array, pull: Array, vi
 
 
 def _hand_eye_pull(model: ViewModel, found: Found) -> Array:
-    """(V, 6, 6) mean twist of the part, rotations in 1/lever, that a unit displacement of one view makes by the hand-eye."""
+    """(V, 6, 6) largest twist of a view, rotations in 1/lever, that one view displaced by 1 makes by the hand-eye."""
     mixed = model.mixed(found.further)
     inverse = np.linalg.inv(mixed.covariance(found.fit.variances)[0])
     X = model.hand_eye if found.further is None else np.column_stack([model.hand_eye, found.further])
     scale = 1 / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
     scaled = X * scale
-    gain = scale[:, None] * (np.linalg.pinv(scaled.T @ inverse @ scaled, rcond=1e-12, hermitian=True) @ scaled.T @ inverse)
+    gain = scale[:, None] * (
+        np.linalg.pinv(scaled.T @ inverse @ scaled, rcond=1e-12, hermitian=True) @ scaled.T @ inverse
+    )
     moved = np.einsum("vij,jn->vin", model.mount_twists, gain[:6])
     own = np.einsum("vin,wnj->wvij", moved, model.views, optimize=True)
     # Common to all views it is no error of the cloud: what counts is the displacement of single views against the mean.

@@ -1,4 +1,4 @@
-"""What can be wrong with one scan so that it closes nowhere: mirrored, scaled, in another unit; or a copy of another."""
+"""What can be wrong with one scan so that it closes nowhere: mirrored, scaled, another unit; or a copy of another."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -58,7 +58,9 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
             return ScanFault("mirrored", f"{words} in this cloud: export it again")
     for factor, words in UNITS.items():
         if closes(scan.points / factor, True) > needed:
-            return ScanFault("unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit")
+            return ScanFault(
+                "unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit"
+            )
     return scale_fault(scan, T_pose, surface, size, needed)
 
 

@@ -155,14 +155,18 @@ def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) ->
     others = [v for v in range(len(capture.scans)) if v != view]
     surface = surface_of(capture.scans, freed.poses, others, tolerance)
     best = place(capture.scans[view], surface, freed.poses[view][None], part_size([capture]))[0]
-    return best.T if best.closure > judge(capture.scans[view], freed.poses[view], surface).closure else freed.poses[view]
+    return (
+        best.T if best.closure > judge(capture.scans[view], freed.poses[view], surface).closure else freed.poses[view]
+    )
 
 
 def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:
     """Median closure of linked views on the surface of the other ones."""
     some = core[:: max(len(core) // 6, 1)]
     closures = [
-        judge(capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)).closure
+        judge(
+            capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)
+        ).closure
         for v in some
     ]
     return float(np.median(closures))

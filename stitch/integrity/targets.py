@@ -50,8 +50,8 @@ def check_targets(session: Session) -> list[Problem]:
         if stated is None:
             return []
         fix = (
-            f"the targets scatter by {stated.off:.3g} {session.length_unit} under the best hand-eye, and no usual mistake "
-            "explains it: check names of targets, rows and how the poses were converted"
+            f"the targets scatter by {stated.off:.3g} {session.length_unit} under the best hand-eye, and no usual "
+            "mistake explains it: check names of targets, rows and how the poses were converted"
         )
         return [Problem("displaced", tuple(names), fix)]
     h = best.hypothesis

@@ -6,6 +6,7 @@ A capture keeps this form: `T_reference_mount` holds what stands left of the han
 what stands right of it, and the points are those that sensor and part would have shown without effects.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +44,23 @@ class Measurement:
     def has_intensity(self) -> bool:
         """True if every point has an intensity."""
         return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
+
+    def without(self, left_out: Sequence[int]) -> "Measurement":
+        """The measurement less some views; what effects know of the others stays: numbers, rows before, first values."""
+        keep = [v for v in range(self.views.count) if v not in set(left_out)]
+        views = self.views.only(keep)
+        scan_views, target_views = (
+            tuple(replace(own[v], index=i, views=views) for i, v in enumerate(keep)) if own else ()
+            for own in (self.scan_views, self.target_views)
+        )
+        return replace(
+            self,
+            capture=self.capture.without(np.array(sorted(left_out), np.int64)),
+            T_base_flange=self.T_base_flange[keep],
+            views=views,
+            scan_views=scan_views,
+            target_views=target_views,
+        )
 
     def __repr__(self) -> str:
         return f"Measurement({self.capture.name!r}, {self.views.count} views)"

@@ -1,6 +1,7 @@
 """What was measured: a session, its views and its scanner."""
 
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -85,6 +86,10 @@ class Session:
     def has_sightings(self) -> bool:
         """True if some view shows labelled points or a probe."""
         return any(view.sighting is not None for view in self.views)
+
+    def without(self, names: Collection[str]) -> "Session":
+        """The session less some views."""
+        return replace(self, views=tuple(view for view in self.views if view.name not in names))
 
     @property
     def joints(self) -> Array | None:

@@ -1,7 +1,7 @@
 """What effects may know of the views: all of them at once (`Views`), or one with its points (`ScanView`)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,6 +54,18 @@ class Views:
     def hours(self) -> Array:
         """(V,) since the first view."""
         return self.time / 3600.0
+
+    def only(self, keep: Sequence[int]) -> "Views":
+        """Some of the views; their numbers, the rows before them and the first values stay those of the session."""
+        of_views = {name: getattr(self, name)[keep] for name in ("time", "joints", "previous", "approach", "number")}
+        return replace(
+            self,
+            count=len(keep),
+            velocity=None if self.velocity is None else self.velocity[keep],
+            torques=replace(self.torques, values=self.torques.values[keep]),
+            covariates={name: values[keep] for name, values in self.covariates.items()},
+            **of_views,
+        )
 
     def has(self, need: str) -> bool:
         """True if joints, time, torque, velocity or a covariate is known for every view."""

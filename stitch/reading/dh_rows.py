@@ -40,13 +40,7 @@ def robot_from_dh(
         for key in ("a", "alpha_deg", "d", "theta_deg")
     )
     alpha, theta = np.radians(alpha), np.radians(theta)
-    still = np.broadcast_to(np.eye(4), (len(a), 4, 4))
-    if convention == "standard":
-        before, after = still, elementary("z", 0, d) @ elementary("x", alpha, a)
-    elif convention == "modified":
-        before, after = elementary("x", alpha, a), elementary("z", 0, d)
-    else:
-        raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
+    before, after = _about_joint(convention, a, alpha, d)
     masses = [point_mass(where, row) for where, row in rows]
     payload_mass, payload_com = payload_of(payload)
     return Robot(
@@ -65,6 +59,15 @@ def robot_from_dh(
         alpha=alpha,
         d=d,
     )
+
+
+def _about_joint(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
+    """(n, 4, 4) each: what stands before and behind the turn of every joint."""
+    if convention == "standard":
+        return np.broadcast_to(np.eye(4), (len(a), 4, 4)), elementary("z", 0, d) @ elementary("x", alpha, a)
+    if convention == "modified":
+        return elementary("x", alpha, a), elementary("z", 0, d)
+    raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
 
 
 def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:

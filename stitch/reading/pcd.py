@@ -85,6 +85,8 @@ def _wanted(header: dict[str, list[str]]) -> dict[str, int]:
 def _ascii(path: Path, body: bytes, header: dict[str, list[str]], count: int) -> dict[str, Array]:
     counts = _counts(header)
     rows = min(count, body.count(b"\n") + 1)
+    if not body.strip():
+        raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
     table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=rows).reshape(-1, sum(counts))
     if len(table) < count:
         raise InputError(f"{path}: {count} points announced, data for {len(table)}; export it again")

@@ -42,20 +42,29 @@ def robot_from_urdf(
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
-        return _robot(path, robot, base_link, flange_link, 1 / METRES[length_unit], gravity, payload)
+        before, after, mass, com = _serial_chain(robot, base_link, flange_link, 1 / METRES[length_unit])
+        payload_mass, payload_com = payload_of(payload)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    return Robot(
+        name=str(robot.get("name", path.stem)),
+        convention="urdf",
+        before=before,
+        after=after,
+        theta=np.zeros(len(before)),
+        mass=mass,
+        com=com,
+        payload_mass=payload_mass,
+        payload_com=payload_com,
+        gravity=gravity_of(gravity),
+        metres_per_unit=METRES[length_unit],
+    )
 
 
-def _robot(
-    path: Path,
-    root: Element,
-    base_link: str | None,
-    flange_link: str | None,
-    scale: float,
-    gravity: Array,
-    payload: dict[str, Any] | None,
-) -> Robot:
+def _serial_chain(
+    root: Element, base_link: str | None, flange_link: str | None, scale: float
+) -> tuple[Array, Array, Array, Array]:
+    """What stands before and behind the turn of every joint (n, 4, 4), and what it moves: mass (n,), com (n, 3)."""
     before: list[Array] = []
     after: list[Array] = []
     mass, com = [], []
@@ -77,20 +86,7 @@ def _robot(
     # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
     after[-1] = after[-1] @ pending
     com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
-    payload_mass, payload_com = payload_of(payload)
-    return Robot(
-        name=str(root.get("name", path.stem)),
-        convention="urdf",
-        before=np.array(before),
-        after=np.array(after),
-        theta=np.zeros(len(before)),
-        mass=np.array(mass),
-        com=np.array(com),
-        payload_mass=payload_mass,
-        payload_com=payload_com,
-        gravity=gravity_of(gravity),
-        metres_per_unit=1 / scale,
-    )
+    return np.array(before), np.array(after), np.array(mass), np.array(com)
 
 
 def _chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:

@@ -72,9 +72,10 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
             _require_later(file, line, time_s, latest)
             latest = time_s
         values = {c: number(file, line, c, row[c]) for c in covariates if row[c]}
+        cloud = row.get("cloud", "")
         T_base_flange = _flange(file, line, name, row, joints[i], robot)
         approach = _approach(file, line, row, joints, i)
-        rows.append(Row(line, name, row.get("cloud", ""), T_base_flange, joints[i], approach, time_s, values))
+        rows.append(Row(line, name, cloud, T_base_flange, joints[i], approach, time_s=time_s, covariates=values))
     return rows
 
 

@@ -36,6 +36,24 @@ class FusedCloud:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """A view that is not fused, and why."""
+
+    view: str
+    why: str
+    pose: Array  # (4, 4) T_reference_scanner of the model, where the robot says it stood
+    points: int = 0  # of its scan
+
+
+@dataclass(frozen=True)
+class ViewLinks:
+    """How the views hold each other, by their names."""
+
+    components: tuple[tuple[str, ...], ...] = ()  # largest first
+    weak: tuple[tuple[str, str], ...] = ()  # (view, its only partner)
+
+
+@dataclass(frozen=True)
 class LedgerStep:
     """One change of the model: a line of ledger.json."""
 
@@ -74,6 +92,8 @@ class Run:
     notes: tuple[str, ...] = ()
     targets: TargetFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
+    left_out: tuple[LeftOut, ...] = ()  # views of the session that are not fused; all other fields are without them
+    links: ViewLinks = field(default_factory=ViewLinks)
 
     @property
     def T_mount(self) -> Array:

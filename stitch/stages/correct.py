@@ -125,7 +125,7 @@ def correct(
         model=Model(hand_eye.T_mount, (), hand_eye.covariance),
         hand_eye=hand_eye,
         overlaps=final,
-        freed=tuple(f.poses for f in freed),
+        freed=freed,
         history=(*history, *fine, pooled_rms(final)),
         captures=tuple(captures),
     )

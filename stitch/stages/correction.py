@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.model.model import Model
+from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.hand_eye import HandEye
 from stitch.observations.surfaces.overlaps import Overlaps
 
@@ -16,6 +16,6 @@ class Correction:
     model: Model
     hand_eye: HandEye  # its statistics
     overlaps: tuple[Overlaps, ...]
-    freed: tuple[Array, ...]  # (V, 4, 4) poses by the overlaps alone: where register starts
+    freed: tuple[FreePoses, ...]  # views moved by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
     captures: tuple[Capture, ...]  # without the effects in use

@@ -1,16 +1,17 @@
 """Which way a run goes, from clouds or from labelled points, and its result collected at the end."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import LedgerStep, Run, StageResult
+from stitch.runs.run import LedgerStep, LeftOut, Run, StageResult, ViewLinks
 from stitch.stages import from_surfaces, from_targets
 from stitch.stages.coarse import Coarse
 from stitch.stages.finish import Finished
 from stitch.stages.fitted import Course, Fitted
 from stitch.stages.observability import unobservable
+from stitch.stages.sentences import view_notes
 
 
 def course_of(session: Session) -> Course:
@@ -28,6 +29,9 @@ class End:
     effects_file: str | None
     ledger: tuple[LedgerStep, ...] = ()
     poses_before: Array | None = None  # (V, 4, 4) of the model before its last change
+    left_out: tuple[LeftOut, ...] = ()  # views of the session that do not belong
+    kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
+    links: ViewLinks = field(default_factory=ViewLinks)
 
 
 def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
@@ -59,7 +63,9 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         effects_file=end.effects_file,
         poses_before=end.poses_before,
         convergence=finished.convergence,
-        notes=course.notes(session, fitted, index, end.begun),
+        notes=(*view_notes(end.left_out, end.kept), *course.notes(session, fitted, index, end.begun)),
+        left_out=end.left_out,
+        links=end.links,
         targets=own.targets,
         outliers=own.outliers,
     )

@@ -60,7 +60,7 @@ def finish_surfaces(
     corrected = StageResult("correct", g.rms, int(g.count.sum()), len(correction.history), seconds, note)
     show(recorder, corrected, own, poses_model)
     clock.lap()
-    registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index])
+    registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index].poses)
     final, iterations = registration.overlaps.gram, len(registration.history)
     registered = StageResult("register", final.rms, int(final.count.sum()), iterations, clock.lap())
     fused = fuse(own, registration.poses)
@@ -125,12 +125,12 @@ def _targets_as_cloud(found: TargetFit) -> FusedCloud:
 
 
 def per_view_rms(overlaps: Overlaps, views: int) -> Array:
-    """(V,) rms of the residuals that touch a view, inside the robust gate."""
+    """(V,) rms of the residuals that touch a view, inside the robust gate; NaN for a view without partners."""
     square, count = np.zeros(views), np.zeros(views)
     for (v, w), s, n in zip(overlaps.gram.pairs, overlaps.gram.raw_square, overlaps.gram.count, strict=True):
         square[[v, w]] += s
         count[[v, w]] += n
-    return np.sqrt(square / np.maximum(count, 1))
+    return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
 
 
 def show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array) -> None:

@@ -134,7 +134,7 @@ def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Seque
         model=model,
         hand_eye=last.hand_eye,
         overlaps=tuple(overlaps),
-        freed=tuple(f.poses for f in freed),
+        freed=tuple(freed),
         history=(*history, pooled_rms(overlaps)),
         captures=captures,
     )

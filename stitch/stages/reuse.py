@@ -37,7 +37,7 @@ def reuse(captures: Sequence[Capture], model: Model) -> Correction:
         model=model,
         hand_eye=HandEye(model.T_mount, model.covariance, 1.0, scatter, 1.0),
         overlaps=overlaps,
-        freed=tuple(f.poses for f in freed),
+        freed=tuple(freed),
         history=(pooled_rms(overlaps),),
         captures=tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
     )

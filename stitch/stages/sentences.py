@@ -8,6 +8,7 @@ from stitch.measurement.session import Session
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_fit import TargetFit
+from stitch.runs.run import LeftOut
 from stitch.stages.coarse import Coarse
 from stitch.units import MICROMETRES
 
@@ -84,6 +85,13 @@ def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
             "pose errors would: its sigma was widened by that factor."
         )
     return tuple(notes)
+
+
+def view_notes(left_out: Sequence[LeftOut], kept: Sequence[LeftOut]) -> tuple[str, ...]:
+    """Views that do not belong, first of all."""
+    told = [f"View {item.view} does not belong and was left out: {item.why}." for item in left_out]
+    told += [f"View {item.view} does not belong and was kept as asked: {item.why}." for item in kept]
+    return tuple(told)
 
 
 def target_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:

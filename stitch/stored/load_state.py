@@ -12,7 +12,7 @@ from stitch.model.bound import bound
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.thinning import thinned
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import LedgerStep
+from stitch.runs.run import LedgerStep, LeftOut, ViewLinks
 from stitch.runs.state import State
 from stitch.stages.reuse import REUSE_GATE, converged_overlaps
 from stitch.stored.run_documents import read_ledger, read_result
@@ -40,6 +40,9 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
     with library_threads_off():
         session, scans = thinned(session) if thin and session.has_clouds else (session, capture(session))
         measurement = about_part(measurement_of(session, scans), file.T_mount_coarse)
+        left_out, links = left_out_of(document)
+        gone = [v for v, view in enumerate(session.views) if view.name in {item.view for item in left_out}]
+        session, measurement = session.without([item.view for item in left_out]), measurement.without(gone)
         model = bound(file, measurement)
         measurement = as_counted(measurement, session, document)
         own = corrected(measurement, model)
@@ -54,7 +57,23 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         noise_floor=document["noise_floor"],
         ledger=steps,
         effects_file=effects,
+        left_out=left_out,
+        links=links,
     )
+
+
+def left_out_of(document: dict[str, Any]) -> tuple[tuple[LeftOut, ...], ViewLinks]:
+    """Views that the run left out, and how the others hold each other."""
+    rows = {row["view"]: row for row in document["views"]}
+    left_out = [
+        LeftOut(item["view"], item["why"], np.array(rows[item["view"]]["pose"], float), rows[item["view"]]["points"])
+        for item in document.get("left_out", ())
+        if item["view"] in rows
+    ]
+    linkage = document.get("linkage", {})
+    components = tuple(tuple(part) for part in linkage.get("components", ()))
+    weak = tuple((row["view"], row.get("partner", "")) for row in linkage.get("weak", ()))
+    return tuple(left_out), ViewLinks(components, weak)
 
 
 def _documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:

@@ -52,12 +52,15 @@ def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state
             f"{folder}/model.toml: changed after the run; see what it does with `stitch run {state.session.path} "
             f"--hand-eye {folder} -o ANOTHER`"
         )
-    if [view["view"] for view in document["views"]] != [view.name for view in state.session.views]:
+    gone = {item.view for item in state.left_out}
+    if [v["view"] for v in document["views"] if v["view"] not in gone] != [view.name for view in state.session.views]:
         raise InputError(f"{state.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
 
 
 def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
-    session, model, views = state.session, state.model, document["views"]
+    session, model = state.session, state.model
+    gone = {item.view for item in state.left_out}
+    views = [view for view in document["views"] if view["view"] not in gone]
     with library_threads_off():
         own = corrected(state.measurement, model)
         overlaps = converged_overlaps(own, model.T_mount, state.gate) if own.scans else None
@@ -86,6 +89,8 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         convergence={stage: [_number(x) for x in course] for stage, course in document["convergence"].items()},
         notes=tuple(document["notes"]),
         targets=targets,
+        left_out=state.left_out,
+        links=state.links,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
-from stitch.runs.run import Run
+from stitch.runs.run import LeftOut, Run
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
 FORMAT = "stitch-run/1"
@@ -53,7 +53,15 @@ def result_document(run: Run) -> dict[str, Any]:
             term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
             for term in run.terms
         },
-        "views": [_view(run, v) for v in range(len(run.session.views))],
+        "views": [
+            *(_view(run, v) for v in range(len(run.session.views))),
+            *(_left_out_view(item) for item in run.left_out),
+        ],
+        "left_out": [{"view": item.view, "why": item.why} for item in run.left_out],
+        "linkage": {
+            "components": [list(part) for part in run.links.components],
+            "weak": [{"view": v, "partner": w, "directions": "all, through one pair"} for v, w in run.links.weak],
+        },
         "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,
@@ -77,6 +85,17 @@ def ledger(run: Run) -> list[dict[str, Any]]:
         | {key: getattr(s, key) for key in numbers}
         for i, s in enumerate(run.ledger)
     ]
+
+
+def _left_out_view(item: LeftOut) -> dict[str, Any]:
+    """A view that is not fused: its pose is what the robot and the model say."""
+    return {
+        "view": item.view,
+        "pose": item.pose.tolist(),
+        "correction": [0.0] * 6,
+        "rms": None,
+        "points": item.points,
+    }
 
 
 def _view(run: Run, v: int) -> dict[str, Any]:

@@ -1,0 +1,99 @@
+"""Which views of a run may be fused: blunders named and left out, contradictions beyond any arm refused."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.integrity.deep_check import ROTATION, TRANSLATION_M, contradicts, deep_check
+from stitch.integrity.pairing import explain
+from stitch.integrity.problems import Problem
+from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.targets import check_targets
+from stitch.measurement.capture import Capture
+from stitch.measurement.session import Session
+from stitch.observations.targets.target_fit import TargetFit
+from stitch.runs.run import LeftOut, ViewLinks
+from stitch.stages.correction import Correction
+from stitch.units import METRES
+
+
+@dataclass(frozen=True)
+class Admission:
+    """What may be fused of one session."""
+
+    left_out: tuple[LeftOut, ...] = ()
+    links: ViewLinks = ViewLinks()
+
+    @property
+    def names(self) -> set[str]:
+        """Of the views that are left out."""
+        return {item.view for item in self.left_out}
+
+    def line(self) -> str:
+        """What was left out and why."""
+        return "; ".join(f"{item.view}: {item.why}" for item in self.left_out)
+
+    def indices(self, session: Session) -> list[int]:
+        """Numbers of the views that are left out."""
+        return [v for v, view in enumerate(session.views) if view.name in self.names]
+
+
+def admission(session: Session, correction: Correction, index: int) -> Admission:
+    """Examine the views of one session of a rig under a corrected model.
+
+    Raises:
+        InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
+        NoResultError: they do, and none does; or groups of views share no surface.
+    """
+    own, T_mount = correction.captures[index], correction.model.T_mount
+    found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index])
+    if contradicts(session, found):
+        refuse(session, deep_check(session))
+    problems = explain(session, own, T_mount, found) if found.left_out or found.block else []
+    apart = next((p for p in problems if p.kind == "disconnected"), None)
+    if apart is not None:
+        raise NoResultError(f"{session.path}: {apart.line()}")
+    return Admission(_left_out(session, own, found, T_mount, problems), _links(session, found))
+
+
+def admission_of_targets(session: Session, found: TargetFit) -> Admission:
+    """Labelled points: outliers are taken out one by one; poses that contradict them all are refused.
+
+    Raises:
+        InputError: a usual mistake explains it.
+        NoResultError: none does.
+    """
+    rotation, translation = np.sqrt(found.variances[:2])
+    if rotation > ROTATION or translation > TRANSLATION_M / METRES[session.length_unit]:
+        refuse(session, check_targets(session))
+    return Admission()
+
+
+def refuse(session: Session, problems: Sequence[Problem]) -> None:
+    """Raise what a deep check found; nothing where it found nothing certain."""
+    for problem in problems:
+        kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
+        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
+
+
+def _left_out(
+    session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[Problem]
+) -> tuple[LeftOut, ...]:
+    poses = own.poses(T_mount)
+    out = []
+    for v in found.left_out:
+        name = session.views[v].name
+        why = next((p.line() for p in problems if name in p.views), "it shares no surface with the others")
+        out.append(LeftOut(name, why, poses[v], len(own.scans[v].points)))
+    return tuple(out)
+
+
+def _links(session: Session, found: Snooping) -> ViewLinks:
+    names = [view.name for view in session.views]
+    return ViewLinks(
+        components=tuple(tuple(names[v] for v in part) for part in found.linkage.components),
+        weak=tuple((names[v], names[w]) for v, w in found.linkage.single),
+    )

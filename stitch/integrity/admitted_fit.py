@@ -1,0 +1,62 @@
+"""The fit of a rig with the views that belong: fit, examine, leave out what does not belong, and again."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from stitch.errors import NoResultError
+from stitch.integrity.admission import Admission, admission, admission_of_targets
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.stages.fitted import Fitted
+
+# Blunders that hide behind others come out in the next round; three are enough to end or to give up.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Admitted:
+    """A rig with the views that belong, its fit, and what each session left out."""
+
+    sessions: list[Session]
+    measurements: list[Measurement]
+    fitted: Fitted
+    admissions: list[Admission]
+
+
+def admitted_fit(
+    sessions: Sequence[Session],
+    measurements: Sequence[Measurement],
+    fit: Callable[[Sequence[Session], Sequence[Measurement]], Fitted],
+    keep: bool = False,
+) -> Admitted:
+    """Fit all sessions with the views that belong.
+
+    Args:
+        keep: name views that do not belong, but leave them in.
+
+    Raises:
+        InputError: poses contradict the scans, and a usual mistake explains it.
+        NoResultError: they do, and none does; too few views are left; groups of views share no surface.
+    """
+    own, measured = list(sessions), list(measurements)
+    taken = [Admission() for _ in own]
+    for _ in range(_ROUNDS):
+        fitted = fit(own, measured)
+        found = [_examined(session, fitted, i) for i, session in enumerate(own)]
+        taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
+        if keep or not any(a.left_out for a in found):
+            break
+        measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
+        own = [s.without(a.names) for s, a in zip(own, found, strict=True)]
+        short = next((s for s in own if len(s.views) < 2), None)
+        if short is not None:
+            raise NoResultError(f"{short.path}: fewer than two views are left that belong together: {taken[0].line()}")
+    return Admitted(own, measured, fitted, taken)
+
+
+def _examined(session: Session, fitted: Fitted, index: int) -> Admission:
+    if fitted.correction is not None:
+        return admission(session, fitted.correction, index)
+    found = fitted.sessions[index].targets
+    assert found is not None
+    return admission_of_targets(session, found)

@@ -1,0 +1,51 @@
+"""Mistakes with the poses of a session: what they do, and what they may be called."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+
+_OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
+
+
+def with_poses(session, T):
+    """The session with other flange poses (V, 4, 4) and no joints."""
+    views = zip(session.views, T, strict=True)
+    return replace(session, views=tuple(replace(v, T_base_flange=pose, joints=None) for v, pose in views))
+
+
+def _of(change):
+    return lambda session: with_poses(session, change(np.array([v.T_base_flange for v in session.views])))
+
+
+def _turned(change):
+    return _of(lambda T: frames.make(change(Rotation.from_matrix(T[:, :3, :3])).as_matrix(), T[:, :3, 3]))
+
+
+def _exchanged(T):
+    T = T.copy()
+    T[[2, 8]] = T[[8, 2]]
+    return T
+
+
+MISTAKES = {
+    "inverse": (_of(frames.inverse), ("inverse",)),
+    # Poses without joints: the other mount is the same as poses inverted.
+    "mount": (lambda s: replace(s, mount=_OTHER[s.mount]), ("inverse", "mount")),
+    "KUKA angles as xyz": (_turned(lambda R: Rotation.from_euler("xyz", R.as_euler("ZYX"))), ("euler",)),
+    "fixed for moving axes": (_turned(lambda R: Rotation.from_euler("XYZ", R.as_euler("xyz"))), ("euler",)),
+    "ZYZ as ZXZ": (_turned(lambda R: Rotation.from_euler("ZXZ", R.as_euler("ZYZ"))), ("euler",)),
+    "rotation vector as angles": (_turned(lambda R: Rotation.from_euler("xyz", R.as_rotvec())), ("euler",)),
+    "radians as degrees": (_turned(lambda R: Rotation.from_rotvec(R.as_rotvec() * np.pi / 180)), ("degrees",)),
+    "w first": (_turned(lambda R: Rotation.from_quat(R.as_quat()[:, [3, 0, 1, 2]])), ("quaternion",)),
+    "turned the other way": (_turned(lambda R: R.inv()), ("quaternion",)),
+    "inches": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 25.4)), ("unit",)),
+    "metres": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 1000)), ("unit",)),
+    "scaled": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] * 1.05)), ("scale",)),
+    "shifted by one": (_of(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),
+    "shifted by two": (_of(lambda T: np.roll(T, -2, axis=0)), ("shifted",)),
+    "reversed": (_of(lambda T: T[::-1]), ("reversed",)),
+    "two exchanged": (_of(_exchanged), ("exchanged",)),
+}

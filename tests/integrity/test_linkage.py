@@ -1,0 +1,39 @@
+"""The graph of overlaps against graphs whose structure is known by construction."""
+
+from stitch.integrity.linkage import Link, apart, of_links
+
+
+def links(*pairs, share=1.0, count=100):
+    return [Link(v, w, count, share) for v, w in pairs]
+
+
+def test_a_chain_is_one_component_and_every_inner_view_cuts_it():
+    found = of_links(5, links((0, 1), (1, 2), (2, 3), (3, 4)))
+    assert found.components == ((0, 1, 2, 3, 4),)
+    assert found.cut_views == (1, 2, 3)
+    assert found.single == ((0, 1), (4, 3))
+
+
+def test_a_ring_has_no_cut_view_and_nothing_hangs_by_one_pair():
+    found = of_links(6, links(*((v, (v + 1) % 6) for v in range(6))))
+    assert (found.cut_views, found.single, found.unlinked) == ((), (), ())
+
+
+def test_two_rings_are_two_groups_that_the_refusal_names():
+    found = of_links(7, links((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 6), (6, 3)))
+    assert found.components == ((3, 4, 5, 6), (0, 1, 2))
+    line = apart(found, [f"scan{v}" for v in range(7)])
+    assert "scan3" in line and "scan0" in line and "2 groups" in line
+
+
+def test_pairs_that_lie_near_without_closing_link_nothing():
+    found = of_links(3, [*links((0, 1)), *links((1, 2), share=0.2)])
+    assert found.unlinked == (2,)
+    assert found.share(2) == 0.2
+    assert of_links(3, [*links((0, 1)), *links((1, 2), count=5)]).unlinked == (2,)
+
+
+def test_a_view_without_any_pair_is_unlinked_and_not_a_group():
+    found = of_links(3, links((0, 1)))
+    assert found.unlinked == (2,) and found.share(2) == 0.0
+    assert apart(found, ["a", "b", "c"]) is None
