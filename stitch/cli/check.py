@@ -12,16 +12,24 @@ from rich.table import Table
 from stitch.cli.options import Json
 from stitch.cli.streams import emit
 from stitch.errors import InputError
+from stitch.integrity.deep_check import deep_check
 from stitch.measurement.session import Session
 from stitch.reading.session_folder import load_session
 from stitch.system.console import console
+from stitch.writing.json_file import to_json
 
 
 def check(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Also try out what people do wrong: pairing, conventions, units, views.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Read sessions completely and say what is wrong; computes nothing."""
+    """Read sessions completely and say what is wrong; computes nothing unless asked to look deeper."""
+    if deep:
+        _deep(sessions, as_json)
+        return
     facts, errors = [], []
     for path in sessions:
         try:
@@ -35,6 +43,23 @@ def check(
     for line in errors:
         print(f"stitch: {line}", file=sys.stderr)
     if errors:
+        raise typer.Exit(2)
+
+
+def _deep(sessions: list[Path], as_json: bool) -> None:
+    """Every usual mistake tried on each session: what is wrong, in which views, how to fix it."""
+    found = {str(path): deep_check(load_session(path)) for path in sessions}
+    documents = [
+        {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
+        for path, problems in found.items()
+    ]
+    if as_json:
+        emit(to_json(documents[0] if len(documents) == 1 else documents))
+    else:
+        for path, problems in found.items():
+            for line in [p.line() for p in problems] or ["nothing wrong was found"]:
+                console().print(f"{path}: {line}", soft_wrap=True)
+    if any(p.certain for problems in found.values() for p in problems):
         raise typer.Exit(2)
 
 

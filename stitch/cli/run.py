@@ -42,6 +42,7 @@ def run(
     effects_file: EffectsFile = None,
     trust: Trust = False,
     force: Force = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")] = False,
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
     as_json: Json = False,
@@ -62,7 +63,8 @@ def run(
     model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
     with run_folder.new_folder(target, sessions, force) as scratch:
         folders = _folders(scratch, names)
-        runs = run_rig(loaded, model, [recorder_for(folder, recording) for folder in folders], names_of_effects)
+        recorders = [recorder_for(folder, recording) for folder in folders]
+        runs = run_rig(loaded, model, recorders, names_of_effects, keep)
         if effects_file:
             runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
@@ -117,6 +119,8 @@ def show(runs: list[Run], target: Path) -> None:
     for result in runs:
         session: Session = result.session
         to_um = MICROMETRES[session.length_unit]
+        for note in result.notes[: len(result.left_out)]:
+            terminal.print(note, soft_wrap=True, style="bold")
         table = Table(title=session.name, title_justify="left")
         for heading in ("stage", "rms (µm)", "correspondences", "iterations", "seconds"):
             table.add_column(heading, justify="left" if heading == "stage" else "right")
@@ -125,8 +129,14 @@ def show(runs: list[Run], target: Path) -> None:
                 s.name, f"{s.rms * to_um:.1f}", f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}"
             )
         terminal.print(table)
+        for s in result.stages[1:]:
+            if s.note:
+                terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
         terminal.print(result.verdict, soft_wrap=True)
-        for line in (*(f"Not observable from these motions: {u}." for u in result.unobservable), *result.notes):
+        for line in (
+            *(f"Not observable from these motions: {u}." for u in result.unobservable),
+            *result.notes[len(result.left_out) :],
+        ):
             terminal.print(line, soft_wrap=True)
         folder = target if len(runs) == 1 else target / session.name
         for name in ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"):

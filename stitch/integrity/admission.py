@@ -1,7 +1,7 @@
 """Which views of a run may be fused: blunders named and left out, contradictions beyond any arm refused."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class Admission:
     """What may be fused of one session."""
 
     left_out: tuple[LeftOut, ...] = ()
-    links: ViewLinks = ViewLinks()
+    links: ViewLinks = field(default_factory=ViewLinks)
 
     @property
     def names(self) -> set[str]:

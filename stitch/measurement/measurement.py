@@ -46,7 +46,7 @@ class Measurement:
         return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
 
     def without(self, left_out: Sequence[int]) -> "Measurement":
-        """The measurement less some views; what effects know of the others stays: numbers, rows before, first values."""
+        """The measurement less some views; of the others numbers, rows before and first values stay as they were."""
         keep = [v for v in range(self.views.count) if v not in set(left_out)]
         views = self.views.only(keep)
         scan_views, target_views = (

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from data_synth.judgement import judge
 from data_synth.fixtures.quiet_scenes import simulated
+from data_synth.judgement import judge
 from data_synth.scene import load_scene
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main

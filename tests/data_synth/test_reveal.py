@@ -51,7 +51,7 @@ def judged(tmp_path, hidden=HIDDEN, diagnosis=None, fitted=None, unit="mm", off=
 FITTED = {"joint_compliance": {"c2": {"value": 1.1e-6, "sigma": 2e-7, "unit": "rad/(N m)"}}}
 
 
-WHOLE = {"joint_compliance": {name: FITTED["joint_compliance"]["c2"] for name in ("c2", "c3")}}
+WHOLE = {"joint_compliance": dict.fromkeys(("c2", "c3"), FITTED["joint_compliance"]["c2"])}
 OWN = "humidity_bias: an effect of your own, its name says nothing here; judge it by the hand-eye's error"
 
 

@@ -76,7 +76,7 @@ def test_undoing_every_order_of_euler_angles_is_among_the_hypotheses():
     R = Rotation.from_matrix(T[:, :3, :3])
     rng = np.random.default_rng(0)
     # Angles of two axes read as those of three lose their branch where the middle one exceeds 90°: not tried here.
-    three, two = "XYZ XZY YXZ YZX ZXY ZYX xyz zyx".split(), "ZYZ ZXZ XYX YZY zyz".split()
+    three, two = ["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "xyz", "zyx"], ["ZYZ", "ZXZ", "XYX", "YZY", "zyz"]
     for orders in (three, three, three, two, two):
         right, wrong = rng.choice(orders, 2, replace=False)
         bad = frames.make(Rotation.from_euler(wrong, R.as_euler(right)).as_matrix(), T[:, :3, 3])
