@@ -133,10 +133,8 @@ def show(runs: list[Run], target: Path) -> None:
             if s.note:
                 terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
         terminal.print(result.verdict, soft_wrap=True)
-        for line in (
-            *(f"Not observable from these motions: {u}." for u in result.unobservable),
-            *result.notes[len(result.left_out) :],
-        ):
+        hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
+        for line in (*hidden, *result.notes[len(result.left_out) :]):
             terminal.print(line, soft_wrap=True)
         folder = target if len(runs) == 1 else target / session.name
         for name in ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"):

@@ -1,0 +1,1 @@
+"""What a run found, and who watches it work."""

@@ -1,0 +1,46 @@
+"""A run as far as the next question needs it: what was measured, the model, and its history."""
+
+from dataclasses import dataclass, field
+
+from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.model import Model
+from stitch.runs.run import LedgerStep, LeftOut, Run, ViewLinks
+
+
+@dataclass(frozen=True)
+class State:
+    """What was measured, the model, and its history."""
+
+    session: Session
+    measurement: Measurement
+    model: Model
+    T_mount_coarse: Array  # (4, 4)
+    gate: float  # largest distance between partners, length_unit; NaN without clouds
+    residual_rms: float
+    noise_floor: float
+    ledger: tuple[LedgerStep, ...]
+    effects_file: str | None
+    left_out: tuple[LeftOut, ...] = ()  # views of the session that do not count; session and measurement are without
+    links: ViewLinks = field(default_factory=ViewLinks)
+
+    def __repr__(self) -> str:
+        return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"
+
+
+def state_of(run: Run) -> State:
+    """The state of a run in memory."""
+    return State(
+        session=run.session,
+        measurement=run.measurement,
+        model=run.model,
+        T_mount_coarse=run.T_mount_coarse,
+        gate=float("nan") if run.overlaps is None else run.overlaps.gate,
+        residual_rms=run.residual_rms,
+        noise_floor=run.noise_floor,
+        ledger=run.ledger,
+        effects_file=run.effects_file,
+        left_out=run.left_out,
+        links=run.links,
+    )
