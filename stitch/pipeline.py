@@ -18,12 +18,11 @@ from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
-from stitch.observations.linearise import linearise
 from stitch.runs.recorder import Recorder, Silent
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
-from stitch.stages.course import End, collected, course_of
+from stitch.stages.course import End, collected, course_of, linearise
 from stitch.stages.rig import require_effects, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
@@ -160,5 +159,5 @@ def _terms_at(
     session: Session, effects: Sequence[str], measurement: Measurement, model: Model, gate: float
 ) -> list[Term]:
     """Terms for further effects, begun where the views suggest them."""
-    linear = partial(linearise, measurement, model, gate, session.nominal)
+    linear = partial(linearise, session, measurement, model, gate)
     return initial_terms(measurement, [known(name) for name in effects], linear)

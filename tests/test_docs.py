@@ -9,9 +9,13 @@ import threading
 from pathlib import Path
 
 import pytest
+import typer
 
 import stitch
 from bench.readme_output import commands, printed, shown
+from stitch.cli.main import build
+from stitch.effects import EFFECTS
+from stitch.effects.user_file import load
 from stitch.writing.run_folder import write_run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,6 +71,50 @@ def test_every_name_of_a_page_is_in_the_code(page, code):
 def test_pages_use_the_field_s_words(page):
     text = without_blocks(page).split("## How things are said")[0]
     assert not [found.group() for found in PRIVATE.finditer(text)]
+
+
+@pytest.fixture(scope="module")
+def options() -> dict[str, set[str]]:
+    """Every command of `stitch`, those of `calibrate` by both words, with its options."""
+    group = typer.main.get_command(build())
+    found = dict(group.commands)
+    found |= {f"calibrate {name}": command for name, command in found.pop("calibrate").commands.items()}
+    return {name: {o for p in command.params for o in (*p.opts, *p.secondary_opts)} for name, command in found.items()}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_of_a_page_has_the_options_that_it_shows(page, options):
+    text = page.read_text(encoding="utf-8")
+    lines = [*re.findall(r"^(?:\$ |    )?(?:\.venv/bin/)?stitch (.+)$", text, re.MULTILINE)]
+    lines += [text.removeprefix("stitch ") for text in quoted(page) if text.startswith("stitch ")]
+    known = {"--help", "--tables", "--seeds", "--scheduler"}.union(*options.values())
+    assert not [o for text in quoted(page) for o in re.findall(r"^--[a-z][\w-]*", text) if o not in known]
+    for line in lines:
+        command = next((c for c in sorted(options, key=len, reverse=True) if re.match(rf"{c}\b", line)), None)
+        assert command or re.match(r"(calibrate$|[A-Z])", line), line
+        asked = re.findall(r"(?<![\w-])--?[a-z][\w-]*", line.split("#")[0])
+        assert command is None or not {o for o in asked if o not in options[command] and o != "--help"}, line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_of_a_page_names_what_there_is(page):
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+        compile(block, page.name, "exec")
+        imports = [line for line in block.splitlines() if re.match(r"(from|import) ", line)]
+        exec("\n".join(imports), {})
+        assert not [name for name in re.findall(r"\bstitch\.(\w+)\(", block) if name not in stitch.__all__]
+
+
+def test_the_effect_of_the_page_is_a_file_that_loads(tmp_path):
+    before, file = dict(EFFECTS), tmp_path / "mine.py"
+    page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    file.write_text(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], encoding="utf-8")
+    try:
+        assert load(file) == ["humidity_bias"]
+        assert EFFECTS["humidity_bias"].parameters(6, (), "mm")[0].unit == "mm"
+    finally:
+        EFFECTS.clear()
+        EFFECTS.update(before)
 
 
 def test_every_function_and_form_of_the_walks_is_in_the_file_that_it_links_to():

@@ -18,8 +18,8 @@ from stitch.diagnosis.thresholds import PREDICTED
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.linearise import linearise
 from stitch.runs.state import State
+from stitch.stages.course import linearise
 from stitch.system.threads import library_threads_off
 
 
@@ -62,7 +62,7 @@ def diagnose_state(state: State) -> Diagnosis:
 
 def linear_model_of(state: State) -> LinearModel:
     """What a session says beside the model of a run."""
-    return linearise(state.measurement, state.model, state.gate, state.session.nominal)
+    return linearise(state.session, state.measurement, state.model, state.gate)
 
 
 def _examined(linear: LinearModel, selection: Selection, matrix: Array, tests: int) -> list[CandidateEffect]:

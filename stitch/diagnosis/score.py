@@ -75,7 +75,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     size = linear.mixed.size
     worth = np.argsort(-quick, kind="stable")[: _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size]
     tried = [
-        _try(linear, form) if i in worth and quick[i] >= _HOPELESS else _Tried(float(quick[i]))
+        _try(linear, form) if i in worth and quick[i] >= _HOPELESS and whites[i].any() else _Tried(float(quick[i]))
         for i, form in enumerate(candidate.forms)
     ]
     weights = form_weights(candidate)

@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import chi2
 
+from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.integrity.deep_check import ROTATION, TRANSLATION_M, contradicts, deep_check
@@ -14,10 +16,14 @@ from stitch.integrity.snooping import Snooping, snoop
 from stitch.integrity.targets import check_targets
 from stitch.measurement.capture import Capture
 from stitch.measurement.session import Session
+from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
 from stitch.units import METRES
+
+# A hand-eye that differs by chance alone is refused once in a million.
+_CHANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,8 @@ def admission(session: Session, correction: Correction, index: int) -> Admission
         NoResultError: they do, and none does; or groups of views share no surface.
     """
     own, T_mount = correction.captures[index], correction.model.T_mount
+    if correction.given:
+        _require_own_model(session, correction, index)
     found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index])
     if contradicts(session, found):
         refuse(session, deep_check(session))
@@ -70,6 +78,22 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     if rotation > ROTATION or translation > TRANSLATION_M / METRES[session.length_unit]:
         refuse(session, check_targets(session))
     return Admission()
+
+
+def _require_own_model(session: Session, correction: Correction, index: int) -> None:
+    """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
+    own, T_mount = correction.captures[index], correction.model.T_mount
+    fitted = fit_hand_eye([own], [correction.freed[index]], T_mount)
+    xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
+    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2.isf(_CHANCE, 6)
+    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
+    shift = float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
+    turn = float(np.linalg.norm(xi[:3]))
+    if clear and (turn > ROTATION or shift > TRANSLATION_M / METRES[session.length_unit]):
+        raise NoResultError(
+            f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
+            "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
+        )
 
 
 def refuse(session: Session, problems: Sequence[Problem]) -> None:

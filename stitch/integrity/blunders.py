@@ -115,7 +115,9 @@ def _block(model: ViewModel, first: Array | None, plain: Found) -> Block | None:
     deviance, fit = both[0 if what == "part" else 1]
     drift = min(_likelihood(model, _beside(first, c))[0] for c in _drifts(model))
     singles, _ = _likelihood(model, plain.further)
-    clearer = deviance + _CLEARER < drift and deviance + _CLEARER < singles - 6 * (len(plain.blunders) - 1)
+    # Every single blunder takes six numbers of its own: by Akaike's rule each must earn two.
+    alone = singles + 12 * max(len(plain.blunders) - 1, 0)
+    clearer = deviance + _CLEARER < min(drift, alone)
     smaller = np.sqrt(np.max(start.variances[:2] / np.maximum(fit.variances[:2], 1e-300))) > _STEP_RATIO
     if not (clearer and smaller):
         return None

@@ -32,7 +32,7 @@ def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
                 if right != order:
                     named = np.column_stack([angles[:, order.upper().index(axis)] for axis in right])
                     yield _order_fix(order, right), Rotation.from_euler(right, named)
-        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(angles)
+        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(_shortest(angles))
     for right in (*ORDERS, *(o.lower() for o in ORDERS)):
         yield (
             f"the rotation vectors are Euler angles in the order {_named(right)}",
@@ -62,3 +62,11 @@ def _angles(R: Rotation, order: str) -> Array:
         # Gimbal lock sets an angle to zero: that reading is one of those to try.
         warnings.simplefilter("ignore")
         return np.asarray(R.as_euler(order))
+
+
+def _shortest(angles: Array) -> Array:
+    """Of the two triples of angles about three axes that make one rotation, the shorter: vectors are at most π long."""
+    other = np.stack([angles[:, 0] - np.pi, np.pi - angles[:, 1], angles[:, 2] - np.pi], axis=1)
+    other = (other + np.pi) % (2 * np.pi) - np.pi
+    shorter = np.linalg.norm(other, axis=1) < np.linalg.norm(angles, axis=1)
+    return np.where(shorter[:, None], other, angles)

@@ -12,17 +12,22 @@ import numpy as np
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
+from stitch.integrity.conventions import explained
 from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
 from stitch.integrity.linkage import only
 from stitch.integrity.problems import Problem
+from stitch.integrity.relative_scans import RelativeScans
 from stitch.measurement.capture import Capture, place
 from stitch.measurement.session import Session
 from stitch.measurement.sightings import sightings_of
 from stitch.observations.targets.closed_form import closed_form
+from stitch.observations.targets.landmarks import best_fit
 from stitch.units import METRES
 
 # No arm is off by more; a better hypothesis must leave a fifth of what the stated one leaves.
 _LIMIT_M, _CLEARER = 0.005, 0.2
+# Hypotheses that are fitted in full, and targets in one line.
+_TRIED, _LINE = 12, 0.02
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ def check_targets(session: Session) -> list[Problem]:
     stated = _fit(capture, Hypothesis("stated", T, session.mount, ""))
     if stated is not None and stated.off < limit:
         return []
-    fits = [fit for h in _tried(session, limit) if (fit := _fit(capture, h)) is not None]
+    fits = [fit for h in _tried(session, capture, limit) if (fit := _fit(capture, h)) is not None]
     names = [view.name for view in session.views]
     best = min(fits, key=lambda fit: fit.off, default=None)
     before = np.inf if stated is None else stated.off
@@ -60,15 +65,39 @@ def check_targets(session: Session) -> list[Problem]:
     return [Problem(h.kind, tuple(only(h.rows, names)), fix)]
 
 
-def _tried(session: Session, length: float) -> Iterator[Hypothesis]:
-    found = distinct(hypotheses(session), 1e-3, 0.1 * length)
-    yield from found[1:]
+def _tried(session: Session, capture: Capture, length: float) -> Iterator[Hypothesis]:
+    """What to try: where targets show how the sensor moved, the hypotheses that explain its motions best."""
+    motions = _motions(capture)
+    ranked = explained(session, motions)
+    if ranked:
+        yield from (e.hypothesis for e in ranked[:_TRIED] if e.scale == 1.0)
+        found = hypotheses(session)[:1]
+    else:
+        found = distinct(hypotheses(session), 1e-3, 0.1 * length)
+        yield from found[1:]
     stated = found[0]
     for factor, words in UNITS.items():
         T = np.array(stated.T_base_flange)
         T[:, :3, 3] *= factor
         fix = f"the sightings are {factor:.6g} times as large as the poses say ({words}): check length_unit"
         yield replace(stated, kind="unit", T_base_flange=T, fix=fix)
+
+
+def _motions(capture: Capture) -> RelativeScans:
+    """Motions of the sensor between views that share three targets or more, by least squares (Kabsch 1976)."""
+    s = capture.sightings
+    assert s is not None
+    views, pairs, T = len(s.points), [], []
+    for v, w in ((v, v + step) for step in (1, 2) for v in range(views - step)):
+        common = np.intersect1d(s.target[v][s.used[v]], s.target[w][s.used[w]])
+        if len(common) < 3:
+            continue
+        a, b = (np.array([s.points[i][s.used[i] & (s.target[i] == k)][0] for k in common]) for i in (v, w))
+        spread = np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
+        if spread[1] > _LINE * spread[0]:
+            pairs.append((v, w))
+            T.append(best_fit(b, a))
+    return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4), len(pairs))
 
 
 def _fit(capture: Capture, hypothesis: Hypothesis) -> TargetFit | None:

@@ -19,3 +19,4 @@ class Correction:
     freed: tuple[FreePoses, ...]  # views moved by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
     captures: tuple[Capture, ...]  # without the effects in use
+    given: bool = False  # the model is that of another run, nothing was fitted

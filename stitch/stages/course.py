@@ -3,7 +3,10 @@
 from dataclasses import dataclass, field
 
 from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
+from stitch.model.model import Model
+from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import LedgerStep, LeftOut, Run, StageResult, ViewLinks
 from stitch.stages import from_surfaces, from_targets
@@ -17,6 +20,18 @@ from stitch.stages.sentences import view_notes
 def course_of(session: Session) -> Course:
     """How a run goes with what was observed."""
     return from_surfaces if session.has_clouds else from_targets
+
+
+def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    """What a session says about what a model lacks.
+
+    Args:
+        gate: largest distance between partners, length_unit; NaN without clouds.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    return course_of(session).linearise(session, measurement, model, gate)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
+from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
 from stitch.stages.coarse import Coarse
@@ -61,6 +62,10 @@ class Course(Protocol):
 
     def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
         """The sessions under a model of another run as it is."""
+        ...
+
+    def linearise(self, session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+        """What was observed, as one linear model about a model."""
         ...
 
     def finish(

@@ -10,9 +10,12 @@ from stitch.model.bound import bound
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
@@ -93,6 +96,16 @@ def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file
         return reuse([corrected(m, model) for m in measurements], model)
 
     return _fitted(*without_outliers(measurements, once, _targets))
+
+
+def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    """Views freed under the model by their overlaps and common targets.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    own = corrected(measurement, model)
+    return surface_model(measurement, model, own, free_poses(own, own.poses(model.T_mount), gate))
 
 
 def finish(

@@ -10,10 +10,12 @@ from stitch.model.bound import bound
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
+from stitch.observations.linear_model import LinearModel
 from stitch.observations.targets.closed_form import closed_form
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
 from stitch.observations.targets.rows import rows_of
 from stitch.observations.targets.target_fit import TargetFit, rms_of
+from stitch.observations.targets.target_model import target_model
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
 from stitch.stages.coarse import REUSED, STATED, Coarse
@@ -82,6 +84,13 @@ def refit(
 def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
     """The session under a model of another run; nothing is fitted but targets that it does not know."""
     return _fitted(measurements, lambda measurement, _: evaluate_targets(measurement, bound(file, measurement)))
+
+
+def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    """Labelled points as they are."""
+    sightings = measurement.capture.sightings
+    assert sightings is not None
+    return target_model(measurement, model, drawing_of(session.nominal, sightings))
 
 
 def finish(

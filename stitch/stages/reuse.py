@@ -40,6 +40,7 @@ def reuse(captures: Sequence[Capture], model: Model) -> Correction:
         freed=tuple(freed),
         history=(pooled_rms(overlaps),),
         captures=tuple(weighing(c, s) for c, s in zip(captures, scatter, strict=True)),
+        given=True,
     )
 
 

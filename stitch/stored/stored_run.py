@@ -64,7 +64,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
     with library_threads_off():
         own = corrected(state.measurement, model)
         overlaps = converged_overlaps(own, model.T_mount, state.gate) if own.scans else None
-        targets = None if own.sightings is None else _targets(folder, state)
+        targets = _targets(folder, state) if document.get("targets") and own.sightings is not None else None
     scatter = document["repeatability"]
     return Run(
         session=session,

@@ -46,7 +46,8 @@ def write_residuals(run: Run, path: Path) -> None:
     if run.targets is not None:
         parts.append(residual_columns(run.targets, session))
     # Beside clouds, labelled points have the columns of these.
-    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if all(key in p for p in parts)}
+    common = [key for key in (parts or [{}])[0] if all(key in part for part in parts)]
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in common}
     arrays = {
         key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()
     }

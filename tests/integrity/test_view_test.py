@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from stitch.integrity.blunders import find_blunders
 from stitch.integrity.reliability import blunder_sizes, noncentrality, normal_blocks, reliability
@@ -61,8 +62,6 @@ def test_blunder_of_the_detectable_size_is_found_and_named_as_often_as_stated():
     _fit, under = known(model)
     normal = normal_blocks(model, replace(find_blunders(model), under=under))
     rng, found, named, trials = np.random.default_rng(1), 0, 0, 300
-    from scipy import stats
-
     limit = stats.chi2.isf(0.01 / VIEWS, 6)
     for _ in range(trials):
         v, direction = int(rng.integers(VIEWS)), rng.standard_normal(6)

@@ -7,8 +7,8 @@ from stitch.diagnosis.selection.ranking import certain, ranked_one
 from stitch.diagnosis.thresholds import WORTH
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.model.term import Term
-from stitch.observations.linearise import linearise
 from stitch.runs.state import State
+from stitch.stages.course import linearise
 
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
@@ -28,7 +28,7 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
 def _objection(state: State, term: Term) -> tuple[float, str | None]:
     """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
     name = term.name
-    linear = linearise(state.measurement, state.model.without(name), state.gate, state.session.nominal)
+    linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)
     candidate = as_fitted(linear, term)
     if not candidate.forms[0].keep.any():
         return 0.0, f"{name} is not seen beside the others"

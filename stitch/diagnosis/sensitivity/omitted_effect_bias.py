@@ -12,7 +12,8 @@ def hand_eye_response(linear: LinearModel) -> Array:
     """(3, n) how whitened numbers (n,) displace the middle of the scanner's field through the fitted hand-eye."""
     middle = np.mean([points.mean(axis=0) for points in linear.measurement.capture.point_sets], axis=0)
     lever = np.hstack([-frames.skew(middle), np.eye(3)])
-    scale = np.maximum(np.linalg.norm(linear.white_design, axis=0), 1e-300)
+    length = np.linalg.norm(linear.white_design, axis=0)
+    scale = np.where(length > 0, length, 1.0)
     return np.asarray(lever @ (np.linalg.pinv(linear.white_design / scale, rcond=1e-10) / scale[:, None])[:6])
 
 

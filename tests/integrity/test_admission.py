@@ -1,0 +1,79 @@
+"""Runs of sessions with blunders: named and left out, or refused; never fused in silence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch import frames
+from stitch.errors import InputError, NoResultError
+from stitch.model.model_toml import ModelFile
+from stitch.pipeline import add, run
+
+
+@pytest.fixture(scope="module")
+def good():
+    return session_of(measured_blade(21, views=10, pixels=80))
+
+
+def with_view(session, number, **changes):
+    views = list(session.views)
+    views[number] = replace(views[number], **changes)
+    return replace(session, views=tuple(views))
+
+
+def test_a_good_session_leaves_nothing_out(good):
+    found = run(good)
+    assert found.left_out == () and found.links.components == (tuple(v.name for v in good.views),)
+    assert np.isfinite(found.view_rms).all()
+
+
+def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
+    swapped = with_view(with_view(good, 2, cloud=good.views[6].cloud), 6, cloud=good.views[2].cloud)
+    found = run(swapped)
+    assert {item.view for item in found.left_out} == {"v002", "v006"}
+    assert all("exchange the clouds of v002 and v006" in item.why for item in found.left_out)
+    assert found.notes[0].startswith("View v002 does not belong") and len(found.poses) == 8
+    again = add(found, "range_scale")
+    assert again.left_out == found.left_out and len(again.poses) == 8
+    kept = run(swapped, keep=True)
+    assert kept.left_out == () and len(kept.poses) == 10 and "kept as asked" in kept.notes[0]
+
+
+def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
+    T = good.views[4].T_base_flange.copy()
+    T[:3, 3] += [3.0, 0.0, 4.0]
+    found = run(with_view(good, 4, T_base_flange=T, joints=None, approach=None))
+    assert [item.view for item in found.left_out] == ["v004"]
+    # Few points a view: the amount is known to a twentieth.
+    amount = float(found.left_out[0].why.split("off by ")[1].split(" mm")[0])
+    assert amount == pytest.approx(5.0, rel=0.05)
+
+
+def test_poses_that_contradict_all_scans_are_refused(good):
+    """Inverted poses: no run, and the mistake is named."""
+    views = [replace(v, T_base_flange=frames.inverse(v.T_base_flange), joints=None, approach=None) for v in good.views]
+    with pytest.raises((InputError, NoResultError), match="inverse|inverted|mount"):
+        run(replace(good, views=tuple(views), robot=None))
+
+
+def test_a_model_of_another_mount_is_refused(good):
+    found = run(good)
+    T = found.T_mount @ frames.exp(np.array([0, 0, 0, 50.0, 0, 0]))
+    stranger = ModelFile("mm", good.mount, T, T, found.mount_covariance)
+    with pytest.raises(NoResultError, match="another mount"):
+        run(good, stranger)
+    own = ModelFile("mm", good.mount, found.T_mount, found.T_mount, found.mount_covariance)
+    assert run(good, own).left_out == ()
+
+
+def test_labelled_points_with_exchanged_coordinates_are_refused():
+    session, *_ = labelled_cell(3, views=20)
+    views = tuple(
+        replace(v, sighting=replace(v.sighting, points=v.sighting.points[:, [0, 2, 1]])) for v in session.views
+    )
+    with pytest.raises((InputError, NoResultError)):
+        run(replace(session, views=views))
