@@ -1,6 +1,6 @@
 """What `stitch check --deep` and data snooping find in sessions with one mistake, and in sessions without any.
 
-Usage: python bench/integrity.py good|sizes|kinds|real FILE [--seeds 0 5] [--minutes 30] [--real FOLDER]
+Usage: python bench/integrity.py good|sizes|kinds FILE [--seeds 0 5] [--minutes 30] [--every 6]
 
 Rows are appended to FILE (a JSON line each) as they come; what stands there already is not computed again.
 Seeds 0 to 99 were used while the code was written, 1000 and above are run once.

@@ -117,7 +117,7 @@ def in_base_frame(T_reference_scanner: Array) -> Fault:
             session, {v: frames.transform(T, shown(session, v)) for v, T in enumerate(T_reference_scanner)}
         )
 
-    return Fault(apply, ("frame",))
+    return Fault(apply, ("mount",))
 
 
 def faults(views: int, rng: np.random.Generator) -> dict[str, Fault]:

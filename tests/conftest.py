@@ -34,6 +34,8 @@ LONGEST = (
     "test_diagnosis_commands.py",
     "test_labelled_commands.py",
     "test_joint_effects.py",
+    "test_readme_example.py",
+    "test_extend_page.py",
 )
 
 

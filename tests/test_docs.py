@@ -1,9 +1,6 @@
-"""The pages say what is there: paths, names, the walk of a cloud, diffs that work, output that is printed."""
+"""The pages say what is there: paths, names, commands, the walk of a cloud."""
 
-import math
 import re
-import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -12,7 +9,6 @@ import pytest
 import typer
 
 import stitch
-from bench.readme_output import commands, printed, shown
 from stitch.cli.main import build
 from stitch.effects import EFFECTS
 from stitch.effects.user_file import load
@@ -155,103 +151,3 @@ def test_a_cloud_walks_as_the_page_says(session, tmp_path):
     calls = iter(seen)
     for name, file in walk:
         assert (name, str(ROOT / file)) in calls, f"{name} was not called after the ones before it"
-
-
-def applied(page: Path, root: Path) -> None:
-    """Apply every diff of a page to a copy of the tree: each hunk's lines stand in the file exactly once."""
-    for diff in re.findall(r"```diff\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
-        target = root / re.search(r"^\+\+\+ b/(\S+)", diff, re.MULTILINE)[1]
-        for hunk in diff.split("\n@@\n")[1:]:
-            lines = hunk.splitlines()
-            old = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "+")
-            new = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "-")
-            text = target.read_text(encoding="utf-8") if target.exists() else ""
-            assert text.count(old) == 1 if old else not text, f"{target}: {old}"
-            target.write_text(text.replace(old, new) if old else new, encoding="utf-8")
-
-
-EXTENDED = """
-import numpy as np
-from dataclasses import replace
-from data_synth.fixtures.labelled_arm import labelled_cell
-import stitch
-from stitch import frames
-from stitch.diagnosis import candidates
-from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.selection.ranking import ranked_all
-from stitch.effects import EFFECTS
-from stitch.measurement.capture import capture
-from stitch.measurement.measurement import measurement_of
-from stitch.model.model import Model
-from stitch.observations.plate import plate_model
-
-assert EFFECTS["mount_thermal_drift"].formula == "M·exp(ξ (T−T₀)), T = scanner_temperature_c"
-for name in set(EFFECTS) - {"mount_thermal_drift", "joint_offset", "gear_eccentricity"}:
-    del EFFECTS[name]
-candidates.empirical_effects = lambda views: []
-
-# The effect: what is put into a cell is found.
-true = np.array([1e-4, -2e-4, 1.5e-4, 0.03, -0.02, 0.04])
-cell, _, _ = labelled_cell(3, views=25, noise=0.005)
-warm = 3 * np.sin(np.arange(25) / 4)
-def seen(view, degrees):
-    moved = frames.transform(frames.inverse(frames.exp(true * degrees)), view.sighting.points)
-    return replace(
-        view, covariates={"scanner_temperature_c": 20 + degrees}, sighting=replace(view.sighting, points=moved))
-drifting = replace(cell, views=tuple(seen(v, d) for v, d in zip(cell.views, warm)))
-term = stitch.run(drifting, effects=["mount_thermal_drift"]).terms[0]
-off = (term.values - true) / term.sigmas
-assert np.isfinite(off).all() and np.abs(off).max() < 4, off
-
-# The observation: an offset of joint 3 that flat points alone show.
-plate = np.array([[60., 10, 30], [-40, 55, 30], [-20, -60, 30], [10, 5, 30], [-70, -10, 30], [50, -50, 30]])
-cell, T_mount, _ = labelled_cell(1, views=30, offset=np.array([0, 0, 1.5e-3, 0, 0, 0]), targets=plate)
-linear = plate_model(measurement_of(cell, capture(cell)), Model(T_mount))
-best = ranked_all(linear, candidates_of(linear)[0])[0][0]
-found = {p.name: (v, s) for p, v, s in zip(best.score.form.free, best.score.values, best.score.sigmas)}
-assert best.name == "joint_offset" and list(found) == ["d3"], found
-assert abs(found["d3"][0] - 1.5e-3) < 3 * found["d3"][1] < 3e-4, found
-
-# The statistic: silent where the scatter is normal, heard where it has long tails.
-rng = np.random.default_rng(0)
-def notes(drawn):
-    cell, _, _ = labelled_cell(5, views=25, noise=1e-3, scatter=(1e-6, 1e-3))
-    noisy = [replace(v.sighting, points=v.sighting.points + 0.02 * drawn((4, 3)), sigma=np.full(4, 0.02))
-             for v in cell.views]
-    views = tuple(replace(v, sighting=s) for v, s in zip(cell.views, noisy))
-    return stitch.diagnose(stitch.run(replace(cell, views=views))).notes
-tails = (rng.standard_normal, lambda shape: rng.standard_t(2, shape))
-heard = [any("not normal" in note for note in notes(drawn)) for drawn in tails]
-assert heard == [False, True], heard
-"""
-
-
-def test_the_diffs_of_the_page_that_extends_work(tmp_path):
-    shutil.copytree(ROOT / "stitch", tmp_path / "stitch", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "data_synth", tmp_path / "data_synth", ignore=shutil.ignore_patterns("__pycache__"))
-    applied(ROOT / "docs" / "extend.md", tmp_path)
-    command = [sys.executable, "-c", EXTENDED]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_example_of_the_readme_prints_what_it_shows(tmp_path):
-    page = shown()
-    anew = printed(commands(page), tmp_path)
-    number = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
-    assert number.sub("#", re.sub(" +", " ", anew)) == number.sub("#", re.sub(" +", " ", page)), (
-        "to fix: python bench/readme_output.py"
-    )
-    for a, b in zip(number.findall(anew), number.findall(page), strict=True):
-        # Another processor may round otherwise: one in the last digit that is shown.
-        assert math.isclose(value(a), value(b), rel_tol=0, abs_tol=1.01 * max(last_digit(a), last_digit(b))), (a, b)
-
-
-def value(number: str) -> float:
-    return float(number.replace(",", ""))
-
-
-def last_digit(number: str) -> float:
-    """What one more in the last digit that is shown is worth."""
-    mantissa, _, power = number.partition("e")
-    return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))

@@ -60,7 +60,7 @@ def _nothing_next(found: Diagnosis) -> str:
         return "Nothing is missing: there is nothing to tell apart."
     if len(found.effects) > 1:
         return f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}."
-    return "Nothing has to be told apart: no two suspects look alike in these views."
+    return "Nothing has to be told apart: no two candidate effects are aliases in these views."
 
 
 def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
@@ -79,11 +79,11 @@ def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, obje
 
 
 def show(found: Diagnosis, length_unit: str) -> None:
-    """Sentence first, then the suspects, what the poses follow, what to do next."""
+    """Sentence first, then the candidate effects, what the poses follow, what to do next."""
     terminal, to_um = console(), MICROMETRES[length_unit]
     terminal.print(found.sentence, soft_wrap=True, style="bold")
-    table = Table(title="Suspects", title_justify="left")
-    for heading in ("effect", "p", "posterior", "left (µm)", "held-out (µm)"):
+    table = Table(title="Candidate effects", title_justify="left")
+    for heading in ("effect", "p", "posterior", "rms if added (µm)", "held-out if added (µm)"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
     for s in found.candidates[:_SHOWN]:
         table.add_row(*_row(found, s, to_um))
@@ -91,7 +91,7 @@ def show(found: Diagnosis, length_unit: str) -> None:
     for s in found.candidates[:3]:
         if s.ranked.score.observable:
             alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
-            told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; looks like {alike}" if alike else "")
+            told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; aliases: {alike}" if alike else "")
             terminal.print(told, soft_wrap=True)
     unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
     if unseen:

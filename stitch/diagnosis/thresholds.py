@@ -33,7 +33,7 @@ RISE, FALL = 1.05, 0.995
 # An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
 CLEAR, FAINT = 4.0, 2.0
 
-# Effects whose patterns correlate more than this look alike in these views.
+# Effects whose patterns correlate more than this are aliases in these views.
 SIMILAR = 0.9
 # λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
 TOLD_APART = 5.4

@@ -1,7 +1,7 @@
 """Which views of a run may be fused: blunders named and left out, contradictions beyond any arm refused."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -60,7 +60,11 @@ def admission(session: Session, correction: Correction, index: int) -> Admission
     found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index])
     if contradicts(session, found):
         refuse(session, deep_check(session))
-    problems = explain(session, own, T_mount, found) if found.left_out or found.block else []
+        raise _unexplained(session, found)
+    if found.block is not None and not _beyond_any_slip(session, found):
+        # A slip of the part, or a knock of the mount, within what a model can hold: the diagnosis names it.
+        found = replace(found, block=None)
+    problems = explain(session, own, T_mount, found) if found.left_out else []
     apart = next((p for p in problems if p.kind == "disconnected"), None)
     if apart is not None:
         raise NoResultError(f"{session.path}: {apart.line()}")
@@ -80,6 +84,14 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     return Admission()
 
 
+def _beyond_any_slip(session: Session, found: Snooping) -> bool:
+    """True if a block of views is displaced by more than an effect of the model may be."""
+    assert found.block is not None
+    lever = found.freed.overlaps.gram.lever if found.block.what == "part" else 1.0
+    turn, shift = (float(np.linalg.norm(x)) for x in (found.block.estimate[:3] / lever, found.block.estimate[3:]))
+    return turn > ROTATION or shift > TRANSLATION_M / METRES[session.length_unit]
+
+
 def _require_own_model(session: Session, correction: Correction, index: int) -> None:
     """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
     own, T_mount = correction.captures[index], correction.model.T_mount
@@ -94,6 +106,14 @@ def _require_own_model(session: Session, correction: Correction, index: int) -> 
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
             "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
         )
+
+
+def _unexplained(session: Session, found: Snooping) -> NoResultError:
+    off = f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+    return NoResultError(
+        f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
+        "it; to fix: check that rows and clouds belong together and how the poses were converted"
+    )
 
 
 def refuse(session: Session, problems: Sequence[Problem]) -> None:

@@ -89,7 +89,7 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
     still = np.broadcast_to(np.eye(4), T.shape)
     yield Hypothesis(
-        "frame", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them"
+        "mount", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them"
     )
 
 

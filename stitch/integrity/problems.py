@@ -22,7 +22,6 @@ KINDS = (
     "foreign",
     "reclamped",
     "disconnected",
-    "frame",
 )
 
 

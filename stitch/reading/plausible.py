@@ -82,18 +82,25 @@ def _refuse(size_m: float, limits: tuple[float, float], what: str, how: str, key
 
 
 def _compare_motions(session: Session, flange: Array) -> None:
-    """Labelled points have no size of their own, but they move with the arm."""
-    metres = METRES[session.length_unit]
-    seen = [view.sighting.points for view in session.views if view.sighting is not None]
+    """Labelled points have no size of their own, but a target that several views see moves with the arm."""
+    seen = [view.sighting for view in session.views if view.sighting is not None]
     if len(seen) < 3 or session.has_clouds:
         return
-    moved, arm = float(np.ptp(np.concatenate(seen), axis=0).max()) * metres, float(np.ptp(flange, axis=0).max())
+    names = np.concatenate([sighting.targets for sighting in seen])
+    points = np.concatenate([sighting.points for sighting in seen]) * METRES[session.length_unit]
+    moved, arm = max(_spread(points[names == name]) for name in np.unique(names)), _spread(flange)
+    # A target that one view sees has not moved at all.
     if min(moved, arm) > 0 and not 1 / _MOTION < moved / arm < _MOTION:
         raise InputError(
             f"{session.path / 'session.toml'}: the targets move over {moved * 1e3:.3g} mm, the flange over "
             f"{arm * 1e3:.3g} mm; the scale looks off by 1000: write poses and targets in length_unit "
             f'(is "{session.length_unit}")'
         )
+
+
+def _spread(points: Array) -> float:
+    """The longest side of the box around points."""
+    return float(np.ptp(points, axis=0).max())
 
 
 def _compare_standoff(session: Session, cloud_unit: str) -> None:

@@ -32,51 +32,51 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     believed to be larger than found: beside an imitation the right effect is hardly known without an end.
     """
     candidates = [c for c in candidates if not c.empirical]
-    chain, refused = _grown(linear, candidates, [best]), dict[str, str]()
-    explained = sum(r.log_posterior for r in chain)
+    chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
+    explained = sum(r.log_posterior for r in chosen)
     while True:
-        chain = _holding(linear, chain, len(candidates))
-        tried = [(r.name, extrapolate(_without(linear, chain, r), r.score)) for r in chain]
+        chosen = _eliminated_back(linear, chosen, len(candidates))
+        tried = [(r.name, extrapolate(_without(linear, chosen, r), r.score)) for r in chosen]
         erring = {name: found for name, found in tried if found is not None and not found.helps}
         if not erring:
-            return ForwardSelection(tuple(sorted(chain, key=lambda r: -r.log_posterior)), explained, refused)
+            return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
         name = max(erring, key=lambda name: erring[name].believed)
         refused[name] = erring[name].objection(name)
         candidates = [c for c in candidates if c.name != name]
-        chain = _grown(linear, candidates, [r for r in chain if r.name != name])
+        chosen = _grown(linear, candidates, [r for r in chosen if r.name != name])
 
 
-def _grown(linear: LinearModel, candidates: Sequence[Candidate], chain: Sequence[Ranked]) -> list[Ranked]:
+def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
     """Further effects, one by one, as long as one can be named beside those before."""
-    chain = list(chain)
-    while len(chain) < AT_ONCE:
-        beside = _beside(linear, chain)
-        others = [c for c in candidates if c.name not in {r.name for r in chain}]
-        scores = [score(beside, c) for c in promising(beside, others, TRIED)]
+    chosen = list(chosen)
+    while len(chosen) < AT_ONCE:
+        conditioned = _conditioned(linear, chosen)
+        others = [c for c in candidates if c.name not in {r.name for r in chosen}]
+        scores = [score(conditioned, c) for c in promising(conditioned, others, TRIED)]
         # Preselected by what they gain: all that were looked at count as tests.
         ranked, _ = rank(scores, tests=len(others))
         following = next((r for r in ranked if certain(r)), None)
         if following is None:
             break
-        chain.append(following)
-    return chain
+        chosen.append(following)
+    return chosen
 
 
-def _holding(linear: LinearModel, chain: Sequence[Ranked], tests: int) -> list[Ranked]:
+def _eliminated_back(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> list[Ranked]:
     """The effects that can still be named beside all the others."""
-    chain = list(chain)
-    for r in list(chain):
-        own = ranked_one(_without(linear, chain, r), r.score.candidate, tests)
-        others = [other for other in chain if other.name != r.name]
-        chain = [*others, own] if certain(own) else others
-    return chain
+    chosen = list(chosen)
+    for r in list(chosen):
+        own = ranked_one(_without(linear, chosen, r), r.score.candidate, tests)
+        others = [other for other in chosen if other.name != r.name]
+        chosen = [*others, own] if certain(own) else others
+    return chosen
 
 
-def _without(linear: LinearModel, chain: Sequence[Ranked], one: Ranked) -> LinearModel:
+def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:
     """The evidence beside all effects but one."""
-    return _beside(linear, [r for r in chain if r.name != one.name])
+    return _conditioned(linear, [r for r in chosen if r.name != one.name])
 
 
-def _beside(linear: LinearModel, chain: Sequence[Ranked]) -> LinearModel:
-    columns = [r.score.form.columns for r in chain]
+def _conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
+    columns = [r.score.form.columns for r in chosen]
     return linear.conditioned_on(np.hstack(columns)) if columns else linear

@@ -1,4 +1,4 @@
-"""Which candidates look alike in these views: correlation of what they do, hand-eye and model projected out."""
+"""Which candidates are aliases in these views: correlation of what they do, hand-eye and model projected out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,0 +1,65 @@
+"""Views that do not belong, in a cell of known truth: found, named, and where they really stood."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import captured_blade
+from stitch import frames
+from stitch.integrity.relative_scans import relative_scans
+from stitch.integrity.snooping import snoop
+from stitch.measurement.scan import prepare_view
+
+GATE, OFF = 2.5, 6
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return captured_blade(11, views=12, pixels=90)
+
+
+def with_mounts(own, change):
+    T = np.array(own.T_reference_mount)
+    return replace(own, T_reference_mount=change(T))
+
+
+def test_a_good_session_loses_no_view(cell):
+    measured, own = cell
+    found = snoop(own, measured.T_mount, GATE)
+    assert found.left_out == () and len(found.disconnected) == 1
+    # 20 µm and 20 µrad were put in.
+    assert 0.01 < found.translation < 0.04 and 1e-5 < found.rotation < 4e-5
+
+
+@pytest.mark.parametrize("shift", [1.0, 40.0])
+def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
+    measured, own = cell
+    twist = np.r_[0, 0, 0, shift * np.array([0.6, 0.0, 0.8])]
+
+    def change(T):
+        T[OFF] = frames.exp(twist) @ T[OFF]
+        return T
+
+    found = snoop(with_mounts(own, change), measured.T_mount, GATE)
+    assert found.left_out == (OFF,)
+    assert found.misplaced[0].distance == pytest.approx(shift, abs=0.15)
+
+
+def test_a_scan_of_something_else_belongs_nowhere(cell):
+    measured, own = cell
+    xy = np.random.default_rng(0).uniform(-40, 40, (2000, 2))
+    waves = prepare_view("waves", np.column_stack([xy, 420 + 9 * np.sin(xy[:, 0] / 7)]))
+    scans = (*own.scans[:OFF], waves, *own.scans[OFF + 1 :])
+    found = snoop(replace(own, scans=scans), measured.T_mount, GATE)
+    assert [(m.view, m.kind) for m in found.misplaced] == [(OFF, "foreign")]
+
+
+def test_motions_between_scans_are_those_of_the_cell(cell):
+    measured, own = cell
+    found = relative_scans(own)
+    poses = measured.T_reference_scanner
+    true = np.array([frames.inverse(poses[v]) @ poses[w] for v, w in found.pairs])
+    off = frames.angle_between(true, found.T)
+    assert len(found.pairs) >= 8
+    assert np.mean(off < 2e-3) > 0.7
