@@ -12,7 +12,7 @@ from stitch.measurement.capture import capture
 from stitch.model.model_toml import read_model
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
-from stitch.pipeline import run, run_rig
+from stitch.pipeline import diagnose, run, run_rig
 from stitch.reading.session_folder import load_session
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
@@ -99,7 +99,7 @@ def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
 
 
 def test_diagnosis_of_a_real_object_says_that_poses_dominate_and_joints_are_not_known(runs):
-    found = runs["david"].diagnose()
+    found = diagnose(runs["david"])
     assert found.verdict in ("unknown_effect", "cannot_tell")
     assert "pose errors dominate" in found.sentence
     assert "repeat" in found.sentence

@@ -5,6 +5,7 @@ import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
+from stitch.effects.in_session import lacking
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.scan import prepare_view
 
@@ -43,4 +44,4 @@ def test_an_intensity_that_is_not_finite_counts_as_none(blade_capture, wrong):
     session.views[1].cloud.scalars["intensity"] = np.full(len(session.views[1].cloud.points), 0.5)
     session.views[1].cloud.scalars["intensity"][3] = wrong
     measurement = measurement_of(session, capture)
-    assert not measurement.has_intensity and measurement.lacks(EFFECTS["intensity_bias"]) == ("intensity",)
+    assert not measurement.has_intensity and lacking(measurement, EFFECTS["intensity_bias"]) == ("intensity",)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.fixtures.in_memory import clouds_of, labelled_session_of, points_of
 from stitch.measurement.labelled_points import Sighting
-from stitch.pipeline import run
+from stitch.pipeline import add, run
 
 
 def error(T, true):
@@ -56,10 +56,10 @@ def test_both_know_the_hand_eye_better_than_either_and_say_how_well(cells):
 def test_targets_lie_where_they_are_within_their_sigma(cells):
     _, _, runs = cells
     for seed, found in zip(SEEDS, runs["both"], strict=True):
-        true, covariance = measured_plate(seed), found.labelled.landmarks_covariance
+        true, covariance = measured_plate(seed), found.targets.landmarks_covariance
         z = []
-        for k, name in enumerate(found.labelled.rows.capture.sightings.targets):
-            d = found.labelled.landmarks.positions[k] - true.targets[name]
+        for k, name in enumerate(found.targets.rows.capture.sightings.targets):
+            d = found.targets.landmarks.positions[k] - true.targets[name]
             z.append(in_sigmas(d, covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]))
         # The targets of one run share the error of its hand-eye: three degrees of freedom each, judged one by one.
         assert max(z) < chi2.ppf(1 - 1e-3 / len(z) / len(SEEDS), 3)
@@ -105,7 +105,7 @@ def test_a_wrong_point_is_found_and_listed_and_pulls_nothing():
 
 def test_a_sensor_effect_that_acts_on_both_is_found():
     measured = measured_plate(3, hidden={"range_scale": 4.0})
-    after = run(labelled_session_of(measured)).add("range_scale")
-    value, sigma = after.terms[0].values[0], after.sigmas[0][0]
+    after = add(run(labelled_session_of(measured)), "range_scale")
+    value, sigma = after.terms[0].values[0], after.terms[0].sigmas[0]
     # Normal errors stay within 3.3 sigmas in 999 of 1000 cases; the effect itself is larger.
     assert abs(value - measured.hidden["range_scale"]["s"]) < 3.3 * sigma < abs(value)

@@ -47,7 +47,7 @@ def test_targets_that_a_model_does_not_know_have_sigmas_of_their_own():
         model = replace(model_of(run(session)), T_mount=wrong, covariance=spread**2, targets={})
         found = run(session, model)
         error = (found.fused.points - places).ravel()
-        covariance = found.labelled.landmarks_covariance[: error.size, : error.size]
+        covariance = found.targets.landmarks_covariance[: error.size, : error.size]
         squares.append(error @ np.linalg.solve(covariance, error))
     assert chi2.ppf(0.001, error.size * len(squares)) < np.sum(squares) < chi2.ppf(0.999, error.size * len(squares))
 
@@ -89,7 +89,7 @@ def test_a_probe_is_placed_and_turned():
     session, T_mount, places = labelled_cell(6, views=60, probe=True)
     found = run(session)
     assert np.abs(found.fused.points[0] - places[0]).max() < 0.1
-    assert Rotation.from_matrix(found.labelled.landmarks.orientation.T @ PROBE_TURN).magnitude() < 1e-4
+    assert Rotation.from_matrix(found.targets.landmarks.orientation.T @ PROBE_TURN).magnitude() < 1e-4
 
 
 def test_nominal_targets_pull_by_their_sigma(tmp_path):

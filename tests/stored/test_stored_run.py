@@ -24,9 +24,9 @@ def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
     write_run(found, tmp_path / "r")
     again = stored_run(tmp_path / "r", load_state(tmp_path / "r"))
     for name in ("positions", "orientation"):
-        np.testing.assert_array_equal(getattr(again.labelled.landmarks, name), getattr(found.labelled.landmarks, name))
-    np.testing.assert_allclose(again.labelled.target_rms, found.labelled.target_rms, rtol=1e-9)
-    np.testing.assert_array_equal(again.labelled.heldout, found.labelled.heldout)
-    assert again.labelled.rms == pytest.approx(found.residual_rms, rel=1e-9)
+        np.testing.assert_array_equal(getattr(again.targets.landmarks, name), getattr(found.targets.landmarks, name))
+    np.testing.assert_allclose(again.targets.target_rms, found.targets.target_rms, rtol=1e-9)
+    np.testing.assert_array_equal(again.targets.heldout, found.targets.heldout)
+    assert again.targets.rms == pytest.approx(found.residual_rms, rel=1e-9)
     for same in (again, stitched(loaded, model_of(found))):
-        np.testing.assert_array_equal(same.sigmas, found.sigmas)
+        np.testing.assert_array_equal(same.terms[0].sigmas, found.terms[0].sigmas)
