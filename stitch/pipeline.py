@@ -81,9 +81,8 @@ def run_rig(
         for i, (session, own) in enumerate(zip(found.sessions, found.admissions, strict=True)):
             if len(session.views) < len(sessions[i].views):
                 recorders[i].start(session)
-            last = replace(
-                end, left_out=() if keep else own.left_out, kept=own.left_out if keep else (), links=own.links
-            )
+            out, kept = ((), own.left_out) if keep else (own.left_out, ())
+            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
             runs.append(collected(session, i, last, before[i], recorders[i]))
         return runs
 

@@ -22,6 +22,8 @@ from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
 from stitch.units import METRES
 
+# What the joints of an uncalibrated arm may displace single views by: 5 mrad, 2 mm.
+_ARM_ROTATION, _ARM_M = 5e-3, 2e-3
 # A hand-eye that differs by chance alone is refused once in a million.
 _CHANCE = 1e-6
 
@@ -31,6 +33,7 @@ class Admission:
     """What may be fused of one session."""
 
     left_out: tuple[LeftOut, ...] = ()
+    suspected: tuple[LeftOut, ...] = ()  # off by no more than an effect of an arm may cause: fused, and noted
     links: ViewLinks = field(default_factory=ViewLinks)
 
     @property
@@ -68,7 +71,13 @@ def admission(session: Session, correction: Correction, index: int) -> Admission
     apart = next((p for p in problems if p.kind == "disconnected"), None)
     if apart is not None:
         raise NoResultError(f"{session.path}: {apart.line()}")
-    return Admission(_left_out(session, own, found, T_mount, problems), _links(session, found))
+    out = _not_belonging(session, own, found, T_mount, problems)
+    within = _within_an_arm(session, found, problems)
+    return Admission(
+        left_out=tuple(item for item in out if item.view not in within),
+        suspected=tuple(item for item in out if item.view in within),
+        links=_links(session, found),
+    )
 
 
 def admission_of_targets(session: Session, found: TargetFit) -> Admission:
@@ -82,6 +91,19 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     if rotation > ROTATION or translation > TRANSLATION_M / METRES[session.length_unit]:
         refuse(session, check_targets(session))
     return Admission()
+
+
+def _within_an_arm(session: Session, found: Snooping, problems: Sequence[Problem]) -> set[str]:
+    """Views that several displacements single out, none beyond what an uncalibrated arm may cause.
+
+    One such view among many is a blunder; several are what a systematic effect looks like, and leaving them out would
+    hide it from the diagnosis.
+    """
+    linked = [m for m in found.misplaced if m.kind == "displaced" and m.view not in found.linkage.unlinked]
+    explained = {name for problem in problems if problem.kind != "displaced" for name in problem.views}
+    small = [m for m in linked if m.rotation <= _ARM_ROTATION and m.distance * METRES[session.length_unit] <= _ARM_M]
+    names = {session.views[m.view].name for m in small} - explained
+    return names if len(names) > 1 else set()
 
 
 def _beyond_any_slip(session: Session, found: Snooping) -> bool:
@@ -123,7 +145,7 @@ def refuse(session: Session, problems: Sequence[Problem]) -> None:
         raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
 
 
-def _left_out(
+def _not_belonging(
     session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[Problem]
 ) -> tuple[LeftOut, ...]:
     poses = own.poses(T_mount)

@@ -58,10 +58,10 @@ class Capture:
 
     def without(self, left_out: Indices) -> "Capture":
         """The capture less some views."""
-        keep = [v for v in range(len(self.scans)) if v not in left_out]
+        keep = np.setdiff1d(np.arange(len(self.T_reference_mount)), left_out)
         return replace(
             self,
-            scans=tuple(self.scans[v] for v in keep),
+            scans=tuple(self.scans[v] for v in keep) if self.scans else (),
             T_reference_mount=self.T_reference_mount[keep],
             T_reference_flange=self.T_reference_flange[keep],
             T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],

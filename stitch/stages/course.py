@@ -46,6 +46,7 @@ class End:
     poses_before: Array | None = None  # (V, 4, 4) of the model before its last change
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not belong
     kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
+    suspected: tuple[LeftOut, ...] = ()  # views that stand out, and are fused
     links: ViewLinks = field(default_factory=ViewLinks)
 
 
@@ -78,7 +79,7 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         effects_file=end.effects_file,
         poses_before=end.poses_before,
         convergence=finished.convergence,
-        notes=(*view_notes(end.left_out, end.kept), *course.notes(session, fitted, index, end.begun)),
+        notes=(*view_notes(end.left_out, end.kept, end.suspected), *course.notes(session, fitted, index, end.begun)),
         left_out=end.left_out,
         links=end.links,
         targets=own.targets,

@@ -87,10 +87,18 @@ def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def view_notes(left_out: Sequence[LeftOut], kept: Sequence[LeftOut]) -> tuple[str, ...]:
+def view_notes(
+    left_out: Sequence[LeftOut], kept: Sequence[LeftOut], suspected: Sequence[LeftOut] = ()
+) -> tuple[str, ...]:
     """Views that do not belong, first of all."""
     told = [f"View {item.view} does not belong and was left out: {item.why}." for item in left_out]
     told += [f"View {item.view} does not belong and was kept as asked: {item.why}." for item in kept]
+    if suspected:
+        names = ", ".join(item.view for item in suspected)
+        told.append(
+            f"Views {names} stand out from the others by more than chance, but by no more than an effect of the arm "
+            "may cause: they are fused; diagnose before leaving any out."
+        )
     return tuple(told)
 
 

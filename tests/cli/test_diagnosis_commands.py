@@ -45,7 +45,7 @@ def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     assert [s["step"] for s in ledger] == [0, 1]
     assert ledger[1]["residual_rms"] < ledger[0]["residual_rms"]
     assert judge(folder / "r", folder / "s.truth.json")["judgement"] == "complete"
-    assert load_state(folder / "r").terms[0].effect.name == "joint_compliance"
+    assert load_state(folder / "r").model.terms[0].effect.name == "joint_compliance"
     stitch_command("run", folder / "s", "-o", folder / "again", "--hand-eye", folder / "r", "--no-recording")
     again = json.loads((folder / "again" / "result.json").read_text())
     assert again["residual_rms"] == pytest.approx(result["residual_rms"], rel=0.02)
@@ -73,7 +73,7 @@ def test_bad_use_ends_in_one_line(session_on_disk, stitch_command, capsys, argum
         stitch_command("run", folder / "s", "-o", folder / "r0", "--no-recording")
     capsys.readouterr()
     with pytest.raises(SystemExit) as stop:
-        main([a.replace("RUN", folder / "r0").replace("SESSION", folder / "s") for a in arguments])
+        main([a.replace("RUN", str(folder / "r0")).replace("SESSION", str(folder / "s")) for a in arguments])
     assert stop.value.code == 2
     line = capsys.readouterr().err.strip()
     assert "\n" not in line
