@@ -50,7 +50,7 @@ lint: install
 	$(VENV)/bin/lint-imports --no-logo
 
 check: lint
-	$(PYTHON) -m pytest --cov
+	$(PYTHON) -m pytest -m "slow or not slow" --cov
 	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=90
 
 # Pins every package with hashes. What other indexes or settings of this machine might write into it is refused.

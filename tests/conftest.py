@@ -26,9 +26,7 @@ library_threads_off()
 
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
-    "test_real_scans.py",
     "test_surface_stages.py",
-    "test_mixed_fit.py",
     "test_blade_diagnosis.py",
     "test_scanner_field.py",
     "test_diagnosis_commands.py",

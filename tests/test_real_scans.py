@@ -15,6 +15,9 @@ from stitch.observations.surfaces.overlaps import collect
 from stitch.pipeline import diagnose, run, run_rig
 from stitch.reading.session_folder import load_session
 
+# Minutes of work: `make check` runs it, `make test` does not.
+pytestmark = pytest.mark.slow
+
 IN_HAND = ("david", "cone", "sphere", "rubik")
 
 

@@ -40,6 +40,7 @@ def test_real_laser_lines(shared_data):
     assert abs(result.free.radius - 40) < 2 * np.sqrt(result.free.covariance[9, 9])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["line", "area"])
 def test_error_is_that_of_the_covariance(kind):
     cells = [sphere_cell(seed, kind) for seed in range(10)]
@@ -61,6 +62,7 @@ def test_exact_without_noise(kind):
     assert fit.centre == pytest.approx(cell.centre, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_sides_of_laser_lines_are_found_from_all_poses():
     for seed in range(6):
         cell = sphere_cell(seed, turns=0.6)
@@ -70,6 +72,7 @@ def test_sides_of_laser_lines_are_found_from_all_poses():
         assert np.linalg.norm(twist(cell, start.T_mount)[:3]) < 0.05
 
 
+@pytest.mark.slow
 def test_orientations_equal_to_a_fiftieth_of_a_degree_at_two_metres():
     """The decoupled answer takes them as equal: 0.02° at 2 m is 0.7 mm; the refined one uses them as they are."""
     loose, right = [], []
@@ -128,6 +131,7 @@ def test_metres_give_what_millimetres_give(tmp_path, capsys, monkeypatch):
     assert " m rms" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["line", "area"])
 def test_a_wrong_pose_is_named_and_hardly_counts(kind, tmp_path):
     for seed in range(3):

@@ -8,6 +8,7 @@ from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.write import write_session
 
 
+@pytest.mark.slow
 def test_every_command_works(tmp_path, stitch_command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     measured = measured_plate(5, views=10)

@@ -29,7 +29,7 @@ def nothing_hidden():
 
 # Sizes that are two to four times what these cells can show at the least.
 VISIBLE = [
-    ("joint_offset", "eye_in_hand", 4.0),
+    pytest.param("joint_offset", "eye_in_hand", 4.0, marks=pytest.mark.slow),
     ("joint_compliance", "eye_to_hand", 3.0),
     ("lens_distortion", "eye_to_hand", 3.0),
 ]

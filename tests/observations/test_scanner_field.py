@@ -30,6 +30,7 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
     return squares, sigmas
 
 
+@pytest.mark.slow
 def test_sigmas_hold_whatever_the_scanner_repeats():
     """As large as the noise, or none: the error is within its covariance, and small errors do not widen it as large."""
     large, small = chi_squares(1.0), chi_squares(0.0)

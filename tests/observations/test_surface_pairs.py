@@ -91,6 +91,7 @@ def test_moving_all_views_together_costs_nothing(overlaps):
     assert abs(b @ common) < 1e-9 * np.abs(b).max() * len(b)
 
 
+@pytest.mark.slow
 def test_repeatability_is_recovered():
     """40 µm and 60 µrad put in, over 6 cells: the mean estimate within 35 %."""
     found = []

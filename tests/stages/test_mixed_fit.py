@@ -12,6 +12,9 @@ from data_synth.fixtures.in_memory import clouds_of, labelled_session_of, points
 from stitch.measurement.labelled_points import Sighting
 from stitch.pipeline import add, run
 
+# Minutes of work: `make check` runs it, `make test` does not.
+pytestmark = pytest.mark.slow
+
 
 def error(T, true):
     """(6,) rotation vector and translation from T to the truth, scanner frame."""

@@ -24,6 +24,7 @@ def at_part(capture: Capture, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle, np.hstack([-frames.skew(middle), np.eye(3)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_hand_eye_error_is_what_the_covariance_predicts(mount):
     """From 5° and 30 mm, 4 draws of scatter and noise a mount: rms error at the part below 1.2 of the prediction, sigmas honest."""

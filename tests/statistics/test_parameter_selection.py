@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from stitch.statistics.identifiability import independent
-from stitch.statistics.parameter_selection import omitted_rms, supported
+from stitch.statistics.parameter_selection import Whitened, omitted_rms, supported
 
 
 @settings(max_examples=25, deadline=None)
@@ -30,7 +30,7 @@ def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
         rng = np.random.default_rng(seed)
         own, further = rng.standard_normal((60, 6)), rng.standard_normal((60, 9))
         z = further[:, 2] * 1.5 + own @ rng.standard_normal(6) + rng.standard_normal(60)
-        chosen = supported(own, further, z, np.full(9, 0.5), groups, [0] * 6)
+        chosen = supported(Whitened(own, further, z), np.full(9, 0.5), groups, [0] * 6)
         assert chosen[2] and chosen[3]
         others += chosen.sum() > 2
     # 5 groups whose log evidence exceeds 2.5 by chance in some 0.4 % each.
@@ -39,10 +39,8 @@ def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
 
 def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
     rng = np.random.default_rng(0)
-    chosen = supported(
-        rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60), np.full(3, 0.1),
-        [[0], [1], [2]], [0, 0, 1],
-    )  # fmt: skip
+    noise = Whitened(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60))
+    chosen = supported(noise, np.full(3, 0.1), [[0], [1], [2]], [0, 0, 1])
     assert chosen[2] and chosen[:2].sum() == 1
 
 
@@ -53,10 +51,10 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
         own, further, size = rng.standard_normal((12, 2)), 0.4 * rng.standard_normal((12, 1)), rng.uniform(0.2, 3)
         amplitude = size * rng.standard_normal() * rng.integers(0, 2)
         z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
-        told.append(omitted_rms(own, further, z, np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
+        told.append(omitted_rms(Whitened(own, further, z), np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
         true.append(amplitude**2 / size**2)
     apart = np.array(told) - true
     assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
     # Beside a column that is fitted and says the same nothing is known of it but its size.
-    same = omitted_rms(own, np.tile(further, 2), z, np.full(2, 0.3), np.array([True, False]))
+    same = omitted_rms(Whitened(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]))
     np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)

@@ -162,7 +162,7 @@ def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, mo
     monkeypatch.setattr(change_command, "suggest", lambda state, at_most: (None, [], None))
     monkeypatch.setattr(change_command, "write_diagnosis", lambda found, state, run: {})
     assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
-    assert state_of(result).T_mount.tolist() == told(run)["hand_eye"]
+    assert state_of(result).model.T_mount.tolist() == told(run)["hand_eye"]
 
 
 def test_a_page_or_picture_that_fails_leaves_the_old_one(changing, monkeypatch):
