@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.write import write_session
