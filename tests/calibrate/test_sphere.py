@@ -116,6 +116,7 @@ def test_command_on_both_mounts(mount, tmp_path, capsys, monkeypatch):
     assert document["mount"] == mount and len(document["views"]) == len(cell.G)
 
 
+@pytest.mark.slow
 def test_metres_give_what_millimetres_give(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli, "entry_points", lambda group: [])
     cell = sphere_cell(6, "line", turns=0.6)

@@ -69,6 +69,7 @@ def motions_of(A, B):
     return frames.inverse(A[i]) @ A[j], frames.inverse(B[i]) @ B[j]
 
 
+@pytest.mark.slow
 def test_two_hundred_hand_eyes_no_worse_than_opencv():
     """Views refined together; the refined motions of all pairs are judged against the closed forms too."""
     cv2 = pytest.importorskip("cv2")

@@ -65,6 +65,7 @@ def test_nothing_hidden_is_adequate(nothing_hidden):
     assert 5e-3 < found.translation < 6e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "follows"), [("covariate_bias", "humidity_percent")])
 def test_what_the_library_does_not_know_gets_no_name(name, follows):
     _, result = blade_run(2, {name: 4.0}, "eye_in_hand", 14)

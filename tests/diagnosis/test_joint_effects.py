@@ -23,6 +23,7 @@ def test_a_hidden_joint_offset_is_named_and_found():
         assert values[name] == pytest.approx(true, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_offsets_and_gravity_together_are_found_by_their_names(few_effects):
     # Gravity on the flange's mass turns joint 2 by what the flange reaches out: 2 µrad a millimetre.
     offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])

@@ -79,6 +79,7 @@ def test_blunder_of_the_detectable_size_is_found_and_named_as_often_as_stated():
     assert named / trials >= 0.95
 
 
+@pytest.mark.slow
 def test_good_views_stay_and_several_blunders_do_not_hide_each_other():
     false = sum(bool(find_blunders(direct(seed)).blunders) for seed in range(20))
     assert false <= 2  # at 1 % each, three of twenty happen once in a thousand

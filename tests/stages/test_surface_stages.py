@@ -87,7 +87,7 @@ def test_several_captures_share_one_hand_eye():
     assert xi @ np.linalg.solve(both.covariance, xi) < 25.0  # χ² with 6 degrees: 1 in 3,000
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_a_hand_eye_is_found_from_nothing(mount):
     measured, capture = captured_blade(5, mount=mount, pixels=110)
     found = coarse([capture])
