@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import pytest
+
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import load_scene
 from stitch.pipeline import run
 
 
+@pytest.mark.slow
 def test_a_slip_that_the_run_is_told_of_is_found_where_it_was():
     scene = load_scene("drill-plate")
     scene = replace(scene, scanner=replace(scene.scanner, columns=50, rows=50))

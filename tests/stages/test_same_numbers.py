@@ -39,6 +39,7 @@ def searched(threads: int, cores: int, run: int) -> tuple[str, np.ndarray]:
     return source, np.array([float.fromhex(x) for x in numbers.split()])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be set aside here")
 def test_again_and_on_other_threads():
     once, again, other = searched(2, 8, 0), searched(2, 8, 1), searched(1, 1, 0)
