@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.deep_check import ROTATION, TRANSLATION_M, contradicts, deep_check
+from stitch.integrity.deep_check import beyond_any_arm, contradicts, deep_check
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.snooping import Snooping, snoop
@@ -88,7 +88,7 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
         NoResultError: none does.
     """
     rotation, translation = np.sqrt(found.variances[:2])
-    if rotation > ROTATION or translation > TRANSLATION_M / METRES[session.length_unit]:
+    if beyond_any_arm(session, rotation, translation):
         refuse(session, check_targets(session))
     return Admission()
 
@@ -111,7 +111,7 @@ def _beyond_any_slip(session: Session, found: Snooping) -> bool:
     assert found.block is not None
     lever = found.freed.overlaps.gram.lever if found.block.what == "part" else 1.0
     turn, shift = (float(np.linalg.norm(x)) for x in (found.block.estimate[:3] / lever, found.block.estimate[3:]))
-    return turn > ROTATION or shift > TRANSLATION_M / METRES[session.length_unit]
+    return beyond_any_arm(session, turn, shift)
 
 
 def _require_own_model(session: Session, correction: Correction, index: int) -> None:
@@ -123,7 +123,7 @@ def _require_own_model(session: Session, correction: Correction, index: int) -> 
     middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
     shift = float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
     turn = float(np.linalg.norm(xi[:3]))
-    if clear and (turn > ROTATION or shift > TRANSLATION_M / METRES[session.length_unit]):
+    if clear and beyond_any_arm(session, turn, shift):
         raise NoResultError(
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
             "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"

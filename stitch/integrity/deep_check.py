@@ -19,7 +19,7 @@ from stitch.units import METRES
 # Enough points a view to judge millimetres.
 _POINTS = 8000
 # No arm scatters by more.
-ROTATION, TRANSLATION_M = 0.010, 0.005
+_ROTATION, _TRANSLATION_M = 0.010, 0.005
 # A hand-eye from the scans' own motions is right within this share of the part's size, a stated one within the other.
 _GATE, _STATED_GATE = 0.15, 0.35
 _CLOSES = 0.5
@@ -66,7 +66,12 @@ def examined(session: Session, capture: Capture, found: list[Explained]) -> tupl
 def contradicts(session: Session, found: Snooping) -> bool:
     """True if the poses contradict the scans beyond what any arm does."""
     lost = len(found.left_out) > len(session.views) / 2
-    return lost or found.rotation > ROTATION or found.translation > TRANSLATION_M / METRES[session.length_unit]
+    return lost or beyond_any_arm(session, found.rotation, found.translation)
+
+
+def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
+    """True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
+    return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]
 
 
 def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
