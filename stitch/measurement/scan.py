@@ -1,6 +1,6 @@
 """A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -81,6 +81,26 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
         tree=tree,
         spacing=float(np.median(distance[:, 1])),
         noise=noise,
+    )
+
+
+def sparse(scan: Scan, at_most: int) -> Scan:
+    """The scan with at most `at_most` of its points, evenly over the scan order, and a tree over those alone."""
+    if len(scan.points) <= at_most:
+        return scan
+    picked = np.linspace(0, len(scan.points) - 1, at_most).astype(int)
+    points = np.ascontiguousarray(scan.points[picked])
+    tree = KDTree(points, leafsize=16)
+    distance, _ = tree.query(points, k=2)
+    return replace(
+        scan,
+        points=points,
+        normals=scan.normals[picked],
+        usable=scan.usable[picked],
+        area=scan.area[picked] * (len(scan.points) / at_most),
+        confidence=scan.confidence[picked],
+        tree=tree,
+        spacing=float(np.median(distance[:, 1])),
     )
 
 

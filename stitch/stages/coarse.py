@@ -18,15 +18,17 @@ from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.scan import sparse
 from stitch.observations.surfaces.match import sample, search
-from stitch.stages.correct import close_in
+from stitch.stages.correct import close_in, tightened
 from stitch.stages.initial_guess.centroids import centroid_hand_eyes, scanner_centre
 from stitch.stages.initial_guess.relative_motion import motion_candidates
 from stitch.system.threads import parallel
 
 _SEARCH_SAMPLES = 120
+_SEARCH_POINTS = 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
-_SEARCH_ITERATIONS = 7
+_UNTIL_THEY_MEET, _AFTERWARDS = 4, 3
 # First gate of the search and truncation of the score, as shares of the part's size.
 COARSE_GATE = 0.35
 # Where a hand-eye came from that was not searched.
@@ -81,21 +83,18 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
     if sum(len(c.scans) for c in captures) < 3:
         raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
     size = part_size(captures)
-    tried: list[Candidate] = []
-    for source, T_mount in _starts(captures, _SAME_SHARE * size):
-        candidate = _close(captures, source, T_mount, size)
-        if candidate:
-            tried.append(candidate)
+    starts = _starts(captures, size)
+    tried = _closed(captures, starts, size)
     if not tried:
         raise NoResultError(
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
-    distinct = _distinct(captures, tried, _SAME_SHARE * size)
+    distinct = _distinct(captures, tried, size)
     return Coarse(distinct[0].T_mount, 0.2 * size, distinct[0].source, tuple(distinct))
 
 
-def _starts(captures: Sequence[Capture], tolerance: float) -> list[tuple[str, Array]]:
+def _starts(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
     """Distinct starting hand-eyes with the name of the idea behind each.
 
     Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
@@ -112,7 +111,7 @@ def _starts(captures: Sequence[Capture], tolerance: float) -> list[tuple[str, Ar
     motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
     kept: list[tuple[str, Array]] = []
     for name, T in motions:
-        if all(_separation(captures, T, other) > tolerance for _, other in kept):
+        if all(_separation(captures, size, T, other) > _SAME_SHARE * size for _, other in kept):
             kept.append((name, T))
     return starts + kept
 
@@ -123,14 +122,39 @@ def _turn_about(rotation: Array, centre: Array) -> Array:
     return T
 
 
-def _close(captures: Sequence[Capture], source: str, T_mount: Array, size: float) -> Candidate | None:
-    """Close in from one start; None if the views do not overlap there."""
+def _closed(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float) -> list[Candidate]:
+    """Close in from every start on few points; starts under which no views overlap are dropped.
+
+    Half way, starts that have met go on as one: most end in the same place.
+    """
+    light = [replace(c, scans=tuple(sparse(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
+    met: list[tuple[list[str], Array, list[float]]] = []
+    for source, start in starts:
+        half = _close(light, start, [COARSE_GATE * size] * len(captures), _UNTIL_THEY_MEET)
+        if half is None:
+            continue
+        same = [sources for sources, T, _ in met if _separation(captures, size, half[0], T) < _SAME_SHARE * size]
+        if same:
+            same[0].append(source)
+        else:
+            met.append(([source], *half))
+    ends = [(sources, _close(light, T, gates, _AFTERWARDS)) for sources, T, gates in met]
+    return [
+        Candidate(sources[0], end[0], consistency(captures, end[0], _SCORE_SHARE * size), len(sources))
+        for sources, end in ends
+        if end is not None
+    ]
+
+
+def _close(
+    captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], steps: int
+) -> tuple[Array, list[float]] | None:
+    """Close in by some steps: hand-eye and the gates to go on with; None if no views overlap."""
     try:
-        gates = [COARSE_GATE * size] * len(captures)
-        T_mount, _, _ = close_in(captures, T_mount, gates, samples=_SEARCH_SAMPLES, maximum=_SEARCH_ITERATIONS)
+        T_mount, overlaps, _ = close_in(captures, T_mount, gates, samples=_SEARCH_SAMPLES, maximum=steps)
     except NoResultError:
         return None
-    return Candidate(source, T_mount, consistency(captures, T_mount, _SCORE_SHARE * size))
+    return T_mount, tightened(captures, overlaps)
 
 
 def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
@@ -155,22 +179,25 @@ def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> fl
     return float(np.sqrt(np.mean(squares)))
 
 
-def _distinct(captures: Sequence[Capture], tried: Sequence[Candidate], tolerance: float) -> list[Candidate]:
+def _distinct(captures: Sequence[Capture], tried: Sequence[Candidate], size: float) -> list[Candidate]:
     """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
     groups: list[list[Candidate]] = []
     for candidate in tried:
         for group in groups:
-            if _separation(captures, candidate.T_mount, group[0].T_mount) < tolerance:
+            if _separation(captures, size, candidate.T_mount, group[0].T_mount) < _SAME_SHARE * size:
                 group.append(candidate)
                 break
         else:
             groups.append([candidate])
-    best = [replace(min(group, key=lambda c: c.score), source=group[0].source, reached=len(group)) for group in groups]
+    best = [
+        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=sum(c.reached for c in group))
+        for group in groups
+    ]
     return sorted(best, key=lambda c: c.score)
 
 
-def _separation(captures: Sequence[Capture], T_a: Array, T_b: Array) -> float:
+def _separation(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> float:
     """Largest displacement of the scans' mean centroid box between two hand-eyes."""
     centre = scanner_centre(captures)
-    corners = centre + part_size(captures) / 2 * np.vstack([np.eye(3), -np.eye(3)])
+    corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
     return float(np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1).max())

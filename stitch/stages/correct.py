@@ -77,9 +77,13 @@ def close_in(
         settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
         if moved < _CONVERGED and settled:
             break
-        # Not faster than 0.6 a step: the first fits at a wide gate are still far off.
-        gates = [max(new, 0.6 * old) for new, old in zip(tighter, gates, strict=True)]
+        gates = tightened(captures, overlaps)
     return T_mount, overlaps, history
+
+
+def tightened(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list[float]:
+    """The next gates, not tighter than 0.6 of the last: the first fits at a wide gate are still far off."""
+    return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
 
 
 # From freed views per capture to what `fit_hand_eye` calls `repeating`.

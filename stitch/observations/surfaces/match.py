@@ -42,9 +42,15 @@ def sample(scan: Scan, count: int) -> Indices:
     return picked
 
 
-def overlapping_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
-    """Pairs (v < w) of which at least 4 % of the probed points meet; poses T_reference_scanner."""
-    probes = [sample(scan, _PROBES) for scan in scans]
+def overlapping_pairs(
+    scans: Sequence[Scan], poses: Array, gate: float, at_most: int = _PROBES
+) -> list[tuple[int, int]]:
+    """Pairs (v < w) of which at least 4 % of the probed points meet; poses T_reference_scanner.
+
+    Args:
+        at_most: points of a view that are probed; more than 250 tell nothing new.
+    """
+    probes = [sample(scan, min(at_most, _PROBES)) for scan in scans]
 
     def overlap(pair: tuple[int, int]) -> bool:
         share = 0.0

@@ -36,7 +36,7 @@ def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indic
     Raises:
         NoResultError: no two views overlap.
     """
-    pairs = overlapping_pairs(capture.scans, poses, gate)
+    pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
     matches = list(match(capture.scans, poses, pairs, gate, samples))
     if not matches:
         raise NoResultError(

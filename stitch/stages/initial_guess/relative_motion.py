@@ -108,6 +108,8 @@ def sequence_motions(capture: Capture) -> tuple[Array, Array]:
     config = KISSConfig()
     # Its sums over several threads have no fixed order, so their last digits would change from run to run.
     config.registration.max_num_threads = 1
+    # Started from the centroids it is there within some ten steps, or nowhere.
+    config.registration.max_num_iterations = 60
     config.mapping.voxel_size = 0.02 * size
     config.data.max_range = 1e6
     B = []
