@@ -22,6 +22,7 @@ _OFF_BOUNDARY = np.array([1.0, 1.0, 0.0])
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
 _USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
+_ABSENT = 1e-300  # in place of a variance of zero, which has no logarithm
 # The search ends where the deviance's slope is below the first; with thousands of numbers below the second: the
 # curvature grows with their count, and 0.1 then costs the deviance less than 1e-5.
 _FLAT, _FLAT_AMONG_MANY, MANY_NUMBERS = 1e-4, 0.1, 1_000
@@ -72,19 +73,24 @@ def fit_variances(
         prior: (g,) standard deviations of their coefficients; None leaves them free.
         start: (3,) variances to begin with; None starts from the spread of z.
         both_starts: also begin from noise alone, where the likelihood may have a second maximum.
+
+    Returns:
+        A component that no number has is at variance zero.
     """
     problem = _problem(mixed, G, prior)
     guess = _guess(mixed) if start is None else start
-    first = np.log(np.maximum(guess, 1e-300))
+    first = np.log(np.maximum(guess, _ABSENT))
     begin = [first, first + np.array([-9.0, -9.0, 0.0])] if both_starts else [first]
     centre = np.log(_guess(mixed))
     flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else _FLAT
     bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
+    present = np.einsum("cbii->c", mixed.components) > 0
+    bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
     search = partial(minimize, _deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     fits = [search(np.clip(s, *np.array(bounds).T)) for s in begin]
     best = min(fits, key=lambda f: float(f.fun))
-    return at_variances(mixed, np.exp(best.x), G, prior)
+    return at_variances(mixed, np.where(present, np.exp(best.x), 0.0), G, prior)
 
 
 def at_variances(
@@ -92,7 +98,7 @@ def at_variances(
 ) -> VarianceFit:
     """The same without searching: mean, covariance and deviance for given variances (3,)."""
     problem = _problem(mixed, G, prior)
-    deviance, _ = _deviance(np.log(variances), problem)
+    deviance, _ = _deviance(np.log(np.maximum(variances, _ABSENT)), problem)
     V = mixed.covariance(variances)
     X = problem.X
     weighted = np.linalg.solve(V, np.concatenate([X, mixed.z[..., None]], axis=2))

@@ -10,8 +10,15 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
 from stitch.errors import InputError, NoResultError
+from stitch.integrity.admission import Admission
+from stitch.integrity.admitted_fit import admitted_fit
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import measurement_of
+from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.pipeline import add, run
+from stitch.stages.fitted import Fitted
+from stitch.stages.outlier_removal import FittedSession
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +84,11 @@ def test_labelled_points_with_exchanged_coordinates_are_refused():
     )
     with pytest.raises((InputError, NoResultError)):
         run(replace(session, views=views))
+
+
+def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
+    session, T_mount, _ = labelled_cell(0, views=12)
+    measurement = measurement_of(session, capture(session))
+    fitted = Fitted(Model(T_mount), [FittedSession(measurement, None, ())], [measurement.capture])
+    found = admitted_fit([session], [measurement], lambda sessions, measurements: fitted)
+    assert found.admissions == [Admission()] and found.sessions == [session]

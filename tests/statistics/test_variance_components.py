@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from stitch.statistics.variance_components import MixedModel, at_variances, fit_variances
 
@@ -43,3 +44,25 @@ def test_evidence_is_the_gaussian_integral():
         values.append(np.linalg.slogdet(K)[1] + np.linalg.slogdet(M)[1] + z[0] @ P @ z[0])
     assert with_G.deviance - plain.deviance == pytest.approx(values[1] - values[0], abs=1e-8)
     assert wide.deviance == plain.deviance
+
+
+def test_scatter_that_no_number_has_is_none():
+    """Without scatter of poses it is ordinary regression: (n − a) log λ + RSS/λ and the log-normal prior of the factor."""
+    rng = np.random.default_rng(2)
+    n, a = 40, 3
+    C = np.zeros((3, 1, n, n))
+    C[2, 0] = np.eye(n)
+    A, z = rng.standard_normal((1, n, a)), 2 * rng.standard_normal((1, n))
+    mean, (square,), *_ = np.linalg.lstsq(A[0], z[0], rcond=None)
+    own = minimize_scalar(
+        lambda x: (n - a) * x + square * np.exp(-x) + ((x - np.log(2)) / 1.5) ** 2,
+        bounds=(-5, 5),
+        options={"xatol": 1e-9},
+    )
+    found = fit_variances(MixedModel(z, A, C), both_starts=True)
+    assert found.variances[:2].tolist() == [0, 0]
+    assert found.variances[2] == pytest.approx(np.exp(own.x), rel=1e-4)
+    assert found.mean == pytest.approx(mean, rel=1e-9)
+    # Other columns are compared at the same constants.
+    more = fit_variances(MixedModel(z, A, C), A[..., :1] ** 2, np.ones(1), start=found.variances)
+    assert np.isfinite(more.deviance - found.deviance) and more.variances[:2].tolist() == [0, 0]
