@@ -13,9 +13,12 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     now, floor = (f"{x * to_um:.3g} µm" for x in (d.residual_rms, d.noise_floor))
     scatter = f"{d.translation * to_um:.3g} µm and {d.rotation * 1e6:.3g} µrad"
     if d.verdict == "adequate":
+        rest = (
+            f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {_judged_by(d, to_um)}"
+        )
         return (
-            f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}, and a pose "
-            f"repeatability of {scatter} (standard deviations) explains the rest, {_judged_by(d, to_um)}{_notes(d)}."
+            f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
+            f"{rest if _scatters(d) else ''}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
         return _missing(d, to_um, now, floor, second)
@@ -48,12 +51,20 @@ def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> 
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
     if not d.implausible:
-        return f"{start}{follows}the poses scatter by {scatter} otherwise{_notes(d)}{_lack(d)}."
+        otherwise = (
+            f"the poses scatter by {scatter} otherwise" if _scatters(d) else "what was seen does not show the poses"
+        )
+        return f"{start}{follows}{otherwise}{_notes(d)}{_lack(d)}."
     than = f"more than {_limits(d, to_um)} as stated" if d.scatter_limit.stated else "which no sound arm does"
     return (
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
         f"the same poses, so that those found on one object correct another{_notes(d)}{_lack(d)}."
     )
+
+
+def _scatters(d: Diagnosis) -> bool:
+    """True unless what was seen is the same wherever the poses are."""
+    return d.rotation > 0 or d.translation > 0
 
 
 def _judged_by(d: Diagnosis, to_um: float) -> str:

@@ -81,7 +81,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         heldout_rms=_number(document["heldout_rms"]),
         noise_floor=_number(document["noise_floor"]),
         fused=_fused(folder / "stitched.ply"),
-        repeatability=Repeatability(scatter["rotation"], scatter["translation"], float("nan")),
+        repeatability=Repeatability(_number(scatter["rotation"]), _number(scatter["translation"]), float("nan")),
         overlaps=overlaps,
         verdict=document["verdict"],
         ledger=state.ledger,

@@ -1,5 +1,7 @@
 """A run of labelled points read back from its folder."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from stitch.stored.load_state import load_state
 from stitch.stored.stored_run import stored_run
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
+from viz.run_page import write_report
 
 
 def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
@@ -30,3 +33,12 @@ def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
     assert again.targets.rms == pytest.approx(found.residual_rms, rel=1e-9)
     for same in (again, stitched(loaded, model_of(found))):
         np.testing.assert_array_equal(same.terms[0].sigmas, found.terms[0].sigmas)
+    # A scatter of the poses that nobody knows is no damage.
+    document = json.loads((tmp_path / "r" / "result.json").read_text())
+    document["repeatability"] = {"rotation": None, "translation": None}
+    (tmp_path / "r" / "result.json").write_text(json.dumps(document))
+    unknown = stored_run(tmp_path / "r", load_state(tmp_path / "r"))
+    assert np.isnan(unknown.repeatability.translation) and np.isnan(unknown.repeatability.rotation)
+    for told, shown in ((again, True), (unknown, False)):
+        write_report(told, tmp_path / "page.html")
+        assert ("Scatter of the robot" in (tmp_path / "page.html").read_text()) == shown

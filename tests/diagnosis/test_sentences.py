@@ -1,0 +1,27 @@
+"""The sentence says of the poses what was seen of them, and nothing where nothing was."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.sentences import sentence_of
+
+
+@pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
+def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
+    common = {
+        "verdict": verdict,
+        "residual_rms": 0.0132,
+        "noise_floor": 0.0142,
+        "notes": ("a note",),
+        "missing": {},
+        "depends_on": (),
+        "implausible": False,
+        "scatter_limit": ScatterLimit(2.5e-4, 0.12),
+    }
+    told = sentence_of(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
+    assert "20 µm and 20 µrad" in told and told.endswith("; a note.")
+    silent = sentence_of(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
+    assert "13.2 µm" in silent and "µrad" not in silent and "repeatability" not in silent
+    assert silent.endswith("; a note.")
