@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
@@ -9,21 +10,20 @@ from scipy.stats import chi2
 from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.deep_check import beyond_any_arm, contradicts, deep_check
+from stitch.integrity.deep_check import beyond_any_arm, contradicts, deep_check, judged_by_size
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
-from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
+from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
-from stitch.units import METRES
 
-# What the joints of an uncalibrated arm may displace single views by: 5 mrad, 2 mm.
-_ARM_ROTATION, _ARM_M = 5e-3, 2e-3
 # A hand-eye that differs by chance alone is refused once in a million.
 _CHANCE = 1e-6
 
@@ -50,8 +50,11 @@ class Admission:
         return [v for v, view in enumerate(session.views) if view.name in self.names]
 
 
-def admission(session: Session, correction: Correction, index: int) -> Admission:
+def admission(session: Session, measurement: Measurement, correction: Correction, index: int) -> Admission:
     """Examine the views of one session of a rig under a corrected model.
+
+    Args:
+        index: of the session in the rig.
 
     Raises:
         InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
@@ -60,7 +63,9 @@ def admission(session: Session, correction: Correction, index: int) -> Admission
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
         _require_own_model(session, correction, index)
-    found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index])
+    usual = partial(usual_twists, measurement, correction.model)
+    found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index], usual)
+    found = judged_by_size(session, found)
     if contradicts(session, found):
         refuse(session, deep_check(session))
         raise _unexplained(session, found)
@@ -72,10 +77,9 @@ def admission(session: Session, correction: Correction, index: int) -> Admission
     if apart is not None:
         raise NoResultError(f"{session.path}: {apart.line()}")
     out = _not_belonging(session, own, found, T_mount, problems)
-    within = _within_an_arm(session, found, problems)
     return Admission(
-        left_out=tuple(item for item in out if item.view not in within),
-        suspected=tuple(item for item in out if item.view in within),
+        left_out=out,
+        suspected=tuple(_suspect(session, own, m, T_mount) for m in found.suspected),
         links=_links(session, found),
     )
 
@@ -93,17 +97,10 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     return Admission()
 
 
-def _within_an_arm(session: Session, found: Snooping, problems: Sequence[Problem]) -> set[str]:
-    """Views that several displacements single out, none beyond what an uncalibrated arm may cause.
-
-    One such view among many is a blunder; several are what a systematic effect looks like, and leaving them out would
-    hide it from the diagnosis.
-    """
-    linked = [m for m in found.misplaced if m.kind == "displaced" and m.view not in found.linkage.unlinked]
-    explained = {name for problem in problems if problem.kind != "displaced" for name in problem.views}
-    small = [m for m in linked if m.rotation <= _ARM_ROTATION and m.distance * METRES[session.length_unit] <= _ARM_M]
-    names = {session.views[m.view].name for m in small} - explained
-    return names if len(names) > 1 else set()
+def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
+    name, scan = session.views[found.view].name, own.scans[found.view]
+    why = f"stands off by {found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
+    return LeftOut(name, why, own.poses(T_mount)[found.view], len(scan.points))
 
 
 def _beyond_any_slip(session: Session, found: Snooping) -> bool:

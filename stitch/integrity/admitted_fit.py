@@ -56,7 +56,7 @@ def admitted_fit(
 
 def _examined(session: Session, fitted: Fitted, index: int) -> Admission:
     if fitted.correction is not None:
-        return admission(session, fitted.correction, index)
+        return admission(session, fitted.sessions[index].measurement, fitted.correction, index)
     found = fitted.sessions[index].targets
     # What says nothing about the poses cannot say which of them are wrong.
     return Admission() if found is None else admission_of_targets(session, found)

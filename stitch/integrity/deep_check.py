@@ -1,15 +1,20 @@
 """`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
 
+from functools import partial
+
 from stitch.frames import Array
 from stitch.integrity.conventions import Explained, explained, verdict
 from stitch.integrity.linkage import only
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.relative_scans import relative_scans
-from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
+from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
+from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.thinning import thinned
 from stitch.stages.coarse import coarse
@@ -20,6 +25,8 @@ from stitch.units import METRES
 _POINTS = 8000
 # No arm scatters by more.
 _ROTATION, _TRANSLATION_M = 0.010, 0.005
+# No effect of an arm is believed to displace a single view by more than half of that.
+_VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 # A hand-eye from the scans' own motions is right within this share of the part's size, a stated one within the other.
 _GATE, _STATED_GATE = 0.15, 0.35
 _CLOSES = 0.5
@@ -60,7 +67,17 @@ def examined(session: Session, capture: Capture, found: list[Explained]) -> tupl
         start, gate = begun.T_mount, begun.gate
     T_mount, overlaps, _ = close_in([capture], start, [gate])
     freed = free_poses(capture, capture.poses(T_mount), overlaps[0].gate)
-    return T_mount, snoop(capture, T_mount, overlaps[0].gate, freed)
+    usual = partial(usual_twists, measurement_of(session, capture), Model(T_mount))
+    return T_mount, judged_by_size(session, snoop(capture, T_mount, overlaps[0].gate, freed, usual))
+
+
+def judged_by_size(session: Session, found: Snooping) -> Snooping:
+    """Suspected views that are off by more than what effects of an arm are believed to do are misplaced."""
+
+    def too_far(m: Misplaced) -> bool:
+        return m.rotation > _VIEW_ROTATION or m.distance * METRES[session.length_unit] > _VIEW_M
+
+    return found.settled(too_far)
 
 
 def contradicts(session: Session, found: Snooping) -> bool:

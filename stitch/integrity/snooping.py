@@ -5,8 +5,8 @@ closes, its pose is wrong and it is known by how much; where it closes nowhere, 
 view in its place, each one's own displacement is tested under the scatter of the others.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,6 +54,7 @@ class Snooping:
 
     linkage: Linkage  # at the poses that overlaps alone give, from the model's
     misplaced: tuple[Misplaced, ...]
+    suspected: tuple[Misplaced, ...]  # stand out, but usual effects of the arm would do that too
     block: Block | None
     disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
     model: ViewModel
@@ -71,6 +72,15 @@ class Snooping:
             out |= set(before if len(before) < len(after) else after)
         return tuple(sorted(out))
 
+    def settled(self, sure: Callable[[Misplaced], bool]) -> "Snooping":
+        """The same with those suspected views misplaced of which one is sure."""
+        misplaced = (*self.misplaced, *(m for m in self.suspected if sure(m)))
+        return replace(
+            self,
+            misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),
+            suspected=tuple(m for m in self.suspected if not sure(m)),
+        )
+
     @property
     def rotation(self) -> float:
         """Scatter of the flange poses without the blunders, rad."""
@@ -82,13 +92,20 @@ class Snooping:
         return float(np.sqrt(self.found.fit.variances[1]))
 
 
-def snoop(capture: Capture, T_mount: Array, gate: float, freed: FreePoses | None = None) -> Snooping:
+def snoop(
+    capture: Capture,
+    T_mount: Array,
+    gate: float,
+    freed: FreePoses | None = None,
+    usual: Callable[[FreePoses], Array] | None = None,
+) -> Snooping:
     """Examine the views of a capture under a hand-eye.
 
     Args:
         T_mount: (4, 4) corrected hand-eye.
         gate: distance between partners at which the correction ended, length_unit.
         freed: the views freed from there, if that is at hand.
+        usual: the twists (6V, P) that effects of the library may make; asked only where a view stands out.
 
     Raises:
         NoResultError: no two views overlap.
@@ -110,11 +127,29 @@ def snoop(capture: Capture, T_mount: Array, gate: float, freed: FreePoses | None
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
         for b in found.blunders
     ]
+    if misplaced and usual is not None:
+        sure = {b.view for b in find_blunders(model.with_usual(usual(freed)), homeless).blunders}
+        sure |= set(linked.unlinked)
+    else:
+        sure = {m.view for m in misplaced}
+    suspected = tuple(sorted((m for m in misplaced if m.view not in sure), key=lambda m: m.view))
+    misplaced = [m for m in misplaced if m.view in sure]
     groups = linkage(freed.overlaps).components
     misplaced += [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if _alone(v, groups)]
     groups = tuple(g for g in groups if not set(g) <= {m.view for m in misplaced if m.kind == "foreign"})
     misplaced.sort(key=lambda m: m.view)
-    return Snooping(linked, tuple(misplaced), found.block, groups, model, found, freed, tolerance, needed)
+    return Snooping(
+        linkage=linked,
+        misplaced=tuple(misplaced),
+        suspected=suspected,
+        block=found.block,
+        disconnected=groups,
+        model=model,
+        found=found,
+        freed=freed,
+        tolerance=tolerance,
+        needed=needed,
+    )
 
 
 def _alone(view: int, groups: Sequence[tuple[int, ...]]) -> bool:

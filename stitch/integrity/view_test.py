@@ -7,7 +7,7 @@ non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, T
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -36,6 +36,13 @@ class ViewModel:
     noise: Array  # (n, n) covariance of the sensor noise within overlaps
     centre: Array  # (3,) reference frame
     lever: float  # length_unit: rotations about `centre` count as displacements at this distance
+    usual: Array | None = None  # (n, n) covariance of what effects of the library may do
+
+    def with_usual(self, twists: Array) -> "ViewModel":
+        """The model of an arm that may have effects: twists (6V, P) of the views about the centre, rad and length."""
+        unit = np.array([self.lever] * 3 + [1.0] * 3)
+        columns = np.einsum("vni,vip->np", self.views, twists.reshape(self.count, 6, -1) * unit[:, None])
+        return replace(self, usual=columns @ columns.T)
 
     @property
     def count(self) -> int:
@@ -48,7 +55,8 @@ class ViewModel:
         blocks = self.views @ self.carried
         rotation, translation = (np.einsum("vni,vmi->nm", b, b) for b in (blocks[:, :, :3], blocks[:, :, 3:]))
         components = np.array([rotation, translation, self.noise])[:, None]
-        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], components)
+        usual = None if self.usual is None else self.usual[None]
+        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], components, usual)
 
     def fit(self, further: Array | None = None) -> VarianceFit:
         """Scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""

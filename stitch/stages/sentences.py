@@ -94,10 +94,10 @@ def view_notes(
     told = [f"View {item.view} does not belong and was left out: {item.why}." for item in left_out]
     told += [f"View {item.view} does not belong and was kept as asked: {item.why}." for item in kept]
     if suspected:
-        names = ", ".join(item.view for item in suspected)
+        names = "; ".join(f"{item.view} {item.why}" for item in suspected)
         told.append(
-            f"Views {names} stand out from the others by more than chance, but by no more than an effect of the arm "
-            "may cause: they are fused; diagnose before leaving any out."
+            f"More than chance, but no more than effects of the arm may do: {names}. Fused all the same: diagnose, and "
+            "look at these scans."
         )
     return tuple(told)
 
