@@ -1,6 +1,8 @@
 """What `stitch check --deep` and data snooping find in sessions with one mistake, and in sessions without any.
 
-Usage: python bench/integrity.py good|sizes|kinds FILE [--seeds 0 5] [--minutes 30] [--every 6]
+Usage: python bench/integrity.py good|sizes|kinds|real FILE [--seeds 0 5] [--minutes 30] [--every 6]
+
+`real` puts mistakes into measured scans (folder in STITCH_SHARED_DATA), and runs them too.
 
 Rows are appended to FILE (a JSON line each) as they come; what stands there already is not computed again.
 Seeds 0 to 99 were used while the code was written, 1000 and above are run once.
@@ -8,6 +10,7 @@ Seeds 0 to 99 were used while the code was written, 1000 and above are run once.
 
 import argparse
 import json
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -32,6 +35,8 @@ from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
+from stitch.pipeline import run
+from stitch.reading.session_folder import load_session
 from stitch.stages.correct import close_in
 from stitch.system.threads import library_threads_off
 
@@ -41,6 +46,20 @@ PARTS: dict[str, dict[str, Any]] = {
     "sphere_plate": {},
 }
 MOUNTS = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
+REAL = (
+    "two exchanged",
+    "shifted by 1",
+    "reversed",
+    "inverse",
+    "mount",
+    "euler ZYX as xyz",
+    "euler XYZ as ZYX",
+    "euler xyz as XYZ",
+    "poses in inches",
+    "poses in m",
+    "clouds scaled 1.0254",
+    "clouds mirrored",
+)
 VIEWS, RAYS = 14, 120
 # Effects that a model may lack while a session is good: they must not cost it a view.
 _HIDDEN: tuple[dict[str, float], ...] = (
@@ -125,6 +144,25 @@ def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, in
             yield {"case": case} | judged(fault.apply(session), fault)
 
 
+def real(folder: Path, done: set[tuple[str, str]]) -> Iterator[dict[str, Any]]:
+    """Measured scans with mistakes in their conventions: what is said, and whether a run ends as if all were well."""
+    for part in sorted(f.name for f in folder.iterdir() if (f / "session.toml").exists()):
+        session = load_session(folder / part)
+        table = {"nothing": Fault(lambda s: s, ())} | faults(len(session.views), np.random.default_rng(9))
+        for case in ("nothing", *REAL):
+            if (part, case) in done:
+                continue
+            wrong = table[case].apply(session)
+            try:
+                found = run(wrong)
+                ended = f"ran, left out {', '.join(item.view for item in found.left_out) or 'none'}"
+            except StitchError as error:
+                ended = f"refused: {str(error).split(': ', 1)[1]}"
+            yield {"part": part, "mount": session.mount, "seed": 0, "case": case, "ended": ended} | judged(
+                wrong, table[case]
+            )
+
+
 def judged(session: Session, fault: Fault) -> dict[str, Any]:
     """What the deep check says of a session with a mistake."""
     start = time.perf_counter()
@@ -141,10 +179,16 @@ def judged(session: Session, fault: Fault) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def append(file: Path, row: dict[str, Any]) -> None:
+    """One line more."""
+    with file.open("a") as out:
+        out.write(json.dumps(row, default=float) + "\n")
+
+
 def main() -> None:
     """Run one part of the bench."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("good", "sizes", "kinds"))
+    parser.add_argument("what", choices=("good", "sizes", "kinds", "real"))
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1))
     parser.add_argument("--minutes", type=float, default=30)
@@ -156,6 +200,11 @@ def main() -> None:
     end = time.monotonic() + 60 * given.minutes
     rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
     done = {(r["part"], r["mount"], r["seed"], r["case"]) for r in rows}
+    if given.what == "real":
+        folder = Path(os.environ["STITCH_SHARED_DATA"]) / "reghec"
+        for row in real(folder, {(part, case) for part, _, _, case in done}):
+            append(given.file, row)
+        return
     cells = [(p, m, s) for s in range(*given.seeds) for p in PARTS for m in MOUNTS]
     for number, (part, mount, seed) in enumerate(cells):
         cases = {case for p, m, s, case in done if (p, m, s) == (part, mount, seed)}
@@ -167,8 +216,7 @@ def main() -> None:
             else globals()[given.what](part, mount, seed)
         )
         for row in found:
-            with given.file.open("a") as file:
-                file.write(json.dumps({"part": part, "mount": mount, "seed": seed} | row, default=float) + "\n")
+            append(given.file, {"part": part, "mount": mount, "seed": seed} | row)
             if time.monotonic() > end:
                 return
 

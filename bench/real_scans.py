@@ -13,12 +13,11 @@ from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import capture, part_size
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import part_size
 from stitch.stages.correct import correct
 from stitch.stages.register import register
 

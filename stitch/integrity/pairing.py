@@ -97,7 +97,7 @@ def _exchange(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence
 
 def _single(
     session: Session, capture: Capture, T_mount: Array, found: Snooping, m: Misplaced, same: Sequence[tuple[int, int]]
-) -> Problem:  # fmt: skip
+) -> Problem:
     names = [view.name for view in session.views]
     own = (names[m.view],)
     fault = _fault(capture, T_mount, found, m)
@@ -119,8 +119,8 @@ def _single(
     if digit is not None:
         joint_name, stated, fits, neighbour = digit
         kind = "joint_row" if neighbour else "displaced"
-        return Problem(kind, own, f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit ({amount} off): "
-                       "correct it or leave the view out")  # fmt: skip
+        reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit ({amount} off)"
+        return Problem(kind, own, f"{reads}: correct it or leave the view out")
     return Problem("displaced", own, f"its pose is off by {amount}: correct the row, scan again or leave the view out")
 
 

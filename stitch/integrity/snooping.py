@@ -5,7 +5,7 @@ closes, its pose is wrong and it is known by how much; where it closes nowhere, 
 view in its place, each one's own displacement is tested under the scatter of the others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,26 +14,14 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.blunders import Block, Found, find_blunders
 from stitch.integrity.linkage import Linkage, linkage
-from stitch.integrity.placing import (
-    Placement,
-    judge,
-    place,
-    shows_no_surface,
-    starts_about,
-    starts_anywhere,
-    surface_of,
-)
+from stitch.integrity.placing import judge, place, surface_of
+from stitch.integrity.unlinked_views import needed_closure, placed_views
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 
 # On the surface of the others: four robust sigmas of the overlaps.
 _TOLERANCE_SIGMAS = 4.0
-# A placement is right if at least this share of what linked views have on the others' surface lies on it. Right ones
-# have 0.9 to 1 of it, scans of other parts up to 0.35, scaled by 2.5 % up to 0.7.
-_ACCEPTED = 0.8
-# Views that cannot be seen to belong: the smallest share of a linked view that counts for that comparison.
-_FEW_SHARED = 0.1
 
 
 @dataclass(frozen=True)
@@ -114,8 +102,8 @@ def snoop(
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
     linked = linkage(freed.overlaps)
     tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
-    needed = _ACCEPTED * _usual(capture, freed.poses, linked.core, tolerance) if linked.unlinked else _ACCEPTED
-    placed, homeless = _placed(capture, model_poses, freed, linked, (tolerance, needed))
+    needed = needed_closure(capture, freed.poses, linked, tolerance)
+    placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
     if placed:
         poses = np.array(freed.poses)
         for v, placement in placed.items():
@@ -123,66 +111,29 @@ def snoop(
         freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
     model = view_model(capture, T_mount, freed)
     found = find_blunders(model, homeless)
-    misplaced = [
+    standing_out = [
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
-        for b in found.blunders
+        for b in sorted(found.blunders, key=lambda b: b.view)
     ]
-    if misplaced and usual is not None:
-        sure = {b.view for b in find_blunders(model.with_usual(usual(freed)), homeless).blunders}
-        sure |= set(linked.unlinked)
-    else:
-        sure = {m.view for m in misplaced}
-    suspected = tuple(sorted((m for m in misplaced if m.view not in sure), key=lambda m: m.view))
-    misplaced = [m for m in misplaced if m.view in sure]
+    sure = {m.view for m in standing_out}
+    if sure and usual is not None:
+        again = find_blunders(model.with_usual(usual(freed)), homeless)
+        sure &= {b.view for b in again.blunders} | set(linked.unlinked)
     groups = linkage(freed.overlaps).components
-    misplaced += [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if _alone(v, groups)]
-    groups = tuple(g for g in groups if not set(g) <= {m.view for m in misplaced if m.kind == "foreign"})
-    misplaced.sort(key=lambda m: m.view)
+    foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
+    misplaced = [m for m in standing_out if m.view in sure] + foreign
     return Snooping(
         linkage=linked,
-        misplaced=tuple(misplaced),
-        suspected=suspected,
+        misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),
+        suspected=tuple(m for m in standing_out if m.view not in sure),
         block=found.block,
-        disconnected=groups,
+        disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
         found=found,
         freed=freed,
         tolerance=tolerance,
         needed=needed,
     )
-
-
-def _alone(view: int, groups: Sequence[tuple[int, ...]]) -> bool:
-    return (view,) in groups
-
-
-def _placed(
-    capture: Capture, model_poses: Array, freed: FreePoses, linked: Linkage, limits: tuple[float, float]
-) -> tuple[dict[int, Placement], list[int]]:
-    """Where the views outside the core belong, and those that belong nowhere; the core grows as they are placed."""
-    core, waiting, placed = list(linked.core), list(linked.unlinked), dict[int, Placement]()
-    if not waiting or len(core) < 2:
-        return placed, waiting
-    (tolerance, needed), size, poses = limits, part_size([capture]), np.array(freed.poses)
-    while waiting:
-        surface = surface_of(capture.scans, poses, core, tolerance)
-        new = {}
-        for v in waiting:
-            scan = capture.scans[v]
-            if shows_no_surface(scan):
-                continue
-            starts = [starts_about(model_poses[v], scan, size), model_poses, starts_anywhere(surface, scan)]
-            best = place(scan, surface, np.concatenate(starts), size)[0]
-            if best.closure > needed and best.near > _FEW_SHARED:
-                new[v] = best
-        if not new:
-            break
-        for v, placement in new.items():
-            poses[v] = placement.T
-        placed |= new
-        core += list(new)
-        waiting = [v for v in waiting if v not in new]
-    return placed, waiting
 
 
 def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:
@@ -193,18 +144,6 @@ def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) ->
     return (
         best.T if best.closure > judge(capture.scans[view], freed.poses[view], surface).closure else freed.poses[view]
     )
-
-
-def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:
-    """Median closure of linked views on the surface of the other ones."""
-    some = core[:: max(len(core) // 6, 1)]
-    closures = [
-        judge(
-            capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)
-        ).closure
-        for v in some
-    ]
-    return float(np.median(closures))
 
 
 def _misplaced(capture: Capture, T_model: Array, T: Array, view: int, p_value: float) -> Misplaced:

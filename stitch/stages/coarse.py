@@ -9,23 +9,26 @@ between all views that ought to meet. Objects without features (sphere, cone, pl
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.scan import sparse
-from stitch.observations.surfaces.match import sample, search
 from stitch.stages.correct import close_in, tightened
 from stitch.stages.initial_guess.centroids import centroid_hand_eyes, scanner_centre
+from stitch.stages.initial_guess.hand_eye_candidates import (
+    SEARCH_SAMPLES,
+    Candidate,
+    consistency,
+    distinct,
+    same_answer,
+)
 from stitch.stages.initial_guess.relative_motion import motion_candidates
-from stitch.system.threads import parallel
 
-_SEARCH_SAMPLES = 120
 _SEARCH_POINTS = 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
 _UNTIL_THEY_MEET, _AFTERWARDS = 4, 3
@@ -36,18 +39,6 @@ STATED, REUSED = "given in session.toml", "of another run, used as it is"
 _SCORE_SHARE = 0.05
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
-# Two candidates are the same answer if they place the part within this share of its size.
-_SAME_SHARE = 0.03
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One hand-eye that was tried: its origin and how well all views fall together."""
-
-    source: str
-    T_mount: Array  # (4, 4) after closing in
-    score: float  # length_unit, lower is better
-    reached: int = 1  # starts that ended here
 
 
 @dataclass(frozen=True)
@@ -90,8 +81,8 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
-    distinct = _distinct(captures, tried, size)
-    return Coarse(distinct[0].T_mount, 0.2 * size, distinct[0].source, tuple(distinct))
+    answers = distinct(captures, tried, size)
+    return Coarse(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
 
 
 def _starts(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
@@ -111,7 +102,7 @@ def _starts(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]
     motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
     kept: list[tuple[str, Array]] = []
     for name, T in motions:
-        if all(_separation(captures, size, T, other) > _SAME_SHARE * size for _, other in kept):
+        if not any(same_answer(captures, size, T, other) for _, other in kept):
             kept.append((name, T))
     return starts + kept
 
@@ -133,7 +124,7 @@ def _closed(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], si
         half = _close(light, start, [COARSE_GATE * size] * len(captures), _UNTIL_THEY_MEET)
         if half is None:
             continue
-        same = [sources for sources, T, _ in met if _separation(captures, size, half[0], T) < _SAME_SHARE * size]
+        same = [sources for sources, T, _ in met if same_answer(captures, size, half[0], T)]
         if same:
             same[0].append(source)
         else:
@@ -151,53 +142,7 @@ def _close(
 ) -> tuple[Array, list[float]] | None:
     """Close in by some steps: hand-eye and the gates to go on with; None if no views overlap."""
     try:
-        T_mount, overlaps, _ = close_in(captures, T_mount, gates, samples=_SEARCH_SAMPLES, maximum=steps)
+        T_mount, overlaps, _ = close_in(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
     except NoResultError:
         return None
     return T_mount, tightened(captures, overlaps)
-
-
-def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
-    """Root mean square distance of points to every other view, truncated at `limit`.
-
-    Views that fail to meet count with the limit, so falling apart cannot pay.
-    """
-    squares: list[float] = []
-    for c in captures:
-        poses = c.poses(T_mount)
-        picked = [sample(scan, _SEARCH_SAMPLES) for scan in c.scans]
-        pairs = [(v, w) for v, w in permutations(range(len(c.scans)), 2) if len(picked[v])]
-
-        def mean_square(
-            pair: tuple[int, int], c: Capture = c, poses: Array = poses, picked: list[Indices] = picked
-        ) -> float:
-            v, w = pair
-            distance, _, facing = search(c.scans[v], c.scans[w], picked[v], poses[v], poses[w], limit)
-            return float(np.mean(np.where(facing, distance, limit) ** 2))
-
-        squares += parallel(mean_square, pairs)
-    return float(np.sqrt(np.mean(squares)))
-
-
-def _distinct(captures: Sequence[Capture], tried: Sequence[Candidate], size: float) -> list[Candidate]:
-    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
-    groups: list[list[Candidate]] = []
-    for candidate in tried:
-        for group in groups:
-            if _separation(captures, size, candidate.T_mount, group[0].T_mount) < _SAME_SHARE * size:
-                group.append(candidate)
-                break
-        else:
-            groups.append([candidate])
-    best = [
-        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=sum(c.reached for c in group))
-        for group in groups
-    ]
-    return sorted(best, key=lambda c: c.score)
-
-
-def _separation(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> float:
-    """Largest displacement of the scans' mean centroid box between two hand-eyes."""
-    centre = scanner_centre(captures)
-    corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
-    return float(np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1).max())

@@ -12,7 +12,7 @@ from stitch.diagnosis.score import Score
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.measurement import Measurement
-from stitch.measurement.views import torques_of
+from stitch.measurement.torques import torques_of
 from stitch.model.forward import moves_points, perturbed_frames
 from stitch.model.jacobian import twists
 from stitch.model.model import Model

@@ -1,0 +1,76 @@
+"""Views outside the largest component, tried wide: where on the surface of the linked ones they belong, if anywhere."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.integrity.linkage import Linkage
+from stitch.integrity.placing import (
+    Placement,
+    judge,
+    place,
+    shows_no_surface,
+    starts_about,
+    starts_anywhere,
+    surface_of,
+)
+from stitch.measurement.capture import Capture, part_size
+from stitch.observations.surfaces.free_poses import FreePoses
+
+# A placement is right if at least this share of what linked views have on the others' surface lies on it. Right ones
+# have 0.9 to 1 of it, scans of other parts up to 0.35, scaled by 2.5 % up to 0.7.
+_ACCEPTED = 0.8
+# Views that cannot be seen to belong: the smallest share of a linked view that counts for that comparison.
+_FEW_SHARED = 0.1
+
+
+def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
+    """Share of a scan on the surface of the others at which it counts as placed."""
+    return _ACCEPTED * _usual(capture, poses, linked.core, tolerance) if linked.unlinked else _ACCEPTED
+
+
+def placed_views(
+    capture: Capture, model_poses: Array, freed: FreePoses, linked: Linkage, limits: tuple[float, float]
+) -> tuple[dict[int, Placement], list[int]]:
+    """Where the views outside the core belong, and those that belong nowhere; the core grows as they are placed.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        limits: distance from the surface that still lies on it, length_unit, and the closure needed.
+    """
+    core, waiting, placed = list(linked.core), list(linked.unlinked), dict[int, Placement]()
+    if not waiting or len(core) < 2:
+        return placed, waiting
+    (tolerance, needed), size, poses = limits, part_size([capture]), np.array(freed.poses)
+    while waiting:
+        surface = surface_of(capture.scans, poses, core, tolerance)
+        new = {}
+        for v in waiting:
+            scan = capture.scans[v]
+            if shows_no_surface(scan):
+                continue
+            starts = [starts_about(model_poses[v], scan, size), model_poses, starts_anywhere(surface, scan)]
+            best = place(scan, surface, np.concatenate(starts), size)[0]
+            if best.closure > needed and best.near > _FEW_SHARED:
+                new[v] = best
+        if not new:
+            break
+        for v, placement in new.items():
+            poses[v] = placement.T
+        placed |= new
+        core += list(new)
+        waiting = [v for v in waiting if v not in new]
+    return placed, waiting
+
+
+def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:
+    """Median closure of linked views on the surface of the other ones."""
+    some = core[:: max(len(core) // 6, 1)]
+    closures = [
+        judge(
+            capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)
+        ).closure
+        for v in some
+    ]
+    return float(np.median(closures))
