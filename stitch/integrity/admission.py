@@ -13,6 +13,7 @@ from stitch.frames import Array
 from stitch.integrity.deep_check import beyond_any_arm, contradicts, deep_check, judged_by_size
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
+from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import usual_twists
@@ -69,6 +70,9 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     if contradicts(session, found):
         refuse(session, deep_check(session))
         raise _unexplained(session, found)
+    size = length_problem(found.model, own.T_reference_mount)
+    if size is not None:
+        refuse(session, [size])
     if found.block is not None and not _beyond_any_slip(session, found):
         # A slip of the part, or a knock of the mount, within what a model can hold: the diagnosis names it.
         found = replace(found, block=None)

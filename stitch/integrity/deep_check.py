@@ -8,6 +8,7 @@ from stitch.integrity.linkage import only
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.relative_scans import relative_scans
+from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import usual_twists
@@ -46,6 +47,9 @@ def deep_check(session: Session) -> list[Problem]:
     if named and named[0].hypothesis.kind != "exchanged":
         return [_convention(session, named)]
     T_mount, snooped = examined(session, capture, found)
+    size = length_problem(snooped.model, capture.T_reference_mount)
+    if size is not None:
+        return [size]
     problems = explain(session, capture, T_mount, snooped)
     if contradicts(session, snooped) and not any(p.kind == "disconnected" for p in problems):
         if named:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from stitch.system.exchange import exchange
 from stitch.system.locks import only_writer
+from stitch.system.whole_file import to_disk
 
 Ours = Callable[[Path], bool]  # True for a path, relative to the folder, that may go
 _COMMIT = ".stitch-commit"
@@ -53,6 +54,7 @@ def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
         try:
             yield scratch
             scratch.chmod(0o777 & ~_umask())
+            to_disk(scratch)
             _commit(scratch, path, ours)
         except OSError as error:
             # The scratch folder is gone when somebody reads this.

@@ -13,6 +13,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.integrity.admission import Admission
 from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture
+from stitch.measurement.cloud import Cloud
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
@@ -58,6 +59,14 @@ def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
     # Few points a view: the amount is known to a twentieth.
     amount = float(found.left_out[0].why.split("off by ")[1].split(" mm")[0])
     assert amount == pytest.approx(5.0, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0254, 0.97])
+def test_scans_of_another_scale_are_refused_though_they_fit_each_other(good, factor):
+    views = [replace(v, cloud=Cloud(v.cloud.points * factor)) for v in good.views]
+    with pytest.raises(InputError, match="times as large") as refused:
+        run(replace(good, views=tuple(views)))
+    assert float(str(refused.value).split("clouds are ")[1].split()[0]) == pytest.approx(factor, abs=2e-3)
 
 
 def test_poses_that_contradict_all_scans_are_refused(good):

@@ -65,6 +65,15 @@ def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
         assert run.stat().st_ino == before, "who stands in it must not stand in a folder that is gone"
 
 
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="names of open files are read from /proc")
+def test_what_is_new_is_on_the_disk_before_it_takes_its_place(run, monkeypatch):
+    seen = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: seen.append(os.readlink(f"/proc/self/fd/{descriptor}")))
+    monkeypatch.setattr(whole_folder, "exchange", lambda *_: bool(seen.append("exchanged")))
+    rewrite(run)
+    assert any(name.endswith("/model") for name in seen[: seen.index("exchanged")])
+
+
 def test_a_block_that_fails_changes_nothing(run, tmp_path):
     before = contents(run)
     with pytest.raises(OSError, match="disk full") as error, rewritten(run, ours) as scratch:

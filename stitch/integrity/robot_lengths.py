@@ -1,0 +1,26 @@
+"""Do scanner and robot count lengths alike? The part would come out whole but of the wrong size, and fit itself."""
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.integrity.problems import Problem
+from stitch.integrity.view_test import ViewModel, projector, test
+
+# No scanner in use is off by this share of its lengths, and no arm.
+_SCALE = 0.01
+_CHANCE = 1e-6
+
+
+def length_problem(model: ViewModel, T_reference_mount: Array) -> Problem | None:
+    """The robot's lengths, tested as one factor on all its translations; None if they agree with the scans'.
+
+    Args:
+        T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
+    """
+    column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
+    found = test(projector(model, model.fit(column)), column)
+    share = float(found.estimate[0])
+    if abs(share) < _SCALE or found.p_value > _CHANCE:
+        return None
+    fix = f"the clouds are {1 + share:.4f} times as large as the robot's motions say: check their scale"
+    return Problem("scale", (), fix)
