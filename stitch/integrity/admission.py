@@ -141,7 +141,7 @@ def _unexplained(session: Session, found: Snooping) -> NoResultError:
 
 def refuse(session: Session, problems: Sequence[Problem]) -> None:
     """Raise what a deep check found; nothing where it found nothing certain."""
-    for problem in problems:
+    for problem in (p for p in problems if p.certain):
         kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
         raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
 

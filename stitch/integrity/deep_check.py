@@ -55,7 +55,7 @@ def deep_check(session: Session) -> list[Problem]:
         if named:
             return [_convention(session, named)]
         problems.append(_unexplained(session, snooped))
-    return problems
+    return problems + [_suspected(session, m) for m in snooped.suspected]
 
 
 def examined(session: Session, capture: Capture, found: list[Explained]) -> tuple[Array, Snooping]:
@@ -102,6 +102,12 @@ def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
     fix = fixes[0] + (f"; as likely: {'; '.join(fixes[1:3])}" if len(fixes) > 1 else "")
     names = [view.name for view in session.views]
     return Problem(best.kind, tuple(only(best.rows, names)), fix)
+
+
+def _suspected(session: Session, found: Misplaced) -> Problem:
+    amount = f"{found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
+    fix = f"stands off by {amount}, as effects of an arm may do too: run and diagnose, and look at this scan"
+    return Problem("displaced", (session.views[found.view].name,), fix, certain=False)
 
 
 def _unexplained(session: Session, found: Snooping) -> Problem:
