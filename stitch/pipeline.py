@@ -8,13 +8,11 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
-from stitch.frames import Array
 from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
 from stitch.model.bound import in_unit
-from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
@@ -113,13 +111,8 @@ def diagnose(run: Run | State) -> Diagnosis:
     return diagnose_state(state_of(run) if isinstance(run, Run) else run)
 
 
-def change(
-    state: State, effects: Sequence[str], recorder: Recorder | None = None, poses_before: Array | None = None
-) -> Run:
+def change(state: State, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
     """The run with these effects in its model: hand-eye and all effects fitted together, matched anew.
-
-    Args:
-        poses_before: (V, 4, 4) T_reference_scanner to compare with; default those of the model before.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.
@@ -139,15 +132,12 @@ def change(
         before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = kind.refit([session], [measurement], model, [state.gate])
-        if poses_before is None:
-            poses_before = corrected(measurement, state.model).poses(state.model.T_mount)
         end = End(
             begun=begun,
             fitted=fitted,
             seconds=clock.lap(),
             effects_file=state.effects_file,
             ledger=state.ledger,
-            poses_before=poses_before,
             left_out=state.left_out,
             links=state.links,
         )

@@ -1,8 +1,9 @@
 """One line under every figure: what to read from it."""
 
-MAPS = (
-    "Rms distance between neighbouring views on the part, looked at along its thinnest axis; one colour scale for "
-    "both. What register takes away was an error of single poses; what stays is noise or shape."
+FIELD = (
+    "Per place of the part, how far each view puts the surface from where the others put it, averaged over a patch so "
+    "that the scanner's noise is gone. What fades from one step to the next is what that step explained. Grey: seen by "
+    "one view only. Drag to turn, click and scroll to come closer."
 )
 CONVERGENCE = "Near the dashed line only the scanner's own noise remains; further iterations bring nothing."
 PER_VIEW = (
@@ -13,7 +14,6 @@ WATERFALL = (
     "An effect earns its place if the bar of the views left out falls too; the dashed line is what the sensor's "
     "noise alone would leave."
 )
-CHANGE = "The same correspondences with one colour scale: where the right map is darker, the change has helped."
 BUDGET = "Shares of the mean square: what noise explains, what the named effects explain, and the rest."
 CANDIDATES = (
     "Log Bayes factor: to the right of zero an effect explains more than its parameters cost; 3 is odds of 20 to 1. "

@@ -2,6 +2,7 @@
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -12,8 +13,11 @@ BLUE, ORANGE, GREEN, DARK = "#0072B2", "#D55E00", "#009E73", "#707070"
 UNSEEN = (160, 160, 160)
 # Blue–white–red: below, at and above the surface of the other views.
 SIGNED = "RdBu_r"
-# Dark to bright: how far the views disagree.
-UNSIGNED = "viridis"
+# Grey to dark red: how far the views disagree; light grey is the part itself.
+FIELD = "stitch_field"
+_OF_FIELD = ["#e3e6ea", "#f7e3a1", "#fdb24f", "#f4722b", "#cf2a1e", "#7d0a1c"]
+if FIELD not in colormaps:
+    colormaps.register(LinearSegmentedColormap.from_list(FIELD, _OF_FIELD))
 
 
 def view_colours(count: int) -> NDArray[np.uint8]:
@@ -28,8 +32,8 @@ def signed_colours(values: Array, limit: float) -> NDArray[np.uint8]:
 
 
 def unsigned_colours(values: Array, limit: float) -> NDArray[np.uint8]:
-    """(N, 3) for distances ≥ 0; brightest at `limit`, grey where NaN."""
-    return _mapped(UNSIGNED, np.asarray(values) / max(limit, 1e-12), values)
+    """(N, 3) for distances ≥ 0; darkest at `limit`, grey where NaN."""
+    return _mapped(FIELD, np.asarray(values) / max(limit, 1e-12), values)
 
 
 def _mapped(name: str, share: Array, values: Array) -> NDArray[np.uint8]:

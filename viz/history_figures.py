@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from stitch.comparison.model_history import change_of
 from stitch.runs.run import LedgerStep
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN
@@ -21,16 +22,7 @@ def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
         axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
     floors = np.array([s.noise_floor * um for s in ledger])
     axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
-    axes.set_xticks(place, [change_of(ledger, i) for i in place])
+    axes.set_xticks(place, [change_of(ledger, i).replace(", ", "\n") for i in place])
     axes.set_ylabel("rms between views (µm)")
     above(axes)
     return plain(figure)
-
-
-def change_of(ledger: tuple[LedgerStep, ...], i: int) -> str:
-    """What step i brought or took: + joint_compliance."""
-    if i == 0:
-        return ", ".join(ledger[0].effects) or "hand-eye alone"
-    new = [f"+ {e}" for e in ledger[i].effects if e not in ledger[i - 1].effects]
-    gone = [f"− {e}" for e in ledger[i - 1].effects if e not in ledger[i].effects]
-    return "\n".join([*new, *gone]) or "fitted again"

@@ -13,7 +13,6 @@ from stitch.units import MICROMETRES
 from viz.blueprint import blueprint
 from viz.colours import robust_limit, signed_colours, unsigned_colours, view_colours
 from viz.history_figures import waterfall
-from viz.maps import change_maps, residual_maps
 from viz.page_parts import png_bytes
 from viz.rrd_file import RecordingFile
 from viz.run_figures import shown_points, view_shifts
@@ -100,7 +99,7 @@ class RerunRecorder:
         rec.log("views/correction_um", rr.BarChart(shift), static=True)
         rec.log("verdict", rr.TextDocument(run_markdown(run), media_type=rr.MediaType.MARKDOWN), static=True)
         self._history(run)
-        rec.send_blueprint(blueprint(changed=run.poses_before is not None))
+        rec.send_blueprint(blueprint())
         self.file.write()
 
     def _sticks(self, run: Run) -> None:
@@ -117,10 +116,6 @@ class RerunRecorder:
     def _history(self, run: Run) -> None:
         """The waterfall of the error, and the maps of the part before and after the last change."""
         pictures = {"waterfall": waterfall(run.ledger, run.session.length_unit)}
-        if run.overlaps is not None:
-            pictures["register"] = residual_maps(run)
-            if run.poses_before is not None:
-                pictures["change"] = change_maps(run)
         for name, figure in pictures.items():
             self.recording.log(f"history/{name}", encoded(figure), static=True)
 

@@ -16,8 +16,9 @@ from stitch.units import MICROMETRES
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.blueprint import diagnosis_blueprint
+from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
 from viz.comparison_figures import comparison
-from viz.page_parts import render, svg_address, svg_text
+from viz.page_parts import render, script_json, svg_address, svg_text
 from viz.rrd_file import RecordingFile
 
 # Candidate effects in the table of the page.
@@ -28,10 +29,14 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     """Section of report.html, pictures/*.svg and *.png, diagnosis.rrd."""
     pictures = _pictures(found, state.session.length_unit)
     addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
+    unit, fields = state.session.length_unit, candidate_fields(found)
+    lacking = sorted({need for needs in found.missing.values() for need in needs})
     html = render(
         "diagnosis.html.j2",
         found=found,
-        rows=_rows(found, MICROMETRES[state.session.length_unit]),
+        rows=_rows(found, fields, MICROMETRES[unit]),
+        field=None if fields is None else script_json(packed_candidates(fields, unit)),
+        lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
         unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
         pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
     )
@@ -58,9 +63,10 @@ def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     }
 
 
-def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
+def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[dict[str, str]]:
     """The best candidate effects that these views can show."""
     shown = [s for s in found.candidates if s.ranked.score.observable][:_SHOWN]
+    on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
     return [
         {
             "name": s.name,
@@ -69,6 +75,7 @@ def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
             "amounts": amounts_of(s.ranked),
             "rms_if_added": _rms(found, s, "inside", um),
             "heldout": _rms(found, s, "heldout", um),
+            "on_part": on_part.get(s.name, "–"),
             "aliases": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2]),
         }
         for s in shown

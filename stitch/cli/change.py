@@ -11,6 +11,8 @@ from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.cli.run import recorder_for
 from stitch.cli.streams import emit
+from stitch.comparison.model_history import model_history
+from stitch.comparison.plain_verdict import plain_verdict
 from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
 from stitch.effects.in_session import known, require
 from stitch.errors import InputError
@@ -65,7 +67,7 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
                 before = replace(state_of(result), ledger=result.ledger[:-1])
-                result = change(before, result.effects, recorder_for(scratch, recording), result.poses_before)
+                result = change(before, result.effects, recorder_for(scratch, recording))
             run_folder.write_with_page(result, scratch)
         _show(result, as_json)
     elif as_json:
@@ -117,6 +119,8 @@ def show_ledger(result: Run) -> None:
         numbers = (f"{x * to_um:.1f}" for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
         table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
     terminal.print(table)
+    if (history := model_history(result)) is not None:
+        terminal.print(plain_verdict(history, result.session.length_unit), soft_wrap=True, style="bold")
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
             known_to = f"± {p.sigma:.1g}" if p.fitted else "(explains most)"

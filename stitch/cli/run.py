@@ -8,9 +8,11 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from stitch.cli.options import EffectsFile, Force, Json, Trust
+from stitch.cli.options import EffectsFile, Force, Json, Tolerance, Trust, require_tolerance
 from stitch.cli.progress import Progress, Tee
 from stitch.cli.streams import emit
+from stitch.comparison.model_history import model_history
+from stitch.comparison.plain_verdict import plain_verdict
 from stitch.effects.in_session import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
@@ -45,9 +47,11 @@ def run(
     keep: Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")] = False,
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
+    tolerance: Tolerance = None,
     as_json: Json = False,
 ) -> None:
     """Find and correct the hand-eye, register the views, fuse them."""
+    require_tolerance(tolerance)
     names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
     if effects_file:
         load_effects(effects_file)
@@ -68,7 +72,9 @@ def run(
         if effects_file:
             runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
-            _write(result, folder, mesh)
+            run_folder.write_with_page(result, folder, tolerance)
+            if mesh:
+                write_mesh(result.fused, folder / "mesh.ply")
         if len(runs) > 1:
             write_model(model_of(runs[0]), scratch / "model.toml")
     documents = [result_document(result) for result in runs]
@@ -107,12 +113,6 @@ def recordings(folder: Path) -> list[Recorder]:
     return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
 
 
-def _write(result: Run, folder: Path, mesh: bool) -> None:
-    run_folder.write_with_page(result, folder)
-    if mesh:
-        write_mesh(result.fused, folder / "mesh.ply")
-
-
 def show(runs: list[Run], target: Path) -> None:
     """The stage table, the verdict and the paths, for people."""
     terminal = console()
@@ -132,6 +132,8 @@ def show(runs: list[Run], target: Path) -> None:
         for s in result.stages[1:]:
             if s.note:
                 terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
+        if (history := model_history(result)) is not None:
+            terminal.print(plain_verdict(history, session.length_unit), soft_wrap=True, style="bold")
         terminal.print(result.verdict, soft_wrap=True)
         hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
         for line in (*hidden, *result.notes[len(result.left_out) :]):

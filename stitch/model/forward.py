@@ -93,23 +93,35 @@ def moves_points(terms: Sequence[Term]) -> bool:
     return any(term.effect.place in ("sensor", "shape") for term in terms)
 
 
+def placed(measurement: Measurement, model: Model) -> tuple[Array, list[Array]]:
+    """Poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
+    capture, points = _without_motion(measurement, model.terms), [scan.points for scan in measurement.capture.scans]
+    poses, every = capture.poses(model.T_mount), slice(None)
+    if moves_points(model.terms):
+        points = [p + shift(measurement, model.terms, v, poses[v], every) for v, p in enumerate(points)]
+    return poses, points
+
+
 def corrected(measurement: Measurement, model: Model) -> Capture:
     """The capture as it would be without the effects of the model."""
     terms = model.terms
-    left, right = perturbed_frames(measurement, terms)
-    capture = replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
+    capture = _without_motion(measurement, terms)
     if moves_points(terms):
-        poses = capture.poses(model.T_mount)
-        every = slice(None)
-        scans = [_moved(scan, shift(measurement, terms, v, poses[v], every)) for v, scan in enumerate(capture.scans)]
+        poses, points = placed(measurement, model)
+        scans = [_moved(scan, p) for scan, p in zip(capture.scans, points, strict=True)]
         capture = replace(capture, scans=tuple(scans))
         if capture.sightings is not None:
-            points = capture.sightings.points + shift_targets(measurement, terms, poses)
-            capture = replace(capture, sightings=replace(capture.sightings, points=points))
+            shown = capture.sightings.points + shift_targets(measurement, terms, poses)
+            capture = replace(capture, sightings=replace(capture.sightings, points=shown))
     return capture
 
 
-def _moved(scan: Scan, by: Array) -> Scan:
+def _without_motion(measurement: Measurement, terms: Sequence[Term]) -> Capture:
+    """The capture without effects of robot, mount and part; the points as they were scanned."""
+    left, right = perturbed_frames(measurement, terms)
+    return replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
+
+
+def _moved(scan: Scan, points: Array) -> Scan:
     """Points moved by micrometres: normals, edges and spacing stay, the tree must follow."""
-    points = scan.points + by
     return replace(scan, points=points, tree=KDTree(points, leafsize=16))

@@ -62,6 +62,7 @@ class LedgerStep:
     heldout_rms: float
     noise_floor: float
     T_mount: Array  # (4, 4)
+    values: dict[str, dict[str, float]] = field(default_factory=dict)  # effect -> parameter -> value
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,9 @@ class Run:
     repeatability: Repeatability  # of the flange poses, as the overlaps show it
     overlaps: Overlaps | None  # correspondences of the model, before register moves single views; None without clouds
     verdict: str  # one plain sentence
+    registered: Overlaps | None = None  # correspondences found anew after register: what scatters there is noise
     ledger: tuple[LedgerStep, ...] = ()
     effects_file: str | None = None
-    poses_before: Array | None = None  # (V, 4, 4) poses_model before the last change of the model
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
     targets: TargetFit | None = None  # what the labelled points say, where there are any

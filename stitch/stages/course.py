@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model import Model
@@ -43,7 +42,6 @@ class End:
     seconds: float
     effects_file: str | None
     ledger: tuple[LedgerStep, ...] = ()
-    poses_before: Array | None = None  # (V, 4, 4) of the model before its last change
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not belong
     kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
     suspected: tuple[LeftOut, ...] = ()  # views that stand out, and are fused
@@ -74,10 +72,10 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         fused=finished.fused,
         repeatability=finished.repeatability,
         overlaps=finished.overlaps,
+        registered=finished.registered,
         verdict=finished.verdict,
         ledger=(*end.ledger, _step(fitted, finished)),
         effects_file=end.effects_file,
-        poses_before=end.poses_before,
         convergence=finished.convergence,
         notes=(*view_notes(end.left_out, end.kept, end.suspected), *course.notes(session, fitted, index, end.begun)),
         left_out=end.left_out,
@@ -96,4 +94,5 @@ def _step(fitted: Fitted, finished: Finished) -> LedgerStep:
         heldout_rms=finished.heldout_rms,
         noise_floor=finished.noise_floor,
         T_mount=fitted.model.T_mount,
+        values={term.name: {p.name: p.value for p in term.parameters} for term in fitted.model.terms},
     )

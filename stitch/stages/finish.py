@@ -41,6 +41,7 @@ class Finished:
     verdict: str
     convergence: dict[str, list[float]]
     overlaps: Overlaps | None = None
+    registered: Overlaps | None = None  # after register
 
     @property
     def corrections(self) -> Array:
@@ -81,6 +82,7 @@ def finish_surfaces(
         verdict=surface_sentence(g.rms, final.rms, floor, scatter, session.length_unit),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
         overlaps=overlaps,
+        registered=registration.overlaps,
     )
 
 

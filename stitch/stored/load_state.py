@@ -90,6 +90,7 @@ def _documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:
             heldout_rms=_number(step["heldout_rms"]),
             noise_floor=step["noise_floor"],
             T_mount=np.array(step["hand_eye"], float),
+            values=step.get("parameters", {}),
         )
         for step in read_ledger(folder)
     )

@@ -45,13 +45,15 @@ RESULT = _table(
         "notes": _list(_TEXT),
         "convergence": {"type": "object", "additionalProperties": _list(_MAYBE)},
     },
+    disagreement={"type": ["object", "null"], "properties": {"gate": _NUMBER}},
     outliers=_list(_table({"view": _TEXT, "target": {"type": ["string", "null"]}})),
     cloud_noise_factor=_NUMBER,
     left_out=_list(_table({"view": _TEXT, "why": _TEXT})),
     linkage=_table({}, components=_list(_list(_TEXT)), weak=_list(_table({"view": _TEXT}))),
 )
 _STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
-LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}))
+_VALUES = {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _NUMBER}}
+LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES))
 
 
 def read_result(folder: Path) -> dict[str, Any]:

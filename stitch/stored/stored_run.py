@@ -10,8 +10,11 @@ from plyfile import PlyData, PlyParseError
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.measurement.capture import Capture
 from stitch.model.forward import corrected
 from stitch.model.model_toml import ModelFile, read_model
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.reading.clouds import require_room
@@ -64,6 +67,8 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
     with library_threads_off():
         own = corrected(state.measurement, model)
         overlaps = converged_overlaps(own, model.T_mount, state.gate) if own.scans else None
+        poses = np.array([view["pose"] for view in views], float)
+        registered = _registered(own, poses, document, state.gate) if own.scans else None
         targets = _targets(folder, state) if document.get("targets") and own.sightings is not None else None
     scatter = document["repeatability"]
     return Run(
@@ -74,7 +79,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         unobservable=tuple(document["unobservable"]),
         stages=tuple(_stage(row) for row in document["stages"]),
         poses_model=own.poses(model.T_mount),
-        poses=np.array([view["pose"] for view in views], float),
+        poses=poses,
         corrections=np.array([view["correction"] for view in views], float),
         view_rms=np.array([_number(view["rms"]) for view in views]),
         residual_rms=_number(document["residual_rms"]),
@@ -83,6 +88,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         fused=_fused(folder / "stitched.ply"),
         repeatability=Repeatability(_number(scatter["rotation"]), _number(scatter["translation"]), float("nan")),
         overlaps=overlaps,
+        registered=registered,
         verdict=document["verdict"],
         ledger=state.ledger,
         effects_file=state.effects_file,
@@ -92,6 +98,12 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         left_out=state.left_out,
         links=state.links,
     )
+
+
+def _registered(own: Capture, poses: Array, document: dict[str, Any], gate: float) -> Overlaps:
+    """Correspondences after register, as the run found them last."""
+    stated = (document.get("disagreement") or {}).get("gate")
+    return collect(own, poses, stated or gate, [sample(scan, FINE_SAMPLES) for scan in own.scans])
 
 
 def _stage(row: dict[str, Any]) -> StageResult:

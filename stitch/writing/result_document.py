@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from stitch.comparison.model_history import model_history
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
 from stitch.runs.run import LeftOut, Run
@@ -65,6 +66,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,
+        "disagreement": _disagreement(run),
         "verdict": run.verdict,
         "notes": list(run.notes),
         "versions": _versions(),
@@ -81,10 +83,25 @@ def ledger(run: Run) -> list[dict[str, Any]]:
     """The model's history, one step per change."""
     numbers = ["residual_rms", "heldout_rms", "noise_floor"]
     return [
-        {"step": i, "effects": list(s.effects), "hand_eye": s.T_mount.tolist()}
+        {"step": i, "effects": list(s.effects), "parameters": s.values, "hand_eye": s.T_mount.tolist()}
         | {key: getattr(s, key) for key in numbers}
         for i, s in enumerate(run.ledger)
     ]
+
+
+def _disagreement(run: Run) -> dict[str, Any] | None:
+    """How far the views disagree on the part at every step of the model's history; None without clouds."""
+    history = model_history(run)
+    if history is None or run.registered is None:
+        return None
+    return {
+        "gate": run.registered.gate,
+        "patch_radius": history.patches.radius,
+        "steps": [
+            {"step": s.name, "mean": s.field.mean_abs, "of_noise": s.field.noise, "largest": s.field.quantile()}
+            for s in history.steps
+        ],
+    }
 
 
 def _left_out_view(item: LeftOut) -> dict[str, Any]:

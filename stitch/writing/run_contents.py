@@ -18,6 +18,7 @@ FILES = {
     "residuals.parquet",
     "recording.rrd",
     "report.html",
+    "report.pdf",
     "compare.json",
     "diagnosis.json",
     "diagnosis.rrd",

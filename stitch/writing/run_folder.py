@@ -72,7 +72,11 @@ def write_run(run: Run, folder: Path) -> None:
     write_residuals(run, folder / "residuals.parquet")
 
 
-def write_with_page(run: Run, folder: Path) -> None:
-    """The same and report.html."""
+def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> None:
+    """The same and report.html.
+
+    Args:
+        tolerance: within which the views have to agree on the part, length_unit.
+    """
     write_run(run, folder)
-    extend("stitch.reports", run, folder / "report.html")
+    extend("stitch.reports", run, folder / "report.html", tolerance)

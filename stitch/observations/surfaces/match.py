@@ -105,6 +105,21 @@ def search(
     return distance, partner, found & other.usable[partner] & (cosine > _NORMAL_COSINE)
 
 
+def distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
+    """(M,) signed distances of all correspondences, v less w along their normals, with the views elsewhere.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+        points: (N, 3) of every scan, scanner frame.
+    """
+    out = []
+    for m in matches:
+        p = frames.transform(poses[m.v], points[m.v][m.index_v])
+        q = frames.transform(poses[m.w], points[m.w][m.index_w])
+        out.append(np.einsum("ij,ij->i", p - q, m.normal))
+    return np.concatenate(out)
+
+
 def _partners(
     scans: Sequence[Scan], poses: Array, index: Indices, a: int, b: int, gate: float
 ) -> tuple[Indices, Indices]:

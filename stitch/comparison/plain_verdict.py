@@ -1,0 +1,56 @@
+"""What a run found in one sentence that everybody on the shop floor understands, and how it stands to a tolerance."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from stitch.comparison.disagreement_field import Field
+from stitch.comparison.model_history import ModelHistory
+from stitch.units import MICROMETRES
+
+# Expanded uncertainty: a place is within the tolerance if its distance and two standard errors are (ISO 14253-1).
+_COVERAGE = 2.0
+Light = Literal["good", "check", "bad"]
+
+
+class Judged(NamedTuple):
+    """How the views agree against a tolerance."""
+
+    light: Light  # good: model and stitched cloud; check: the stitched cloud alone; bad: neither
+    sentence: str
+
+
+def plain_verdict(history: ModelHistory, length_unit: str) -> str:
+    """How far the views disagree on the part, what the effects in use brought, what is left in the stitched cloud."""
+    um, models = MICROMETRES[length_unit], history.models
+    before, now, left = (f"{s.field.mean_abs * um:.3g} µm" for s in (models[0], models[-1], history.steps[-1]))
+    rest = f"with each view moved by its own correction, {left} remain in the stitched cloud."
+    changes = [s.name.removeprefix("+ ") for s in models[1:] if s.name.startswith("+ ")]
+    if not changes:
+        return f"On average over the part, the views disagree by {now}; {rest}"
+    return (
+        f"Adding {' and '.join(changes)} brought the views from {before} to {now} of each other, on average over the "
+        f"part; {rest}"
+    )
+
+
+def judged(history: ModelHistory, tolerance: float, length_unit: str) -> Judged:
+    """Whether 95 % of the part agree within a tolerance (length_unit), in the stitched cloud and under the model."""
+    um = MICROMETRES[length_unit]
+    model, cloud = (_reach(s.field) for s in (history.models[-1], history.steps[-1]))
+    allowed = f"{tolerance * um:.4g} µm"
+    told = f"{model * um:.3g} µm under the model, {cloud * um:.3g} µm in the stitched cloud"
+    if cloud > tolerance:
+        return Judged("bad", f"Not within {allowed}: 95 % of the part agree to {told}.")
+    if model > tolerance:
+        return Judged(
+            "check",
+            f"The stitched cloud is within {allowed}, the model alone is not: 95 % of the part agree to {told}; "
+            "do not carry the model to another part yet.",
+        )
+    return Judged("good", f"Within {allowed}: 95 % of the part agree to {told}.")
+
+
+def _reach(field: Field) -> float:
+    """Distance and expanded uncertainty that 95 % of the part stay below."""
+    return field.quantile() + _COVERAGE * float(np.nanmedian(field.sigma))

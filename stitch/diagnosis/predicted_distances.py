@@ -1,0 +1,54 @@
+"""What a candidate effect would leave between the surfaces, correspondence by correspondence."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.diagnosis.score import Score
+from stitch.frames import Array
+from stitch.model.forward import moves_points, shift
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.match import Match, distances
+from stitch.observations.surfaces.surface_model import Surfaces
+
+
+def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
+    """(M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
+
+    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate; in the order of the
+    matches to which the views were freed. None without clouds.
+    """
+    surfaces = linear.observation
+    if not isinstance(surfaces, Surfaces):
+        return None
+    freed = surfaces.freed
+    poses = surfaces.capture.poses(linear.model.T_mount)
+    points = [scan.points for scan in surfaces.capture.scans]
+    twists = linear.design @ linear.present.solve()
+    if scored is not None:
+        X, sums = np.hstack([linear.design, scored.form.response]), scored.candidate.points
+        found = linear.trial(X, None if sums is None else sums.of(scored.form.keep)).solve()
+        k = scored.form.response.shape[1]
+        term = scored.form.at(found[-k:])
+        if moves_points([term]):
+            # Such an effect changes the points, and the views only as hand-eye and the others follow.
+            twists = X[:, :-k] @ found[:-k]
+            measurement, every = linear.measurement, slice(None)
+            points = [p + shift(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
+        else:
+            twists = X @ found
+    matches, centre = freed.overlaps.matches, freed.overlaps.gram.centre
+    return distances(matches, poses, points) + _along_normals(matches, centre, twists.reshape(-1, 6))
+
+
+def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Array:
+    """(M,) B(δ_v − δ_w) of `gram.py`: what twists (V, 6) about `centre` do to the distances.
+
+    Not by moving the views: where hand-eye and links can stand in for one another, both move far and their common
+    motion alone counts.
+    """
+    out = []
+    for m in matches:
+        turned, moved = np.split(twists[m.v] - twists[m.w], 2)
+        out.append(np.cross(m.middle - centre, m.normal) @ turned + m.normal @ moved)
+    return np.concatenate(out)

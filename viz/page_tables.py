@@ -1,0 +1,89 @@
+"""Tables of the page of a run, as rows of plain values."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch.comparison.model_history import ModelHistory
+from stitch.model.hand_eye_uncertainty import expanded
+from stitch.runs.run import Run
+from stitch.units import MICROMETRES, rounded
+from viz.run_figures import shown_points, view_shifts
+
+# Of more views than this the page lists those to look at first.
+_VIEWS = 60
+
+
+def view_rows(run: Run, history: ModelHistory | None) -> list[dict[str, Any]]:
+    """A row for every view, those that disagree most first."""
+    um = MICROMETRES[run.session.length_unit]
+    apart = np.full(len(run.poses), np.nan)
+    if history is not None:
+        values = np.abs(history.models[-1].field.values)
+        apart = np.array([v[np.isfinite(v)].mean() if np.isfinite(v).any() else np.nan for v in values])
+    by_view = zip(run.session.views, apart, run.view_rms, view_shifts(run), run.corrections, strict=True)
+    rows = [
+        {
+            "view": view.name,
+            "points": len(shown_points(view)),
+            "apart": off * um,
+            "rms": rms * um,
+            "shift": np.linalg.norm(moved) * um,
+            "turn": np.linalg.norm(twist[:3]) * 1e3,
+        }
+        for view, off, rms, moved, twist in by_view
+    ]
+    key = "rms" if history is None else "apart"
+    rows.sort(key=lambda row: -np.nan_to_num(row[key]))
+    largest = max((np.nan_to_num(row[key]) for row in rows), default=1.0) or 1.0
+    return [row | {"share": 100 * np.nan_to_num(row[key]) / largest} for row in rows[:_VIEWS]]
+
+
+def target_rows(run: Run) -> list[dict[str, object]]:
+    """A row for every target: name, views that see it, rms, position."""
+    sightings = run.measurement.capture.sightings
+    if run.targets is None or sightings is None:
+        return []
+    um = MICROMETRES[run.session.length_unit]
+    columns = (sightings.targets, sightings.seen, run.targets.target_rms, run.targets.landmarks.positions)
+    return [
+        {"name": name, "seen": int(n), "rms": rms * um, "position": position}
+        for name, n, rms, position in zip(*columns, strict=True)
+    ]
+
+
+def effect_rows(run: Run) -> list[dict[str, str]]:
+    """Parameters that were fitted or tried; those that the views do not show are left out."""
+    return [
+        {
+            "effect": term.name,
+            "name": p.name,
+            "value": rounded(p.value, p.sigma),
+            "sigma": f"{p.sigma:.1g}" if p.fitted else "–",
+            "unit": p.unit,
+        }
+        for term in run.terms
+        for p in term.parameters
+        if p.fitted or p.grid
+    ]
+
+
+def hand_eye_rows(run: Run) -> list[dict[str, object]]:
+    """Name, coarse, corrected, U (k = 2) and unit of every number of the hand-eye; all in the mount frame."""
+    mm = MICROMETRES[run.session.length_unit] / 1e3
+    values = []
+    for T in (run.T_mount_coarse, run.T_mount):
+        values.append([*(T[:3, 3] * mm), *np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec())])
+    U = expanded(run.T_mount, run.mount_covariance)
+    expanded_units = [*(U[3:] * mm), *np.degrees(U[:3])]
+    names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "°") for axis in "xyz"]
+    return [
+        {"name": name, "unit": unit, "coarse": coarse, "corrected": corrected, "U": u}
+        for (name, unit), coarse, corrected, u in zip(names, values[0], values[1], expanded_units, strict=True)
+    ]
+
+
+def matrix(run: Run) -> str:
+    """The corrected hand-eye as four rows to copy, in the form of session.toml."""
+    return "pose = " + "[\n  " + ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount) + ",\n]"

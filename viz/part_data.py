@@ -1,0 +1,100 @@
+"""What the viewer of the page needs, packed: the surface once, the field of every step of the model's history."""
+
+import base64
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.model_history import ModelHistory
+from stitch.frames import Array
+from stitch.units import MICROMETRES
+from viz.colours import FIELD, SIGNED
+from viz.part_camera import Camera
+from viz.part_surface import PartSurface
+
+# Views whose own field a page holds.
+_VIEWS = 24
+_UNKNOWN = -32768
+_STOPS = 17
+
+
+def part_data(surface: PartSurface, camera: Camera, history: ModelHistory, names: list[str], length_unit: str) -> Any:
+    """Plain data for JSON; lengths of the field in µm.
+
+    Args:
+        names: of the views (V,).
+    """
+    um = MICROMETRES[length_unit]
+    own = [step.field.values * um for step in history.steps]
+    first = history.models[0].field
+    worst = np.argsort(-np.nan_to_num(np.array([_mean_abs(v) for v in own[-2]])), kind="stable")[:_VIEWS]
+    return {
+        **packed_surface(surface, camera, history.patches.points),
+        "steps": [
+            {
+                "name": step.name,
+                "mean": step.field.mean_abs * um,
+                "noise": step.field.noise * um,
+                "values": packed_values(step.field.overall * um),
+            }
+            for step in history.steps
+        ],
+        "views": [
+            {"name": names[v], "means": [_mean_abs(x[v]) for x in own], "steps": [packed_values(x[v]) for x in own]}
+            for v in sorted(int(v) for v in worst)
+        ],
+        "full": full_colour(first) * um,
+        "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour(first) * um),
+        "colours": {"field": _stops(FIELD), "signed": _stops(SIGNED)},
+        "radius": f"{history.patches.radius:.3g} {length_unit}",
+        "begin": 1,
+        "end": len(history.steps) - 2 if len(history.models) > 1 else len(history.steps) - 1,
+    }
+
+
+def packed_surface(surface: PartSurface, camera: Camera, patches: Array) -> dict[str, Any]:
+    """Vertices in the camera's axes within a box, 16 bits a coordinate."""
+    flat = surface.vertices @ camera.axes.T
+    low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
+    centre = (flat.max(axis=0) + low) / 2
+    return {
+        "vertices": _base64(np.round((flat - centre) / size * 32767).astype("<i2")),
+        "normals": _base64(np.round(surface.normals @ camera.axes.T * 127).astype("i1")),
+        "triangles": _base64(surface.triangles.astype("<u4")),
+        "near": _base64(surface.patch.astype("<u2")),
+        "weight": _base64(np.round(surface.weight * 255).astype("u1")),
+        "patches": packed_floats((patches @ camera.axes.T - centre) / size),
+        "axes": camera.axes.tolist(),
+        "centre": centre.tolist(),
+        "size": size,
+        "box": (np.ptp(flat, axis=0) / size).tolist(),
+    }
+
+
+def packed_values(values: Array) -> dict[str, Any]:
+    """16 bits a value and the size of one count; what nobody knows is the smallest number."""
+    known = np.isfinite(values)
+    count = float(np.abs(values[known]).max(initial=0.0)) / 32000 or 1.0
+    return {"count": count, "data": _base64(np.where(known, np.nan_to_num(values) / count, _UNKNOWN).astype("<i2"))}
+
+
+def packed_floats(numbers: Array) -> str:
+    """32 bits a number."""
+    return _base64(numbers.astype("<f4"))
+
+
+def _mean_abs(values: Array) -> float:
+    seen = np.abs(values[np.isfinite(values)])
+    return float(seen.mean()) if len(seen) else 0.0
+
+
+def _stops(name: str) -> list[list[int]]:
+    """RGB of a colour map at equal steps."""
+    return [[round(255 * c) for c in colormaps[name](x)[:3]] for x in np.linspace(0, 1, _STOPS)]
+
+
+def _base64(numbers: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(numbers).tobytes()).decode()

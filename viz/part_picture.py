@@ -1,0 +1,89 @@
+"""The part with the field as a still picture: for paper, and where no scripts run."""
+
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from stitch.frames import Array, Indices
+from viz.colours import FIELD, unsigned_colours
+from viz.part_camera import Camera
+from viz.part_surface import PartSurface
+
+# Light that comes from the eye, a little from above and from the left.
+_LIGHT = np.array([-0.25, 0.45, 0.86])
+_AMBIENT = 0.55
+_PIXELS = 560  # along the longer side of the picture
+_INCHES = 4.4
+
+
+class Seen(NamedTuple):
+    """What the pixels of a picture show."""
+
+    shape: tuple[int, int]
+    pixel: Indices  # (P,) numbers of the pixels that show the part
+    corner: Indices  # (P, 3) vertices about the place
+    weight: Array  # (P, 3) theirs
+
+
+def part_picture(
+    surface: PartSurface, camera: Camera, states: list[tuple[str, Array]], limit: float, unit: str
+) -> Figure:
+    """The part once for every state, title and values (K,) of the patches in `unit`, with one scale of colours."""
+    seen = visible(surface, camera)
+    high, wide = seen.shape
+    inches = _INCHES / max(high, wide)
+    each = max(wide * inches, 1.9)
+    figure = Figure(figsize=(0.9 + len(states) * each, high * inches + 0.6), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(states)))
+    for axes, (title, values) in zip(panels, states, strict=True):
+        axes.imshow(painted(surface, camera, seen, unsigned_colours(surface.coloured(values), limit)))
+        axes.axis("off")
+        axes.set_title(title, fontsize=9)
+    scale = ScalarMappable(Normalize(0, limit), colormaps[FIELD])
+    figure.colorbar(scale, ax=panels, label=f"views disagree by ({unit})", extend="max", shrink=0.8, aspect=30)
+    return figure
+
+
+def visible(surface: PartSurface, camera: Camera) -> Seen:
+    """Which place of the surface each pixel shows: of dense samples the one nearest to the eye."""
+    corner, weight = _samples(surface)
+    flat = surface.vertices @ camera.axes.T
+    low, size = flat.min(axis=0)[:2], np.ptp(flat, axis=0)[:2]
+    scale = (_PIXELS - 1) / float(size.max())
+    wide, high = (int(x) + 1 for x in size * scale)
+    place = np.einsum("sc,sci->si", weight, flat[corner])
+    column, row = ((place[:, :2] - low) * scale + 0.5).astype(np.int64).T
+    pixel = (high - 1 - np.clip(row, 0, high - 1)) * wide + np.clip(column, 0, wide - 1)
+    order = np.lexsort((-place[:, 2], pixel))
+    shown, first = np.unique(pixel[order], return_index=True)
+    best = order[first]
+    return Seen((high, wide), shown, corner[best], weight[best])
+
+
+def painted(surface: PartSurface, camera: Camera, seen: Seen, colours: Array) -> Array:
+    """(H, W, 4) shaded picture of colours (N, 3) of the vertices, 0 … 255; clear where there is no part."""
+    light = _LIGHT @ camera.axes / np.linalg.norm(_LIGHT)
+    shade = _AMBIENT + (1 - _AMBIENT) * np.clip(surface.normals @ light, 0, 1)
+    own = np.einsum("pc,pci->pi", seen.weight, (colours * shade[:, None])[seen.corner])
+    picture = np.zeros((seen.shape[0] * seen.shape[1], 4), np.uint8)
+    picture[seen.pixel] = np.column_stack([own, np.full(len(own), 255.0)])
+    return picture.reshape(*seen.shape, 4)
+
+
+def _samples(surface: PartSurface) -> tuple[Indices, Array]:
+    """Corners (S, 3) and weights (S, 3) of samples over all triangles, so dense that no pixel is left out."""
+    if not len(surface.triangles):
+        index = np.arange(len(surface.vertices))
+        return np.stack([index] * 3, axis=1), np.full((len(index), 3), 1 / 3)
+    edges = surface.vertices[surface.triangles] - surface.vertices[np.roll(surface.triangles, 1, axis=1)]
+    longest = float(np.quantile(np.linalg.norm(edges, axis=2).max(axis=1), 0.9))
+    fine = int(np.ceil(longest * _PIXELS / float(np.ptp(surface.vertices, axis=0).max()))) + 1
+    i, j = np.meshgrid(np.arange(fine + 1), np.arange(fine + 1))
+    inside = i + j <= fine
+    weights = np.column_stack([i[inside], j[inside], fine - i[inside] - j[inside]]) / fine
+    count = len(surface.triangles)
+    return np.repeat(surface.triangles, len(weights), axis=0), np.tile(weights, (count, 1))

@@ -1,0 +1,99 @@
+"""The part as a shaded surface, and how the patches of the field colour it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from stitch.comparison.patches import Patches
+from stitch.errors import NoResultError
+from stitch.frames import Array, Indices
+from stitch.runs.run import FusedCloud
+from stitch.writing.mesh import TriangleMesh, mesh_of
+
+# Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
+_FINENESS = 150
+# Share of the triangles up to which a piece of surface for itself is not shown.
+_CRUMB = 0.005
+# Share of places seen once up to which they are not shown.
+_FLYING = 0.25
+_NEAREST = 3
+_SAME_SIDE = 0.3
+
+
+@dataclass(frozen=True)
+class PartSurface:
+    """N vertices with unit normals, reference frame; without triangles where the points span no surface."""
+
+    vertices: Array  # (N, 3)
+    normals: Array  # (N, 3)
+    triangles: Indices  # (T, 3)
+    patch: Indices  # (N, 3) patches about a vertex
+    weight: Array  # (N, 3) their weights, sum 1
+
+    def coloured(self, values: Array) -> Array:
+        """(N,) values (K,) of the patches between them; NaN where none about a vertex is known."""
+        own = values[self.patch]
+        weight = np.where(np.isfinite(own), self.weight, 0.0)
+        total = weight.sum(axis=1)
+        seen = total > 0
+        return np.where(seen, (np.nan_to_num(own) * weight).sum(axis=1) / np.where(seen, total, 1.0), np.nan)
+
+
+def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
+    """The fused cloud as a mesh of what a screen can show."""
+    points, normals = _thinned(fused)
+    triangles = np.zeros((0, 3), np.int64)
+    try:
+        mesh = mesh_of(points, normals)
+        points, triangles = _whole_pieces(mesh)
+        normals = vertex_normals(points, triangles)
+    except NoResultError:
+        pass
+    count = min(4 * _NEAREST, len(patches.points))
+    distance, index = KDTree(np.ascontiguousarray(patches.points)).query(points, k=count)
+    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1).astype(np.int64)
+    # A thin sheet has two sides, each with patches of its own.
+    facing = np.einsum("nki,ni->nk", patches.normals[index], normals) > _SAME_SIDE
+    weight = np.where(facing, 1.0, 1e-6) / (distance**2 + (0.2 * patches.radius) ** 2)
+    best = np.argsort(-weight, axis=1)[:, :_NEAREST]
+    index, weight = (np.take_along_axis(x, best, axis=1) for x in (index, weight))
+    return PartSurface(points, normals, triangles, patch=index, weight=weight / weight.sum(axis=1, keepdims=True))
+
+
+def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
+    """Vertices and triangles without the crumbs that lie about the part."""
+    a, b, c = mesh.triangles.T
+    count = len(mesh.vertices)
+    links = coo_matrix((np.ones(2 * len(a)), (np.append(a, b), np.append(b, c))), shape=(count, count))
+    piece = connected_components(links, directed=False)[1]
+    share = np.bincount(piece[a], minlength=piece.max() + 1) / len(a)
+    kept, triangles = np.unique(mesh.triangles[share[piece[a]] > _CRUMB], return_inverse=True)
+    return mesh.vertices[kept], triangles.reshape(-1, 3).astype(np.int64)
+
+
+def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
+    """(N, 3) mean points and unit normals of cells, both sides of a sheet apart."""
+    once = fused.count < 2
+    # Where views meet almost everywhere, what one view alone saw are its flying points.
+    keep = ~once | (once.mean() > _FLYING)
+    points, normals = fused.points[keep], fused.normals[keep]
+    size = float(np.ptp(points, axis=0).max()) / _FINENESS
+    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))
+    _, group = np.unique(np.ravel_multi_index((*cell.T, side), (*(cell.max(axis=0) + 1), 6)), return_inverse=True)
+    count = np.bincount(group)[:, None]
+    point, normal = (np.stack([np.bincount(group, x) for x in v.T], axis=1) / count for v in (points, normals))
+    return point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+
+
+def vertex_normals(vertices: Array, triangles: Indices) -> Array:
+    """(N, 3) unit normals, the triangles about a vertex weighed by their area."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    across = np.cross(b - a, c - a)
+    out = np.zeros_like(vertices)
+    for i in range(3):
+        np.add.at(out, triangles[:, i], across)
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))

@@ -1,0 +1,240 @@
+// The part in 3D with the field of disagreement. One file, no library, no network.
+(() => {
+  "use strict";
+  const root = document.getElementById("part"), source = document.getElementById("part-data");
+  if (!root || !source) return;
+  const canvas = root.querySelector("canvas"), gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
+  if (!gl) return;  // the still picture stays
+  const data = JSON.parse(source.textContent);
+  const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
+  const vertices = new Int16Array(bytes(data.vertices)), normals = new Int8Array(bytes(data.normals));
+  const triangles = new Uint32Array(bytes(data.triangles)), near = new Uint16Array(bytes(data.near));
+  const weight = new Uint8Array(bytes(data.weight)), count = vertices.length / 3;
+  const unpack = packed => {
+    const raw = new Int16Array(bytes(packed.data)), out = new Float32Array(raw.length);
+    for (let i = 0; i < raw.length; i++) out[i] = raw[i] === -32768 ? NaN : raw[i] * packed.count;
+    return out;
+  };
+  const unknown = -1e9;
+  const onVertices = values => {
+    const out = new Float32Array(count);
+    for (let i = 0; i < count; i++) {
+      let sum = 0, total = 0;
+      for (let k = 3 * i; k < 3 * i + 3; k++) {
+        const v = values[near[k]];
+        if (!Number.isNaN(v)) { sum += weight[k] * v; total += weight[k]; }
+      }
+      out[i] = total ? sum / total : unknown;
+    }
+    return out;
+  };
+
+  const vertexCode = `#version 300 es
+    in vec3 place; in vec3 normal; in float before; in float after;
+    uniform mat3 turn; uniform vec2 scale; uniform vec2 shift; uniform float dot;
+    uniform float blend; uniform float full; uniform float isSigned;
+    out vec3 facing; out float share; out float known;
+    void main() {
+      vec3 p = turn * place;
+      facing = turn * normal;
+      known = min(before, after) < -1e8 ? 0.0 : 1.0;
+      float value = mix(before, after, blend);
+      share = isSigned > 0.5 ? 0.5 + value / (2.0 * full) : value / full;
+      gl_Position = vec4(p.xy * scale + shift, -p.z * 0.5, 1.0);
+      gl_PointSize = dot;
+    }`;
+  const pixelCode = `#version 300 es
+    precision highp float;
+    in vec3 facing; in float share; in float known;
+    uniform sampler2D map; uniform float row;
+    out vec4 colour;
+    void main() {
+      vec3 n = normalize(facing);
+      float light = 0.55 + 0.45 * abs(dot(n, normalize(vec3(-0.25, 0.45, 0.86))));
+      vec3 base = known > 0.5 ? texture(map, vec2(0.03 + 0.94 * clamp(share, 0.0, 1.0), row)).rgb : vec3(0.62);
+      colour = vec4(base * light, 1.0);
+    }`;
+  const compiled = (kind, code) => {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, code); gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    return shader;
+  };
+  const program = gl.createProgram();
+  gl.attachShader(program, compiled(gl.VERTEX_SHADER, vertexCode));
+  gl.attachShader(program, compiled(gl.FRAGMENT_SHADER, pixelCode));
+  gl.linkProgram(program); gl.useProgram(program);
+  const at = name => gl.getUniformLocation(program, name);
+  const attribute = (name, array, size, type, normalised) => {
+    const buffer = gl.createBuffer(), place = gl.getAttribLocation(program, name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.bufferData(gl.ARRAY_BUFFER, array, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(place); gl.vertexAttribPointer(place, size, type, normalised, 0, 0);
+    return buffer;
+  };
+  const padded = (from, Kind) => {  // attributes of three small numbers would not lie on four bytes
+    const out = new Kind(4 * count);
+    for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) out[4 * i + k] = from[3 * i + k];
+    return out;
+  };
+  attribute("place", padded(vertices, Int16Array), 4, gl.SHORT, true);
+  attribute("normal", padded(normals, Int8Array), 4, gl.BYTE, true);
+  const beforeBuffer = attribute("before", new Float32Array(count), 1, gl.FLOAT, false);
+  const afterBuffer = attribute("after", new Float32Array(count), 1, gl.FLOAT, false);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
+  const stops = data.colours.field.length, picture = new Uint8Array(4 * 2 * stops);
+  ["field", "signed"].forEach((name, row) => data.colours[name].forEach((rgb, i) =>
+    picture.set([...rgb, 255], 4 * (row * stops + i))));
+  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, stops, 2, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+  for (const [key, value] of [[gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
+    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE]])
+    gl.texParameteri(gl.TEXTURE_2D, key, value);
+
+  const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
+  const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
+  const play = root.querySelector("button[data-play]");
+  let steps = [], shown = -1, yaw = 0, pitch = 0, zoom = 1, panX = 0, panY = 0, wanted = false;
+
+  const candidates = [];
+  const extra = document.getElementById("candidate-data");
+  if (extra) {  // patches of a diagnosis lie elsewhere: each of ours takes the nearest
+    const more = JSON.parse(extra.textContent), axes = data.axes, own = new Float32Array(bytes(data.patches));
+    const other = new Float32Array(bytes(more.patches)), nearest = new Uint16Array(own.length / 3);
+    for (let i = 0; i < nearest.length; i++) {
+      let best = Infinity;
+      for (let j = 0; j < other.length / 3; j++) {
+        let d = 0;
+        for (let k = 0; k < 3; k++) {
+          const r = axes[k][0] * other[3 * j] + axes[k][1] * other[3 * j + 1] + axes[k][2] * other[3 * j + 2];
+          d += ((r - data.centre[k]) / data.size - own[3 * i + k]) ** 2;
+        }
+        if (d < best) { best = d; nearest[i] = j; }
+      }
+    }
+    for (const c of more.candidates) {
+      const of = packed => { const v = unpack(packed); return Float32Array.from(nearest, j => v[j]); };
+      candidates.push({ name: c.name, steps: [
+        { name: "as it is", mean: more.mean, noise: more.noise, values: of(more.values) },
+        { name: `if ${c.name} were added`, mean: c.mean, noise: more.noise, values: of(c.values) }] });
+    }
+  }
+  data.views.forEach((view, i) => choice.add(new Option(`view ${view.name} against the others`, `v${i}`)));
+  candidates.forEach((c, i) => choice.add(new Option(`predicted: ${c.name}`, `c${i}`)));
+
+  const isSigned = () => choice.value.startsWith("v");
+  const full = () => isSigned() ? data.fullSigned : data.full;
+  function choose() {
+    const i = Number(choice.value.slice(1));
+    if (choice.value.startsWith("c")) steps = candidates[i].steps.map(s => ({ ...s, on: onVertices(s.values) }));
+    else steps = data.steps.map((s, k) => ({ name: s.name, noise: s.noise,
+      mean: isSigned() ? data.views[i].means[k] : s.mean,
+      on: onVertices(unpack(isSigned() ? data.views[i].steps[k] : s.values)) }));
+    slider.max = steps.length - 1;
+    slider.value = Math.min(choice.value.startsWith("c") ? 1 : data.end, steps.length - 1);
+    shown = -1; label(); draw();
+  }
+  function label() {
+    const k = Math.round(Number(slider.value)), s = steps[k], signed = isSigned();
+    title.textContent = `${s.name}: ${signed ? "this view lies off by" : "the views disagree by"} `
+      + `${digits(s.mean)} µm on average (noise alone ${digits(s.noise)} µm)`;
+    slider.setAttribute("aria-valuetext", title.textContent);
+    root.querySelectorAll("[data-steps] button").forEach((b, i) => b.setAttribute("aria-pressed", String(i === k)));
+    const colours = data.colours[signed ? "signed" : "field"].map(c => `rgb(${c.join(",")})`).join(",");
+    bar.querySelector("i").style.background = `linear-gradient(90deg, ${colours})`;
+    const f = full();
+    bar.querySelectorAll("b").forEach((b, i) => {
+      const x = signed ? -f + i * f : i * f / 2;
+      b.textContent = `${signed && i === 2 ? "+" : ""}${digits(x)}${i === 2 ? " µm" : ""}`.replace("-", "−");
+    });
+    bar.querySelector("span").textContent = signed ? "inwards · outwards of the other views" : "views agree · views disagree";
+  }
+  const digits = x => x === 0 ? "0" : Number(x.toPrecision(3)).toString();
+  function names() {
+    const list = root.querySelector("[data-steps]");
+    list.replaceChildren(...steps.map((s, i) => {
+      const b = document.createElement("button");
+      b.type = "button"; b.textContent = s.name;
+      b.onclick = () => glide(i);
+      return b;
+    }));
+  }
+  function draw() {
+    if (wanted) return;
+    wanted = true;
+    requestAnimationFrame(() => {
+      wanted = false;
+      const w = canvas.clientWidth, h = canvas.clientHeight, r = window.devicePixelRatio || 1;
+      if (canvas.width !== Math.round(w * r) || canvas.height !== Math.round(h * r)) {
+        canvas.width = Math.round(w * r); canvas.height = Math.round(h * r);
+      }
+      gl.viewport(0, 0, canvas.width, canvas.height);
+      gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT); gl.enable(gl.DEPTH_TEST);
+      const t = Number(slider.value), k = Math.min(Math.floor(t), steps.length - 2);
+      if (k !== shown) {
+        for (const [buffer, step] of [[beforeBuffer, steps[k]], [afterBuffer, steps[k + 1]]]) {
+          gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.bufferSubData(gl.ARRAY_BUFFER, 0, step.on);
+        }
+        shown = k;
+      }
+      const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
+      gl.uniformMatrix3fv(at("turn"), false, [a, b * d, -b * c, 0, c, d, b, -a * d, a * c]);
+      const reach = 1.9 * zoom, fit = Math.min(w / data.box[0], h / data.box[1]);
+      gl.uniform2f(at("scale"), reach * fit / w, reach * fit / h);
+      gl.uniform2f(at("shift"), panX, panY);
+      gl.uniform1f(at("dot"), Math.max(1.5, r * zoom * 3));
+      gl.uniform1f(at("blend"), t - k); gl.uniform1f(at("full"), full());
+      gl.uniform1f(at("isSigned"), isSigned() ? 1 : 0); gl.uniform1f(at("row"), isSigned() ? 0.75 : 0.25);
+      if (triangles.length) gl.drawElements(gl.TRIANGLES, triangles.length, gl.UNSIGNED_INT, 0);
+      else gl.drawArrays(gl.POINTS, 0, count);
+    });
+  }
+  let gliding = 0;
+  function glide(to) {
+    cancelAnimationFrame(gliding);
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches, from = Number(slider.value), begun = performance.now();
+    const lasting = still ? 1 : 700 * Math.max(1, Math.abs(to - from));
+    const move = now => {
+      const share = Math.min(1, Math.max(0, (now - begun) / lasting));
+      slider.value = from + (to - from) * share; label(); draw();
+      if (share < 1) gliding = requestAnimationFrame(move);
+    };
+    gliding = requestAnimationFrame(move);
+  }
+  slider.oninput = () => { cancelAnimationFrame(gliding); label(); draw(); };
+  choice.onchange = () => { choose(); names(); label(); };
+  play.onclick = () => { const last = steps.length - 1; slider.value = Math.min(data.begin, last - 1); glide(last); };
+
+  const fingers = new Map();
+  canvas.addEventListener("pointerdown", e => { fingers.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId); });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, e => fingers.delete(e.pointerId));
+  canvas.addEventListener("pointermove", e => {
+    const before = fingers.get(e.pointerId);
+    if (!before) return;
+    const x = (e.clientX - before.clientX) / canvas.clientWidth, y = (e.clientY - before.clientY) / canvas.clientHeight;
+    if (fingers.size > 1) {
+      const other = [...fingers.values()].find(f => f.pointerId !== e.pointerId);
+      const far = f => Math.hypot(f.clientX - other.clientX, f.clientY - other.clientY);
+      zoom = Math.min(12, Math.max(0.5, zoom * far(e) / Math.max(far(before), 1)));
+      panX += x; panY -= y;
+    } else if (e.shiftKey || e.buttons === 4 || e.buttons === 2) { panX += 2 * x; panY -= 2 * y; }
+    else { yaw += 4 * x; pitch = Math.min(1.6, Math.max(-1.6, pitch + 3 * y)); }
+    fingers.set(e.pointerId, e); draw();
+  });
+  canvas.addEventListener("contextmenu", e => e.preventDefault());
+  canvas.addEventListener("wheel", e => {
+    if (document.activeElement !== canvas && !e.ctrlKey) return;  // the page scrolls until the part is clicked
+    e.preventDefault(); zoom = Math.min(12, Math.max(0.5, zoom * Math.exp(-e.deltaY / 500))); draw();
+  }, { passive: false });
+  canvas.addEventListener("keydown", e => {
+    const step = 0.12;
+    if (e.key === "ArrowLeft") yaw -= step; else if (e.key === "ArrowRight") yaw += step;
+    else if (e.key === "ArrowUp") pitch -= step; else if (e.key === "ArrowDown") pitch += step;
+    else if (e.key === "+") zoom *= 1.15; else if (e.key === "-") zoom /= 1.15;
+    else if (e.key === "Home") { yaw = pitch = panX = panY = 0; zoom = 1; } else return;
+    e.preventDefault(); draw();
+  });
+  new ResizeObserver(draw).observe(canvas);
+  root.classList.add("live");
+  choose(); names(); label();
+})();
