@@ -24,7 +24,7 @@ def identity(run: Run) -> list[tuple[str, str]]:
     return [
         ("Session", session.name),
         ("Views", f"{len(session.views)}{of}, {_points(session)}"),
-        ("Computed", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ("Page written", datetime.now(UTC).strftime("%Y-%m-%d")),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
         ("Scanner", scanner + stated),
         ("Model", ", ".join(["hand-eye", *run.effects])),

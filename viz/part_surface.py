@@ -79,7 +79,8 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     once = fused.count < 2
     # Where views meet almost everywhere, what one view alone saw are its flying points.
     keep = ~once | (once.mean() > _FLYING)
-    points, normals = fused.points[keep], fused.normals[keep]
+    # As stitched.ply holds them: a page that is made anew is the same.
+    points, normals = (x[keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
     size = float(np.ptp(points, axis=0).max()) / _FINENESS
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))

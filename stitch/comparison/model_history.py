@@ -86,7 +86,8 @@ def _models(run: Run) -> list[tuple[str, Model]]:
         model = _model_of(step, run.measurement)
         if model is not None:
             out.append((change_of(run.ledger, i), model))
-    return [*out, (change_of(run.ledger, len(run.ledger) - 1), run.model)]
+    last = change_of(run.ledger, len(run.ledger) - 1) if run.ledger else ", ".join(run.effects) or ALONE
+    return [*out, (last, run.model)]
 
 
 def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
