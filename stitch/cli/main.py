@@ -22,6 +22,7 @@ from stitch.cli.compare import compare_run
 from stitch.cli.diagnose import diagnose_run, next_measurement
 from stitch.cli.effects import effects
 from stitch.cli.import_file import import_command
+from stitch.cli.init import init
 from stitch.cli.report import report
 from stitch.cli.run import run
 from stitch.cli.streams import results_alone, speak_any_terminal
@@ -30,6 +31,7 @@ from stitch.reading.text_file import shortened
 from stitch.system import time_limit
 
 _COMMANDS: dict[str, Callable[..., Any]] = {
+    "init": init,
     "run": run,
     "check": check,
     "compare": compare_run,

@@ -3,8 +3,9 @@
 from functools import partial
 
 from stitch.frames import Array
-from stitch.integrity.conventions import Explained, explained, verdict
+from stitch.integrity.conventions import explained, verdict
 from stitch.integrity.linkage import only
+from stitch.integrity.motion_fit import Explained
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.relative_scans import relative_scans

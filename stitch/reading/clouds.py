@@ -15,6 +15,8 @@ from stitch.reading.text_file import require_file, shortened
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")
+# Kinds that are read, by the ending of the file's name.
+CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT)
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:

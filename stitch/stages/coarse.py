@@ -36,7 +36,7 @@ _UNTIL_THEY_MEET, _AFTERWARDS = 4, 3
 COARSE_GATE = 0.35
 # Where a hand-eye came from that was not searched.
 STATED, REUSED = "given in session.toml", "of another run, used as it is"
-_SCORE_SHARE = 0.05
+SCORE_SHARE = 0.05
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
 
@@ -75,7 +75,7 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
         raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
     size = part_size(captures)
     starts = _starts(captures, size)
-    tried = _closed(captures, starts, size)
+    tried = close_from(captures, starts, size)
     if not tried:
         raise NoResultError(
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
@@ -113,7 +113,7 @@ def _turn_about(rotation: Array, centre: Array) -> Array:
     return T
 
 
-def _closed(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float) -> list[Candidate]:
+def close_from(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float) -> list[Candidate]:
     """Close in from every start on few points; starts under which no views overlap are dropped.
 
     Half way, starts that have met go on as one: most end in the same place.
@@ -131,7 +131,7 @@ def _closed(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], si
             met.append(([source], *half))
     ends = [(sources, _close(light, T, gates, _AFTERWARDS)) for sources, T, gates in met]
     return [
-        Candidate(sources[0], end[0], consistency(captures, end[0], _SCORE_SHARE * size), len(sources))
+        Candidate(sources[0], end[0], consistency(captures, end[0], SCORE_SHARE * size), len(sources))
         for sources, end in ends
         if end is not None
     ]

@@ -1,0 +1,84 @@
+"""`stitch init FOLDER`: a session from a folder of scans and poses of unknown convention."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stitch.cli.streams import emit
+from stitch.errors import InputError
+from stitch.intake.first_session import FirstSession, first_session
+from stitch.intake.guesses import Guess
+from stitch.intake.session_draft import require_free, write_draft
+from stitch.intake.stated import Stated
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them.")],
+    poses: Annotated[Path | None, typer.Option("--poses", help="File or folder of the poses; default: found.")] = None,
+    columns: Annotated[
+        str | None, typer.Option("--columns", help="Names of the columns of numbers: rx,ry,rz,x,y,z; - leaves one out.")
+    ] = None,
+    rotation: Annotated[
+        str | None, typer.Option("--rotation", help="xyz-extrinsic, zyx-intrinsic, rotation-vector, quaternion-xyzw …")
+    ] = None,
+    angles: Annotated[str | None, typer.Option("--angles", help="deg or rad.")] = None,
+    unit: Annotated[str | None, typer.Option("--unit", help="Of the poses: mm, m, cm or inch.")] = None,
+    cloud_unit: Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm or m.")] = None,
+    mount: Annotated[str | None, typer.Option("--mount", help="eye_in_hand or eye_to_hand.")] = None,
+    inverse: Annotated[
+        bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")] = False,
+) -> None:
+    """Make a session of a folder of scans and poses; the scans tell which convention the poses are in."""
+    out = folder if output is None else output
+    require_free(out)
+    names = tuple(name.strip() for name in columns.split(",")) if columns else ()
+    stated = Stated(poses, names, rotation, angles, unit, cloud_unit, mount, inverse)
+    first = first_session(folder, stated)
+    _tell(first)
+    untold = [guess for guess in first.guesses if not guess.told]
+    if not yes:
+        _ask(out, untold)
+    write_draft(out, first)
+    if as_json:
+        emit(json.dumps(_document(out, first), indent=1))
+    print(f"{out / 'session.toml'} and views.csv: {len(first.pairing.used)} views", file=sys.stderr)
+    print(f"next: stitch run {out}", file=sys.stderr)
+
+
+def _tell(first: FirstSession) -> None:
+    for guess in first.guesses:
+        print(f"{'' if guess.told else '? '}{guess.line}", file=sys.stderr)
+
+
+def _ask(out: Path, untold: list[Guess]) -> None:
+    """On a terminal whether to go on; elsewhere a refusal where something cannot be told.
+
+    Raises:
+        InputError: names the flags that would tell it.
+    """
+    if sys.stdin.isatty():
+        question = f"{len(untold)} guesses cannot be told from these views. " if untold else ""
+        if not typer.confirm(f"{question}Write the session?", default=not untold, err=True):
+            raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
+    elif untold:
+        flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
+        what = ", ".join(guess.what for guess in untold)
+        raise InputError(f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes")
+
+
+def _document(out: Path, first: FirstSession) -> dict[str, object]:
+    return {
+        "session": str(out),
+        "views": len(first.pairing.used),
+        "told": all(guess.told for guess in first.guesses),
+        "guesses": [guess.as_dict() for guess in first.guesses],
+    }

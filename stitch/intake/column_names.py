@@ -1,0 +1,132 @@
+"""What the names of columns say: position, rotation, joint angles, units."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+# Words that say nothing about which number a column holds.
+_FILLERS = {"pose", "tcp", "robot", "flange", "tool", "tool0", "actual", "target", "base", "in", "of", "the", "coord"}
+_FILLERS |= {"position", "pos", "translation", "trans", "t", "p", "transform", "vector", "point", "cartesian", "end"}
+_ROTATION = {"rotation", "orientation", "quaternion", "quat", "rot", "euler", "angles", "angle", "rpy", "rotvec", "o"}
+_LENGTHS = {"mm": "mm", "millimeter": "mm", "millimetre": "mm", "m": "m", "meter": "m", "metre": "m", "cm": "cm"}
+_LENGTHS |= {"inch": "inch", "in": "inch", "inches": "inch"}
+_ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad"}
+_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch)$")
+_JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
+
+# Triples of angles and quadruples of quaternions by name; a rotation stated by its names alone, or None.
+_NAMED = {
+    ("qx", "qy", "qz", "qw"): "quaternion-xyzw",
+    ("q0", "q1", "q2", "q3"): "quaternion-wxyz",
+    ("q1", "q2", "q3", "q4"): "quaternion-wxyz",
+    ("rotx", "roty", "rotz", "rotw"): "quaternion-xyzw",
+    ("w", "p", "r"): "xyz-extrinsic",
+    ("roll", "pitch", "yaw"): "xyz-extrinsic",
+    ("yaw", "pitch", "roll"): "zyx-intrinsic",
+    ("rx", "ry", "rz"): None,
+    ("rz", "ry", "rx"): None,
+    ("a", "b", "c"): None,
+    ("u", "v", "w"): None,
+    ("alpha", "beta", "gamma"): None,
+    ("rotx", "roty", "rotz"): None,
+    ("rotz", "roty", "rotx"): None,
+    ("rot0", "rot1", "rot2"): None,
+    ("rot0", "rot1", "rot2", "rot3"): None,
+}
+
+
+@dataclass(frozen=True)
+class Named:
+    """Columns whose meaning their names tell; indices into the columns."""
+
+    position: tuple[int, ...] = ()
+    rotation: tuple[int, ...] = ()
+    joints: tuple[int, ...] = ()
+    convention: str | None = None  # of the rotation, where the names alone tell it
+    length_unit: str | None = None  # of the position
+    angle_unit: str | None = None  # of rotation or joints
+    rest: dict[str, int] = field(default_factory=dict)  # other named columns: times, temperatures
+
+
+def read_names(header: Sequence[str]) -> Named:
+    """What a header says."""
+    plain, units = zip(*(_plain(name) for name in header), strict=True)
+    where: dict[str, int] = {}
+    for i, name in enumerate(plain):
+        where.setdefault(name, i)
+    joints = _joints(header)
+    position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
+    rotation, convention = _rotation(where, plain, set(position) | set(joints))
+    matrix = _matrix(header) if not rotation else ()
+    if matrix:
+        rotation, position, convention = matrix, (), None
+    used = {*position, *rotation, *joints}
+    return Named(
+        position=position,
+        rotation=rotation,
+        joints=joints,
+        convention=convention,
+        length_unit=next((_LENGTHS[units[i]] for i in position if units[i] in _LENGTHS), None),
+        angle_unit=next((_ANGLES[units[i]] for i in (*rotation, *joints) if units[i] in _ANGLES), None),
+        rest={header[i]: i for i in range(len(header)) if i not in used and header[i] not in ("", "-")},
+    )
+
+
+def _plain(name: str) -> tuple[str, str]:
+    """A name without its unit and fillers, and its unit."""
+    found = _UNIT.search(name.strip())
+    unit = (found[1] or found[2] or "").strip().lower() if found else ""
+    if found:
+        name = name.strip()[: found.start()]
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # camelCase
+    words = [w for w in re.split(r"[._\s/\-]+", name.lower()) if w]
+    unit = unit or next((w for w in words if w in ("mm", "deg", "rad", "cm", "inch")), "")
+    if not unit and "m" in words and len(words) > 1:
+        unit = "m"
+    turned = any(w in _ROTATION for w in words)
+    words = [w for w in words if w != unit]
+    kept = [w for w in words if w not in _FILLERS and w not in _ROTATION and w not in ("xyzw", "wxyz", "xyz")]
+    if not kept:
+        return (words[-1] if len(words) == 1 else ""), unit
+    last = re.sub(r"^(?:[pt]|pos)_?([xyz])$", r"\1", kept[-1])
+    order = next((w for w in words if w in ("xyzw", "wxyz")), None)
+    if order and last in ("0", "1", "2", "3"):
+        return f"q{order[int(last)]}", unit
+    if last in ("0", "1", "2") and not turned and any(w in words for w in ("position", "pos", "translation", "t")):
+        return "xyz"[int(last)], unit
+    return (f"rot{last}" if turned and len(last) == 1 else last), unit
+
+
+def _rotation(where: dict[str, int], plain: Sequence[str], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
+    for names, convention in sorted(_NAMED.items(), key=lambda item: -len(item[0])):
+        index = [where.get(name, -1) for name in names]
+        # Angles by place: the triple counts in the order in which its columns stand.
+        ordered = len(names) == 4 or index == sorted(index)
+        if min(index) >= 0 and not taken & {*index} and ordered:
+            return tuple(index), convention
+    return (), None
+
+
+def _joints(header: Sequence[str]) -> tuple[int, ...]:
+    found: dict[int, int] = {}
+    for i, name in enumerate(header):
+        lower = name.strip().lower()
+        match = _JOINT.match(lower) or re.match(r"(?:.*joints?|.*_q|q|a)[._\s\[]*(\d)\b", lower)
+        if match:
+            found.setdefault(int(match[1]), i)
+    first = min(found, default=1)
+    count = len(found)
+    complete = count >= 4 and sorted(found) == list(range(first, first + count))
+    return (
+        tuple(found[k] for k in sorted(found))
+        if complete and (count >= 5 or "j" in header[found[first]].lower())
+        else ()
+    )
+
+
+def _matrix(header: Sequence[str]) -> tuple[int, ...]:
+    """Columns m00 … m33, r11 … t3 or 0 … 15 in the order of the file, if they are 12 or 16."""
+    named = [
+        i for i, name in enumerate(header) if re.search(r"(?:^|[._])(?:[mtr]?_?\d{1,2}|t[xyz1-3])\]?$", name.lower())
+    ]
+    return tuple(named) if len(named) in (12, 16) else ()

@@ -1,0 +1,150 @@
+"""From a folder of scans and poses to the first session: read, paired, judged by the scans, with reasons.
+
+What a person states is taken; what the files tell is read; the rest is decided by the scans (`doctor.py`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from stitch.controllers.importer import import_file
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.intake.cloud_pairs import Pairing, pairings
+from stitch.intake.doctor import Decided, decide
+from stitch.intake.found_files import PROGRAMS, Found, look_into
+from stitch.intake.guesses import Guess
+from stitch.intake.joint_poses import JOINT_ANGLES, joint_layouts, joint_readings
+from stitch.intake.layouts import layouts
+from stitch.intake.mounting import Mounting, mounting
+from stitch.intake.number_table import parse_number_table
+from stitch.intake.plausible_units import CLOUD_UNITS, cloud_units, pose_units
+from stitch.intake.raw_poses import RawPoses, read_raw_poses
+from stitch.intake.readings import Reading, readings
+from stitch.intake.stated import Stated
+from stitch.intake.ways import MM
+from stitch.intake.why import guesses_of
+from stitch.integrity.relative_scans import relative_scans
+from stitch.measurement.capture import Capture
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Scanner, Session, View
+from stitch.observations.surfaces.thinning import thinned
+from stitch.reading.clouds import read_cloud
+
+# Enough points a view to tell conventions.
+_POINTS = 8000
+_FEWEST = 3
+
+
+@dataclass(frozen=True)
+class FirstSession:
+    """What was found in a folder and how it is to be taken."""
+
+    found: Found
+    raw: RawPoses
+    cloud_unit: str
+    decided: Decided
+    mounting: Mounting
+    guesses: tuple[Guess, ...]
+    optical_axis: str
+
+    @property
+    def pairing(self) -> Pairing:
+        """Which row belongs to which cloud."""
+        return self.decided.best.way.pairing
+
+
+def first_session(folder: Path, stated: Stated) -> FirstSession:
+    """Find, read and judge.
+
+    Raises:
+        InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
+    """
+    found = look_into(folder, stated.poses)
+    raw = _raw(found)
+    raw = raw.renamed(stated.columns) if stated.columns else raw
+    ways_to_read = _readings(found, raw, stated)
+    clouds = [read_cloud(file) for file in found.clouds]
+    for file, cloud in zip(found.clouds, clouds, strict=True):
+        if len(cloud.points) < _FEWEST:
+            raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
+    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units([c.points for c in clouds])
+    pairs = pairings(found.clouds, raw.labels)
+    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
+    units = _units(ways_to_read, stated)
+    decided = decide(capture, cache(lambda: relative_scans(capture)), ways_to_read, pairs, units, stated.carries)
+    of_joints = decided.best.way.reading.rotation == JOINT_ANGLES
+    settled = mounting(decided, stated.mount, stated.inverse, of_joints)
+    axis, axis_guess = optical_axis(clouds)
+    told = guesses_of(found, raw, decided, [c.points for c in clouds], own_units, stated)
+    return FirstSession(found, raw, own_units[0], decided, settled, (*told, settled.guess, axis_guess), axis)
+
+
+def _raw(found: Found) -> RawPoses:
+    first = found.poses[0]
+    if first.suffix.lower() in PROGRAMS:
+        table = parse_number_table(first, import_file(first, "mm").text)
+        return RawPoses(str(first), table.header, table.numbers, table.labels, "the points of a robot program")
+    return read_raw_poses(found.poses)
+
+
+def _readings(found: Found, raw: RawPoses, stated: Stated) -> list[Reading]:
+    out: list[Reading] = []
+    for layout in layouts(raw):
+        if layout.rotation.shape[1]:
+            out += readings(layout, stated.rotation, stated.angle_unit)
+        else:
+            out += joint_readings(layout, found.urdf, stated.angle_unit)
+    if raw.header is None and raw.numbers.shape[1] >= 6 and found.urdf is not None and stated.rotation is None:
+        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, found.urdf, stated.angle_unit)]
+    return out
+
+
+def _units(found: Sequence[Reading], stated: Stated) -> list[str]:
+    """Units that positions can have of which the file does not say it: stated, or plausible."""
+    if stated.length_unit:
+        return [stated.length_unit]
+    open_ = [r for r in found if r.layout.length_unit is None]
+    return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3]))) or ["mm"]
+
+
+def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
+    """Scans made light, in mm, at no poses."""
+    views = tuple(
+        View(
+            name=f"v{i}",
+            cloud=Cloud(cloud.points * scale, cloud.normals),
+            T_base_flange=np.eye(4),
+            joints=None,
+            approach=None,
+            time_s=None,
+            covariates={},
+        )
+        for i, cloud in enumerate(clouds)
+    )
+    session = Session(
+        path=Path(),
+        name="",
+        length_unit="mm",
+        mount="eye_in_hand",
+        scanner=Scanner(None, None, None, np.array([0.0, 0.0, 1.0])),
+        robot=None,
+        sphere_radius=None,
+        cad=None,
+        cad_unit=None,
+        views=views,
+    )
+    return thinned(session, _POINTS)[1]
+
+
+def optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:
+    """The side of z on which the points lie."""
+    middle: Array = np.mean([np.median(c.points, axis=0) for c in clouds], axis=0)
+    axis = "-z" if middle[2] < 0 and abs(middle[2]) > np.linalg.norm(middle[:2]) else "+z"
+    told = abs(middle[2]) > np.linalg.norm(middle[:2])
+    where = ", ".join(f"{x:.3g}" for x in middle)
+    reason = f"the middle of the scans lies at ({where}) in the scanner's frame"
+    return axis, Guess("optical_axis", axis, reason, bool(told), "optical_axis in session.toml")

@@ -1,0 +1,128 @@
+"""What a folder holds: clouds, files of poses, a robot's description."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stitch.errors import InputError
+from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
+from stitch.reading.clouds import CLOUD_SUFFIXES
+
+# Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
+_EITHER = (".txt", ".csv", ".asc")
+_CLOUD_LINES = 400
+PROGRAMS = (".ls", ".src", ".mod", ".script")
+_DEEPEST = 3
+_LARGEST_TABLE_MB = 5.0
+# What this program writes itself.
+_OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
+
+
+@dataclass(frozen=True)
+class Found:
+    """Files of one folder; clouds in the order of their names, numbers by size."""
+
+    folder: Path
+    clouds: tuple[Path, ...]
+    poses: tuple[Path, ...]  # one table, or a file for each pose
+    urdf: Path | None
+    aside: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
+
+
+def look_into(folder: Path, poses: Path | None = None) -> Found:
+    """Find clouds and poses in a folder and below it.
+
+    Args:
+        poses: file or folder of the poses, where a person names it.
+
+    Raises:
+        InputError: no clouds, no poses, or several tables of poses.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; to fix: name the folder of the scans")
+    if poses is not None and not poses.exists():
+        raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
+    files = _files(folder, 0)
+    named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
+    clouds, other_clouds = _clouds([f for f in files if f not in named])
+    if not clouds:
+        known = ", ".join(CLOUD_SUFFIXES)
+        raise InputError(f"{folder}: no clouds there; to fix: put the scans there as {known}")
+    taken = {*clouds, *other_clouds}
+    candidates = [f for f in files if f not in taken and _may_hold_poses(f)]
+    chosen, rest = _named(poses, taken) if poses is not None else _poses(folder, candidates, len(clouds))
+    urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
+    return Found(
+        folder=folder,
+        clouds=tuple(clouds),
+        poses=tuple(chosen),
+        urdf=urdfs[0] if len(urdfs) == 1 else None,
+        aside=(*other_clouds, *rest),
+    )
+
+
+def _files(folder: Path, depth: int) -> list[Path]:
+    """Files in a folder and below, hidden ones and folders of runs left out."""
+    out = []
+    for entry in natural(folder.iterdir()):
+        if entry.name.startswith(".") or entry.name in _OWN:
+            continue
+        if entry.is_file():
+            out.append(entry)
+        elif entry.is_dir() and depth < _DEEPEST and not (entry / "result.json").exists():
+            out += _files(entry, depth + 1)
+    return out
+
+
+def _clouds(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Files of the kind that most clouds have, and clouds of other kinds."""
+    fitting = [f for f in files if f.suffix.lower() in CLOUD_SUFFIXES and _is_cloud(f)]
+    if not fitting:
+        return [], []
+    kinds = Counter(f.suffix.lower() for f in fitting)
+    order = list(CLOUD_SUFFIXES)
+    best = max(kinds, key=lambda kind: (kinds[kind], -order.index(kind)))
+    return [f for f in fitting if f.suffix.lower() == best], [f for f in fitting if f.suffix.lower() != best]
+
+
+def _is_cloud(file: Path) -> bool:
+    if file.suffix.lower() not in _EITHER:
+        return True
+    with file.open("rb") as stream:
+        return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
+
+
+def _may_hold_poses(file: Path) -> bool:
+    kinds = (*STRUCTURED, *TABLES, *PROGRAMS)
+    return file.suffix.lower() in kinds and file.stat().st_size < _LARGEST_TABLE_MB * 1e6
+
+
+def _named(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
+    if poses.is_dir():
+        inside = [f for f in natural(poses.iterdir()) if f.is_file() and f not in clouds and _may_hold_poses(f)]
+        if not inside:
+            raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
+        return inside, []
+    return [poses], []
+
+
+def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
+    """The one table, or the files that are named alike and are about as many as the clouds."""
+    alike: dict[tuple[Path, str, str], list[Path]] = {}
+    for file in candidates:
+        alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
+    sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
+    single = [files for files in alike.values() if len(files) == 1]
+    groups = sets or [g for g in single if _says_pose(g[0])] or single
+    if not groups:
+        raise InputError(f"{folder}: no file of poses there; to fix: name it with --poses FILE")
+    if len(groups) > 1:
+        shown = ", ".join(str(g[0].relative_to(folder)) for g in groups[:4])
+        raise InputError(f"{folder}: several files may hold the poses ({shown}); to fix: name it with --poses FILE")
+    return groups[0], [f for f in candidates if f not in groups[0]]
+
+
+def _says_pose(file: Path) -> bool:
+    return bool(re.search(r"pose|robot|flange|tcp|joint|trajector", file.stem.lower()))

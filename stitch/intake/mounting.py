@@ -1,0 +1,62 @@
+"""Which of scanner and part the robot carries, and whether poses are of the flange in the base or the other way round.
+
+Scans cannot tell "the scanner at the flange" from "the part at the flange, poses inverted": both move alike. What
+tells them apart is where things lie: what sits at the flange is near its origin, what stands in the cell is not near
+that of the base.
+"""
+
+from dataclasses import dataclass
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.intake.doctor import Decided
+from stitch.intake.guesses import Guess
+
+_WORDS = {"eye_in_hand": "the scanner sits at the flange", "eye_to_hand": "the part sits at the flange"}
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the poses are to be taken."""
+
+    mount: str
+    inverted: bool  # the table holds T_flange_base
+    guess: Guess
+
+    def flange(self, T: Array) -> Array:
+        """T_base_flange from poses as the table has them, (..., 4, 4)."""
+        return frames.inverse(T) if self.inverted else T
+
+
+def mounting(decided: Decided, mount: str | None, inverse: bool | None, of_joints: bool) -> Mounting:
+    """Settle it, by what a person states, else by where things lie.
+
+    Args:
+        mount, inverse: as stated; None where they are not.
+        of_joints: poses are from joint angles, so that their direction is known.
+    """
+    direct = "eye_in_hand" if decided.best.way.carries else "eye_to_hand"
+    other = "eye_to_hand" if decided.best.way.carries else "eye_in_hand"
+    nearer = "eye_in_hand" if decided.scanner_at_flange else "eye_to_hand"
+    scanner, part = (f"{mm:.0f} mm" for mm in (decided.scanner_away, decided.part_away))
+    placed = (
+        f"under it the scanner lies {scanner} from the origin of its frame and the part {part} from that of its own"
+    )
+    told = True
+    if mount is not None:
+        chosen, reason = mount, "stated with --mount"
+    elif inverse is not None or of_joints:
+        chosen = other if inverse else direct
+        reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")
+    elif decided.told and decided.mount_told:
+        chosen, reason = nearer, f"{placed}: what lies nearer sits at the flange"
+    else:
+        chosen, told = direct, False
+        reason = (
+            f"{placed}; poses are usually those of the flange in the base" if decided.told else "as poses usually are"
+        )
+    inverted = chosen != direct
+    value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
+    rest = other if chosen == direct else direct
+    runner_up = f"{rest} with poses {'inverted' if not inverted else 'as they are'}" if mount is None else None
+    return Mounting(chosen, inverted, Guess("mount", value, reason, told, "--mount", runner_up))

@@ -1,0 +1,132 @@
+"""Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.reading.text_file import read_text, shortened
+
+_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_BRACKETS = str.maketrans("[](){}", " " * 6)
+_COMMENTS = ("#", "%", "//")
+_LARGEST_MB = 50
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """Numbers in rows, as one file has them."""
+
+    file: Path
+    header: tuple[str, ...] | None  # names of the columns of numbers
+    numbers: Array  # (n, C)
+    labels: tuple[tuple[str, ...], ...]  # texts of every row, from columns that hold no numbers
+    lines: tuple[int, ...]  # line number of every row
+    words: str  # how it was read
+
+
+def read_number_table(file: Path) -> NumberTable:
+    """Read a table of numbers.
+
+    Raises:
+        InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
+    """
+    return parse_number_table(file, read_text(file, "name a table of poses", _LARGEST_MB))
+
+
+def parse_number_table(file: Path, told: str) -> NumberTable:
+    """The same of a text that was read from a file."""
+    kept = [(i, line.strip()) for i, line in enumerate(told.splitlines(), 1) if line.strip()]
+    body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
+    if not body:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    separator = max(_SEPARATORS, key=lambda s: sum(_value(c) is not None for _, line in body for c in _cells(line, s)))
+    rows = [(i, _cells(line, separator)) for i, line in body]
+    comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
+    header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
+    text, numeric = _columns(rows)
+    if len(numeric) < 3:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    numbers = np.array([[_number(file, i, row[c]) for c in numeric] for i, row in rows])
+    decimal = any(_DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
+    words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
+    words += ", with a header" if header else ", without a header"
+    return NumberTable(
+        file=file,
+        header=tuple(header[c] for c in numeric) if header else None,
+        numbers=numbers,
+        labels=tuple(tuple(row[c] for c in text) for _, row in rows),
+        lines=tuple(i for i, _ in rows),
+        words=words,
+    )
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """Cells of a line, trimmed; an empty one at the end goes."""
+    line = line.translate(_BRACKETS).strip()
+    if separator == " ":
+        return line.split()
+    row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    cells = [cell.strip().strip('"') for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _value(cell: str) -> float | None:
+    """The number in a cell, with a point or a comma; None if there is none."""
+    cell = cell.rstrip("°").strip()
+    if _NUMBER.fullmatch(cell):
+        return float(cell)
+    if _DECIMAL_COMMA.fullmatch(cell):
+        return float(cell.replace(",", "."))
+    return None
+
+
+def _number(file: Path, line: int, cell: str) -> float:
+    value = _value(cell)
+    if value is None or not abs(value) < 1e30:
+        raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
+    return value
+
+
+def _split_header(
+    file: Path, rows: list[tuple[int, list[str]]], comment: str, separator: str
+) -> tuple[list[str] | None, list[tuple[int, list[str]]]]:
+    """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
+    header: list[str] | None = None
+    first = rows[0][1]
+    below = rows[1:] or rows
+    width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
+    typical = next((row for _, row in below if len(row) == width), first)
+    texts = [_value(cell) is None for cell in first]
+    if len(rows) > 1 and any(t and _value(c) is not None for t, c in zip(texts, typical, strict=False)):
+        header, rows = first, rows[1:]
+    elif len(rows) > 1 and all(texts) and len(first) != width:
+        rows = rows[1:]  # a title
+    elif comment:
+        names = _cells(comment.lstrip("#%/ "), separator)
+        header = names if len(names) == width and all(_value(name) is None for name in names) else None
+    odd = next(((i, row) for i, row in rows if len(row) != width), None)
+    if odd is not None:
+        raise InputError(
+            f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}; to fix: write one number a column"
+        )
+    if header is not None and len(header) != width:
+        raise InputError(f"{file} line 1: {len(header)} names for {width} columns; to fix: name every column once")
+    return header, rows
+
+
+def _columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
+    """Columns of text, and of numbers: a column with numbers in more than half of its cells is one of numbers."""
+    width = len(rows[0][1])
+    share = [sum(_value(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
+    return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]

@@ -1,0 +1,132 @@
+"""session.toml with every guess as a comment beside its reason, and views.csv; written both or not at all."""
+
+import csv
+import io
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stitch import frames
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.intake.first_session import FirstSession
+from stitch.intake.guesses import Guess
+from stitch.intake.joint_poses import JOINT_ANGLES
+from stitch.intake.plausible_units import POSE_UNITS
+from stitch.reading.session_toml import FORMAT
+from stitch.system.whole_file import whole
+from stitch.units import METRES
+from stitch.writing.session_files import pose_columns
+
+_WIDTH = 118
+
+
+def require_free(folder: Path) -> None:
+    """Refuse a folder that holds a session already.
+
+    Raises:
+        InputError: with what to do.
+    """
+    for name in ("session.toml", "views.csv"):
+        if (folder / name).exists() or (folder / name).is_symlink():
+            raise InputError(f"{folder / name}: exists already; to fix: remove it, or name another folder with -o")
+
+
+def write_draft(folder: Path, first: FirstSession) -> None:
+    """Write both files into a folder, which is made where it does not exist.
+
+    Raises:
+        InputError: there is a session already.
+    """
+    require_free(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole(folder / "views.csv") as table, whole(folder / "session.toml") as toml:
+        table.write_text(views_text(folder, first), encoding="utf-8")
+        toml.write_text(toml_text(folder, first), encoding="utf-8")
+
+
+def length_unit(first: FirstSession) -> str:
+    """The session's: that of the poses, mm where it has no other."""
+    unit = first.decided.best.way.length_unit
+    return unit if unit in METRES else "mm"
+
+
+def toml_text(folder: Path, first: FirstSession) -> str:
+    """session.toml."""
+    told = {guess.what: guess for guess in first.guesses}
+    lines = [f'format = "{FORMAT}"', f'name = "{_name(first.found.folder)}"']
+    for what in ("files", "pairing", "columns", "rotation"):
+        lines += ["", *_comment(told[what])]
+    unit = length_unit(first)
+    lines += ["", *_comment(told["length_unit"]), f'length_unit = "{unit}"']
+    lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
+    lines += ["", *_comment(told["mount"]), f'mount = "{first.mounting.mount}"']
+    lines += ["", "[scanner]", *_comment(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
+    reading = first.decided.best.way.reading
+    urdf = first.found.urdf
+    if reading.layout.joints is not None and urdf is not None:
+        path = Path(os.path.relpath(urdf, folder)).as_posix()
+        lines += ["", "[robot]", "# base_link and flange_link where the chain does not end at the flange"]
+        lines += [f'urdf = "{path}"']
+    return "\n".join(lines) + "\n"
+
+
+def _comment(guess: Guess) -> list[str]:
+    """A guess in lines that begin with #."""
+    words, lines = guess.line.split(), [""]
+    for word in words:
+        if len(lines[-1]) + len(word) + 1 > _WIDTH - 2:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return [f"# {'  ' * bool(i)}{line}" for i, line in enumerate(lines)]
+
+
+def _name(folder: Path) -> str:
+    """A name for the session that can be that of its run."""
+    return re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "session"
+
+
+def views_text(folder: Path, first: FirstSession) -> str:
+    """views.csv: a row for every cloud that has a pose."""
+    used = first.pairing.used
+    clouds = [first.found.clouds[i] for i in used]
+    rows = [int(first.pairing.rows[i] or 0) for i in used]
+    columns: dict[str, list[str]] = {
+        "view": _views(clouds, first.found.folder),
+        "cloud": [Path(os.path.relpath(cloud, folder)).as_posix() for cloud in clouds],
+    }
+    reading = first.decided.best.way.reading
+    if reading.layout.joints is not None:
+        joints = _degrees(first, reading.layout.joints)[rows]
+        columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
+    if reading.rotation != JOINT_ANGLES:
+        columns |= {name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_poses(first, rows)).items()}
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return out.getvalue()
+
+
+def _poses(first: FirstSession, rows: list[int]) -> Array:
+    """T_base_flange (V, 4, 4) in the session's length_unit."""
+    way = first.decided.best.way
+    T = way.reading.T[rows]
+    scale = POSE_UNITS[way.length_unit] / METRES[length_unit(first)]
+    return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
+
+
+def _degrees(first: FirstSession, joints: Array) -> Array:
+    reading = first.decided.best.way.reading
+    in_radians = reading.angle_unit == "rad" if reading.rotation == JOINT_ANGLES else np.abs(joints).max() <= 2 * np.pi
+    return np.degrees(joints) if in_radians else joints
+
+
+def _views(clouds: list[Path], folder: Path) -> list[str]:
+    """Names of views: those of the clouds' files, with their folders where two are called alike."""
+    stems = [cloud.stem for cloud in clouds]
+    if len(set(stems)) == len(stems):
+        return stems
+    return [cloud.relative_to(folder).with_suffix("").as_posix().replace("/", "-") for cloud in clouds]

@@ -1,0 +1,107 @@
+"""The guesses of a first session, each with its reason in words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.intake.doctor import Decided, Judged
+from stitch.intake.found_files import Found
+from stitch.intake.guesses import Guess
+from stitch.intake.plausible_units import POSE_UNITS, size_words
+from stitch.intake.raw_poses import RawPoses
+from stitch.intake.stated import Stated
+
+
+def guesses_of(
+    found: Found,
+    raw: RawPoses,
+    decided: Decided,
+    clouds: Sequence[Array],
+    own_units: Sequence[str],
+    stated: Stated,
+) -> tuple[Guess, ...]:
+    """What was found and how it is read; of the mount speaks `mounting.py`."""
+    return (
+        _files(found, raw),
+        _pairing(decided),
+        _columns(raw, decided, stated),
+        _rotation(decided, stated),
+        _unit(decided, stated),
+        _cloud_unit(clouds, own_units, stated),
+    )
+
+
+def judged_words(judged: Judged) -> str:
+    """What the scans say of a way."""
+    if not judged.meets:
+        return "no two views meet"
+    motions = "" if judged.closed is None else f", {100 * judged.closed:.0f} % of the scanner's motions close"
+    return f"views {judged.misfit:.2f} mm apart{motions}"
+
+
+def _next(decided: Decided) -> str:
+    return (
+        "" if decided.runner_up is None else f"; the next best way leaves them {decided.runner_up.misfit:.2f} mm apart"
+    )
+
+
+def _files(found: Found, raw: RawPoses) -> Guess:
+    clouds = f"{len(found.clouds)} clouds {found.clouds[0].name} … {found.clouds[-1].name}"
+    aside = f"; left aside: {', '.join(f.name for f in found.aside[:5])}" if found.aside else ""
+    poses = found.poses[0].name if len(found.poses) == 1 else f"{found.poses[0].name} … {found.poses[-1].name}"
+    return Guess("files", f"{clouds}, {len(raw.numbers)} poses in {poses}", f"{raw.words}{aside}", True, "--poses")
+
+
+def _pairing(decided: Decided) -> Guess:
+    pairing = decided.best.way.pairing
+    if pairing.by_name:
+        return Guess("pairing", pairing.words, "cloud and pose bear the same name or number", True, "--poses")
+    reason = f"names do not tell it; under it {judged_words(decided.best)}"
+    return Guess("pairing", pairing.words, reason, decided.told, "a column with the cloud's file name")
+
+
+def _columns(raw: RawPoses, decided: Decided, stated: Stated) -> Guess:
+    layout = decided.best.way.reading.layout
+    if stated.columns:
+        return Guess("columns", ", ".join(stated.columns), "stated with --columns", True, "--columns")
+    reason = "the file names them" if layout.named else "told by their values"
+    return Guess("columns", layout.words, reason, layout.named or decided.told, "--columns")
+
+
+def _rotation(decided: Decided, stated: Stated) -> Guess:
+    best = decided.best.way.reading
+    if stated.rotation:
+        return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
+    if best.layout.convention is not None:
+        return Guess("rotation", best.words, "told by the file", True, "--rotation")
+    reason = f"{judged_words(decided.best)}{_next(decided)}"
+    alike = [w.reading.words for w in decided.alike if w.reading.words != best.words]
+    if alike:
+        reason += f"; {', '.join(dict.fromkeys(alike[:3]))} would stitch alike, with another hand-eye"
+    other = decided.runner_up
+    words = None if other is None else f"{other.way.reading.words}, {_direction(other)}, {judged_words(other)}"
+    return Guess("rotation", best.words, reason, decided.told, "--rotation", words)
+
+
+def _direction(judged: Judged) -> str:
+    return "poses as they are" if judged.way.carries else "poses inverted"
+
+
+def _unit(decided: Decided, stated: Stated) -> Guess:
+    way = decided.best.way
+    reach = float(np.linalg.norm(way.reading.T[:, :3, 3], axis=1).max())
+    if stated.length_unit:
+        return Guess("length_unit", way.length_unit, "stated with --unit", True, "--unit")
+    if way.reading.layout.length_unit:
+        return Guess("length_unit", way.length_unit, "told by the file", True, "--unit")
+    metres = reach * POSE_UNITS[way.length_unit]
+    reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {judged_words(decided.best)}"
+    return Guess("length_unit", way.length_unit, reason, decided.told, "--unit")
+
+
+def _cloud_unit(clouds: Sequence[Array], own_units: Sequence[str], stated: Stated) -> Guess:
+    if stated.cloud_unit:
+        return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
+    other = own_units[1] if len(own_units) > 1 else None
+    return Guess("cloud_unit", own_units[0], size_words(clouds), other is None, "--cloud-unit", other)

@@ -1,0 +1,76 @@
+"""`stitch init` at the command line: what it writes, asks and refuses."""
+
+import json
+import shutil
+
+import pytest
+
+from data_synth.fixtures.raw_folders import Convention, raw_folder
+from stitch.cli.main import main
+from stitch.reading.session_folder import load_session
+
+
+@pytest.fixture
+def raw(session, tmp_path):
+    """Three views of a simulated cell as a raw folder."""
+    return raw_folder(session, tmp_path / "raw", Convention())
+
+
+def ended(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        main([str(a) for a in arguments])
+    printed = capsys.readouterr()
+    return end.value.code or 0, printed.out, printed.err
+
+
+STATED = (
+    "--rotation",
+    "xyz-extrinsic",
+    "--angles",
+    "rad",
+    "--unit",
+    "mm",
+    "--cloud-unit",
+    "mm",
+    "--mount",
+    "eye_to_hand",
+)
+
+
+def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
+    code, out, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", "--json", "-o", tmp_path / "made")
+    assert code == 0, err
+    document = json.loads(out)
+    assert document["views"] == 3 and {g["what"] for g in document["guesses"]} >= {"rotation", "mount", "pairing"}
+    made, true = load_session(tmp_path / "made"), load_session(session)
+    for a, b in zip(made.views, true.views, strict=True):
+        assert abs(a.T_base_flange - b.T_base_flange).max() < 1e-3
+    assert not (raw / "session.toml").exists()
+
+
+def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, capsys):
+    table = raw / "RobotPoses.dat"
+    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
+    code, _, err = ended(capsys, "init", raw)
+    assert code == 2 and "--rotation" in err and "--mount" in err and "--yes" in err
+    assert not (raw / "session.toml").exists() and not (raw / "views.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "arguments", "told"),
+    [
+        (lambda raw: (raw / "session.toml").write_text(""), (), "exists already"),
+        (lambda raw: (raw / "RobotPoses.dat").unlink(), (), "--poses"),
+        (lambda raw: [f.unlink() for f in raw.glob("*.ply")], (), "no clouds"),
+        (lambda raw: shutil.copy(raw / "RobotPoses.dat", raw / "robot.txt"), (), "several files"),
+        (lambda raw: None, ("--rotation", "zyx"), "--rotation zyx: use xyz-intrinsic"),
+        (lambda raw: None, ("--columns", "x,y,z"), "3 names"),
+        (lambda raw: None, ("--poses", "nowhere.csv"), "nowhere.csv: no such file"),
+        (lambda raw: (raw / "RobotPoses.dat").write_text("1,2,3,4,5,6\n" * 9), (), "3 clouds and 9 poses"),
+    ],
+)
+def test_what_cannot_be_a_session_is_refused_in_one_line(raw, capsys, spoil, arguments, told):
+    spoil(raw)
+    code, out, err = ended(capsys, "init", raw, "--yes", *arguments)
+    assert code == 2 and told in err and not out
+    assert len(err.strip().splitlines()) == 1 and "Traceback" not in err

@@ -1,0 +1,55 @@
+"""Tables as people write them."""
+
+import numpy as np
+import pytest
+
+from stitch.errors import InputError
+from stitch.intake.number_table import read_number_table
+
+ROWS = [[111.5, -331.25, 317.0, -2.5, 0.125, 3.0], [114.0, -358.5, 360.75, -2.75, 0.25, -3.0]]
+
+
+def written(row, separator, comma):
+    cells = [str(x).replace(".", ",") if comma else str(x) for x in row]
+    return separator.join(cells)
+
+
+@pytest.mark.parametrize("end", ["", "trailing"])
+@pytest.mark.parametrize("header", [None, "x y z rx ry rz", "# x y z rx ry rz"])
+@pytest.mark.parametrize(
+    ("separator", "comma"),
+    [(",", False), (", ", False), (";", False), (";", True), ("\t", True), ("   ", False), (" ", True)],
+)
+def test_any_separator_decimal_mark_and_header(tmp_path, separator, comma, header, end):
+    lines = [written(row, separator, comma) + separator.strip() * bool(end) for row in ROWS]
+    if header:
+        mark, names = ("# ", header[2:]) if header[0] == "#" else ("", header)
+        lines = [mark + separator.join(names.split()), *lines]
+    (tmp_path / "t.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    table = read_number_table(tmp_path / "t.txt")
+    assert np.array_equal(table.numbers, ROWS)
+    assert table.header == (("x", "y", "z", "rx", "ry", "rz") if header else None)
+
+
+def test_brackets_comments_degree_signs_and_names_of_views(tmp_path):
+    text = "// made by hand\nview-1, [1.5, 2, 3], 10°, a.ply\n\nview-2, [2.5, 2, 3], -20°, b.ply\n"
+    (tmp_path / "t.txt").write_text(text, encoding="utf-8")
+    table = read_number_table(tmp_path / "t.txt")
+    assert table.numbers.tolist() == [[1.5, 2, 3, 10], [2.5, 2, 3, -20]]
+    assert table.labels == (("view-1", "a.ply"), ("view-2", "b.ply")) and table.lines == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no rows"),
+        ("just words\nand more\n", "no rows"),
+        ("1,2,3\n4,5\n6,7,8\n", "line 2: 2 cells"),
+        ("1,2,3\n4,x5,6\n7,8,9\n", "line 2: 'x5'"),
+        ("1,2,3\n4,1e99,6\n7,8,9\n", "line 2"),
+    ],
+)
+def test_what_is_no_table_is_refused_with_its_line(tmp_path, text, told):
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        read_number_table(tmp_path / "t.csv")

@@ -1,0 +1,53 @@
+"""Every order of Euler angles against products of turns about one axis, written out here."""
+
+import numpy as np
+import pytest
+
+from stitch.errors import InputError
+from stitch.intake.layouts import Layout
+from stitch.intake.readings import conventions, readings
+
+
+def turn(axis, angle):
+    """Rotation about a coordinate axis, from its definition."""
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    R = np.eye(3)
+    R[j, j] = R[k, k] = np.cos(angle)
+    R[k, j], R[j, k] = np.sin(angle), -np.sin(angle)
+    return R
+
+
+ANGLES = np.array([[0.3, -0.8, 1.9], [-2.0, 0.4, 0.7]])
+EULER = [word for word in conventions() if word.endswith(("intrinsic", "extrinsic"))]
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+@pytest.mark.parametrize("word", EULER)
+def test_orders_of_euler_angles(word, unit):
+    written = np.degrees(ANGLES) if unit == "deg" else ANGLES
+    (reading,) = readings(Layout(np.zeros((2, 3)), written, None, ""), word, unit)
+    order, how = word.split("-")
+    for T, angles in zip(reading.T, ANGLES, strict=True):
+        first, second, third = (turn(axis, angle) for axis, angle in zip(order, angles, strict=True))
+        expected = first @ second @ third if how == "intrinsic" else third @ second @ first
+        assert np.allclose(T[:3, :3], expected, atol=1e-12)
+
+
+def test_there_are_twelve_orders_on_either_side():
+    assert len(EULER) == len(set(EULER)) == 24
+
+
+def test_turns_in_another_order_than_the_columns_stand():
+    (reading,) = readings(Layout(np.zeros((2, 3)), ANGLES, None, ""), "yxz-by-axis", "rad")
+    x, y, z = ANGLES[0]
+    assert np.allclose(reading.T[0, :3, :3], turn("y", y) @ turn("x", x) @ turn("z", z))
+
+
+def test_degrees_where_numbers_exceed_a_turn_in_radians():
+    assert {r.angle_unit for r in readings(Layout(np.zeros((2, 3)), ANGLES * 30, None, ""))} == {"deg"}
+
+
+def test_a_convention_that_the_columns_cannot_have_is_refused():
+    with pytest.raises(InputError, match="--rotation quaternion-xyzw"):
+        readings(Layout(np.zeros((2, 3)), ANGLES, None, ""), "quaternion-xyzw")
