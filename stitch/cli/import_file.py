@@ -9,13 +9,19 @@ import typer
 from stitch.cli.streams import results
 from stitch.controllers.importer import import_file
 from stitch.errors import InputError
+from stitch.intake.import_table import import_table, is_table_of_poses
+from stitch.intake.stated import Stated
 from stitch.system.whole_file import whole
 
 
 def import_command(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="FANUC .ls, KUKA .dat/.src, ABB .mod, UR .script/.csv, tracker .csv."),
+        typer.Argument(
+            metavar="FILE",
+            help="FANUC .ls, KUKA .dat/.src, ABB .mod, UR .script/.csv, tracker .csv; or a table of poses or joint "
+            "angles as text, JSON, YAML, NPY.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -29,11 +35,25 @@ def import_command(
     tool: Annotated[
         str | None, typer.Option("--tool", help="Tool in the flange, numbers as the controller shows them.")
     ] = None,
+    columns: Annotated[
+        str | None, typer.Option("--columns", help="Of a table: x,y,z,rx,ry,rz or j1,j2 …; - leaves one out.")
+    ] = None,
+    rotation: Annotated[
+        str | None, typer.Option("--rotation", help="Of a table: xyz-extrinsic, zyx-intrinsic, rotation-vector …")
+    ] = None,
+    angles: Annotated[str | None, typer.Option("--angles", help="Of a table: deg or rad.")] = None,
+    file_unit: Annotated[str | None, typer.Option("--file-unit", help="Of a table: mm, m, cm or inch.")] = None,
+    inverse: Annotated[bool, typer.Option("--inverse", help="The table holds T_flange_base.")] = False,
 ) -> None:
-    """Write the points of a robot program or of a tracker as views.csv (frames.csv, points.csv)."""
+    """Write the points of a robot program, of a tracker or of a table as views.csv (frames.csv, points.csv)."""
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
-    imported = import_file(file, unit, frame, tool)
+    names = tuple(name.strip() for name in columns.split(",")) if columns else ()
+    stated = Stated(None, names, rotation, angles, file_unit, inverse=inverse or None)
+    if stated != Stated() or is_table_of_poses(file):
+        imported = import_table(file, unit, stated)
+    else:
+        imported = import_file(file, unit, frame, tool)
     if output is None:
         results().write(imported.text)
     else:

@@ -66,7 +66,7 @@ def first_session(folder: Path, stated: Stated) -> FirstSession:
     found = look_into(folder, stated.poses)
     raw = _raw(found)
     raw = raw.renamed(stated.columns) if stated.columns else raw
-    ways_to_read = _readings(found, raw, stated)
+    ways_to_read = all_readings(raw, found.urdf, stated)
     clouds = [read_cloud(file) for file in found.clouds]
     for file, cloud in zip(found.clouds, clouds, strict=True):
         if len(cloud.points) < _FEWEST:
@@ -74,7 +74,7 @@ def first_session(folder: Path, stated: Stated) -> FirstSession:
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units([c.points for c in clouds])
     pairs = pairings(found.clouds, raw.labels)
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
-    units = _units(ways_to_read, stated)
+    units = open_units(ways_to_read, stated)
     decided = decide(capture, cache(lambda: relative_scans(capture)), ways_to_read, pairs, units, stated.carries)
     of_joints = decided.best.way.reading.rotation == JOINT_ANGLES
     settled = mounting(decided, stated.mount, stated.inverse, of_joints)
@@ -91,19 +91,27 @@ def _raw(found: Found) -> RawPoses:
     return read_raw_poses(found.poses)
 
 
-def _readings(found: Found, raw: RawPoses, stated: Stated) -> list[Reading]:
+def all_readings(raw: RawPoses, urdf: Path | None, stated: Stated) -> list[Reading]:
+    """Every reading of a table that is not ruled out by what a person states.
+
+    Args:
+        urdf: of the robot, where the table may hold joint angles.
+
+    Raises:
+        InputError: columns that hold no pose.
+    """
     out: list[Reading] = []
     for layout in layouts(raw):
         if layout.rotation.shape[1]:
             out += readings(layout, stated.rotation, stated.angle_unit)
         else:
-            out += joint_readings(layout, found.urdf, stated.angle_unit)
-    if raw.header is None and raw.numbers.shape[1] >= 6 and found.urdf is not None and stated.rotation is None:
-        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, found.urdf, stated.angle_unit)]
+            out += joint_readings(layout, urdf, stated.angle_unit)
+    if raw.header is None and raw.numbers.shape[1] >= 6 and urdf is not None and stated.rotation is None:
+        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, urdf, stated.angle_unit)]
     return out
 
 
-def _units(found: Sequence[Reading], stated: Stated) -> list[str]:
+def open_units(found: Sequence[Reading], stated: Stated) -> list[str]:
     """Units that positions can have of which the file does not say it: stated, or plausible."""
     if stated.length_unit:
         return [stated.length_unit]

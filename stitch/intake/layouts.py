@@ -12,7 +12,7 @@ from stitch.intake.raw_poses import RawPoses
 # A quaternion with three digits has length 1 within this.
 _UNIT_LENGTH = 5e-3
 _ORTHONORMAL = 1e-2
-_FULL_TURN = 2 * np.pi + 1e-3
+# Larger numbers are no angles; with room for what rounding adds to a full turn.
 _DEGREES = 360.5
 
 
@@ -87,17 +87,11 @@ def _without_index(x: Array) -> Array:
 
 
 def _six(x: Array) -> list[Layout]:
-    """A position and three angles, either first: what exceeds a turn in radians is told by its size, else both."""
+    """A position and three angles, either first: both where both can be angles in degrees, as small positions can."""
     first, last = x[:, :3], x[:, 3:]
-    largest = [float(np.abs(part).max()) for part in (first, last)]
     ahead = Layout(first, last, None, "columns 1 to 3 are the position, 4 to 6 the angles")
     behind = Layout(last, first, None, "columns 1 to 3 are the angles, 4 to 6 the position")
-    small = [size <= _FULL_TURN for size in largest]
-    if small == [True, False]:
-        return [behind]
-    if small == [False, True]:
-        return [ahead]
-    return [layout for layout, size in ((ahead, largest[1]), (behind, largest[0])) if size <= _DEGREES]
+    return [layout for layout in (ahead, behind) if np.abs(layout.rotation).max() <= _DEGREES]
 
 
 def _seven(x: Array) -> list[Layout]:

@@ -32,7 +32,7 @@ class Stated:
         for flag, value, known in (
             ("--rotation", self.rotation, conventions()),
             ("--angles", self.angle_unit, ("deg", "rad")),
-            ("--unit", self.length_unit, tuple(POSE_UNITS)),
+            ("--unit, --file-unit", self.length_unit, tuple(POSE_UNITS)),
             ("--cloud-unit", self.cloud_unit, tuple(CLOUD_UNITS)),
             ("--mount", self.mount, _MOUNTS),
         ):

@@ -1,0 +1,125 @@
+"""A table of poses or joint angles -> the text of views.csv; no scans to ask: what the file does not say, flags say."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from stitch import frames
+from stitch.controllers import tracker_csv, universal
+from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique
+from stitch.controllers.importer import Imported
+from stitch.errors import InputError
+from stitch.intake.layouts import Layout, layouts
+from stitch.intake.number_table import read_number_table
+from stitch.intake.plausible_units import POSE_UNITS, pose_units
+from stitch.intake.raw_poses import STRUCTURED, RawPoses, read_raw_poses
+from stitch.intake.readings import Reading, angle_units, readings
+from stitch.intake.stated import Stated
+from stitch.reading.clouds import CLOUD_SUFFIXES
+from stitch.units import METRES
+
+_PROGRAMS = (".ls", ".src", ".mod", ".script")
+
+
+def is_table_of_poses(file: Path) -> bool:
+    """False for robot programs, recordings of a UR and exports of trackers, which have readers of their own."""
+    suffix = file.suffix.lower()
+    if suffix in STRUCTURED:
+        return True
+    if suffix in _PROGRAMS or not file.is_file():
+        return False
+    try:
+        table = read_number_table(file)
+    except InputError:
+        return False
+    if suffix != ".csv" or table.header is None:
+        return True
+    told = file.read_text(encoding="utf-8-sig", errors="replace")
+    names, _ = tracker_csv.columns(told)
+    return not universal.is_recording(told) and not all(axis in names for axis in "xyz")
+
+
+def import_table(file: Path, unit: str, stated: Stated) -> Imported:
+    """Read a table of poses, or of joint angles, or of both.
+
+    Args:
+        unit: "mm" or "m", the session's length_unit.
+
+    Raises:
+        InputError: no poses, or what the file does not say and no flag states; names the flag.
+    """
+    if unit not in METRES:
+        raise InputError(f"--unit {unit}: use mm or m")
+    raw = read_raw_poses([file])
+    raw = raw.renamed(stated.columns) if stated.columns else raw
+    found = layouts(raw)
+    if len(found) > 1:
+        ways = "; or ".join(layout.words for layout in found)
+        raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
+    layout = found[0]
+    header, cells, words = ["view"], [[name] for name in _names(raw)], []
+    clouds = _clouds(raw)
+    if clouds is not None:
+        header, cells = [*header, "cloud"], [[*row, cloud] for row, cloud in zip(cells, clouds, strict=True)]
+    if layout.joints is not None:
+        degrees = _joints(file, layout, stated)
+        header += [f"j{i + 1}_deg" for i in range(degrees.shape[1])]
+        cells = [[*row, *(f"{q:.9g}" for q in values)] for row, values in zip(cells, degrees, strict=True)]
+        words.append("joint angles")
+    if layout.rotation.shape[1]:
+        reading = _reading(file, layout, stated)
+        file_unit = _unit(file, layout, stated)
+        T = frames.inverse(reading.T) if stated.inverse else reading.T
+        scale = POSE_UNITS[file_unit] / METRES[unit]
+        header += POSE
+        cells = [[*row, *pose_cells(pose, scale)] for row, pose in zip(cells, T, strict=True)]
+        words.append(
+            f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
+        )
+    return Imported("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), ())
+
+
+def _names(raw: RawPoses) -> list[str]:
+    """Names of the views: the first text beside each pose, else numbers."""
+    return unique(texts[0] if texts else f"v{i + 1:03d}" for i, texts in enumerate(raw.labels))
+
+
+def _clouds(raw: RawPoses) -> list[str] | None:
+    """The column of texts that names clouds, if one does."""
+    for texts in zip(*raw.labels, strict=False):
+        if all(Path(text).suffix.lower() in CLOUD_SUFFIXES for text in texts):
+            return [text.replace("\\", "/") for text in texts]
+    return None
+
+
+def _reading(file: Path, layout: Layout, stated: Stated) -> Reading:
+    found = readings(layout, stated.rotation, stated.angle_unit)
+    if len({r.rotation for r in found}) > 1:
+        usual = ", ".join(dict.fromkeys(r.rotation for r in found[:4]))
+        raise InputError(
+            f"{file}: does not say how its {layout.rotation.shape[1]} numbers of rotation are to be read; to fix: "
+            f"state --rotation {usual} …, or let the scans tell it: stitch init FOLDER --poses {file.name}"
+        )
+    if len(found) > 1:
+        raise InputError(f"{file}: does not say the unit of its angles; to fix: state --angles deg or --angles rad")
+    return found[0]
+
+
+def _joints(file: Path, layout: Layout, stated: Stated) -> np.ndarray:
+    assert layout.joints is not None
+    units: Sequence[str] = angle_units(layout.joints, stated.angle_unit or layout.angle_unit)
+    if len(units) > 1:
+        raise InputError(
+            f"{file}: does not say the unit of its joint angles; to fix: state --angles deg or --angles rad"
+        )
+    return np.asarray(layout.joints if units[0] == "deg" else np.degrees(layout.joints))
+
+
+def _unit(file: Path, layout: Layout, stated: Stated) -> str:
+    if stated.length_unit or layout.length_unit:
+        return str(stated.length_unit or layout.length_unit)
+    found = pose_units(layout.position)
+    if len(found) > 1:
+        raise InputError(f"{file}: positions may be in {' or '.join(found)}; to fix: state --file-unit")
+    return found[0]

@@ -1,0 +1,74 @@
+"""`stitch import` of tables: what the file does not say is asked for by its flag."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stitch.cli.main import main
+
+SIX = "view;cloud;x;y;z;rx;ry;rz\nv1;a.ply;812,4;-31;655,2;0,5;-0,25;1,5\nv2;b.ply;800;-30;650;0,6;-0,2;1,4\n"
+JOINTS = "j1 j2 j3 j4 j5 j6\n0.1 0.2 0.3 0.4 0.5 0.6\n0.2 0.2 0.3 0.4 0.5 0.6\n"
+
+
+@pytest.fixture
+def imported(tmp_path, capsys):
+    def call(name, text, *flags):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        with pytest.raises(SystemExit) as ended:
+            main(["import", str(tmp_path / name), *flags])
+        printed = capsys.readouterr()
+        return ended.value.code or 0, list(csv.DictReader(io.StringIO(printed.out))), printed.err
+
+    return call
+
+
+def test_a_table_with_what_the_file_does_not_say(imported):
+    code, rows, _ = imported("t.txt", SIX, "--rotation", "zyx-intrinsic", "--angles", "rad", "--unit", "m")
+    assert code == 0 and [row["view"] for row in rows] == ["v1", "v2"] and rows[0]["cloud"] == "a.ply"
+    assert [float(rows[0][axis]) for axis in "xyz"] == [0.8124, -0.031, 0.6552]
+    q = Rotation.from_quat([float(rows[0][name]) for name in ("qx", "qy", "qz", "qw")])
+    # Rz(0.5)·Ry(−0.25)·Rx(1.5), written out.
+    expected = [Rotation.from_rotvec(v).as_matrix() for v in ([0, 0, 0.5], [0, -0.25, 0], [1.5, 0, 0])]
+    assert np.allclose(q.as_matrix(), expected[0] @ expected[1] @ expected[2], atol=1e-8)
+
+
+def test_poses_of_the_base_in_the_flange_are_inverted(imported):
+    text = "1,0,0,5,0,1,0,6,0,0,1,7,0,0,0,1\n0,-1,0,500,1,0,0,600,0,0,1,700,0,0,0,1\n"
+    _, rows, _ = imported("t.csv", text, "--inverse", "--file-unit", "mm")
+    assert [float(rows[1][axis]) for axis in "xyz"] == [-600, 500, -700]
+
+
+def test_joint_angles(imported):
+    code, rows, _ = imported("t.txt", JOINTS, "--angles", "rad")
+    assert code == 0 and "x" not in rows[0]
+    assert np.allclose([float(rows[1][f"j{i}_deg"]) for i in range(1, 7)], np.degrees([0.2, 0.2, 0.3, 0.4, 0.5, 0.6]))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "flags", "told"),
+    [
+        ("t.txt", SIX, (), "--rotation"),
+        ("t.txt", SIX, ("--rotation", "xyz-extrinsic"), "--angles"),
+        (
+            "t.txt",
+            SIX.replace("812,4", "48").replace("800", "47").replace("655,2", "2").replace("650", "2"),
+            ("--rotation", "xyz-extrinsic", "--angles", "rad"),
+            "--file-unit",
+        ),
+        ("t.txt", JOINTS, (), "--angles"),
+        ("t.dat", "0.1,0.2,0.3,0.4,0.5,0.6\n0.2,0.2,0.3,0.4,0.5,0.6\n", (), "--columns"),
+        ("t.json", "[[1, 2, 3]]", (), "no poses"),
+        ("t.txt", SIX, ("--file-unit", "feet"), "--file-unit feet"),
+    ],
+)
+def test_what_the_file_does_not_say_is_asked_for_by_its_flag(imported, name, text, flags, told):
+    code, rows, err = imported(name, text, *flags)
+    assert code == 2 and told in err and not rows and len(err.strip().splitlines()) == 1
+
+
+def test_programs_and_trackers_keep_their_readers(imported):
+    code, rows, err = imported("t.csv", "name,x,y,z\na,1,2,3\nb,2,3,4\n")
+    assert code == 0 and rows[0]["target"] == "a" and "points.csv" in err
