@@ -20,6 +20,7 @@ from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
+from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
@@ -119,16 +120,27 @@ def _require_own_model(session: Session, correction: Correction, index: int) -> 
     """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
     own, T_mount = correction.captures[index], correction.model.T_mount
     fitted = fit_hand_eye([own], [correction.freed[index]], T_mount)
+    turn, shift = _apart(own, T_mount, fitted.T_mount)
+    if not beyond_any_arm(session, turn, shift):
+        return
+    # Views freed from far off are only on their way, and what they lack would count as scatter: once more from there.
+    freed = free_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
+    fitted = fit_hand_eye([own], [freed], fitted.T_mount)
+    turn, shift = _apart(own, T_mount, fitted.T_mount)
     xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
     clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2.isf(_CHANCE, 6)
-    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
-    shift = float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
-    turn = float(np.linalg.norm(xi[:3]))
     if clear and beyond_any_arm(session, turn, shift):
         raise NoResultError(
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
             "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
         )
+
+
+def _apart(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
+    """Angle (rad) between two hand-eyes, and how far they put the part from each other."""
+    xi = frames.log(frames.inverse(T_mount) @ other)
+    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
 
 
 def _unexplained(session: Session, found: Snooping) -> NoResultError:

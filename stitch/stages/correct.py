@@ -14,6 +14,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.model.model import Model
+from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import assemble
@@ -88,6 +89,8 @@ def tightened(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list
 
 # From freed views per capture to what `fit_hand_eye` calls `repeating`.
 Repeating = Callable[[Sequence[FreePoses]], list[Array]]
+# From freed views per capture and a hand-eye to how their poses may err.
+Erring = Callable[[Sequence[FreePoses], Array], PoseErrors]
 
 
 def correct(
@@ -96,6 +99,7 @@ def correct(
     gate: float,
     recorder: Recorder | None = None,
     repeating: Repeating | None = None,
+    erring: Erring | None = None,
 ) -> Correction:
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
@@ -104,6 +108,7 @@ def correct(
         T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
         gate: first distance between partners, length_unit: the coarse error at the part.
         repeating: errors that all views have in common; they widen the covariance.
+        erring: how poses may err beside white scatter; None: they do not.
 
     Raises:
         NoResultError: no two views of a capture overlap.
@@ -120,7 +125,8 @@ def correct(
         for c, f, o in zip(captures, freed, overlaps, strict=True)
     )
     common = None if repeating is None else repeating(freed)
-    hand_eye = fit_hand_eye(captures, freed, first.T_mount, repeating=common)
+    errors = None if erring is None else erring(freed, first.T_mount)
+    hand_eye = fit_hand_eye(captures, freed, first.T_mount, repeating=common, errors=errors)
     final = tuple(
         collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
         for c, o in zip(captures, overlaps, strict=True)

@@ -11,6 +11,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import split, stacked
+from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import pair_squares
 from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
@@ -74,7 +75,8 @@ class _Linearised:
         # A parameter at zero that is not zero errs alike in every view, as the scanner does.
         repeating = [np.hstack([r, c * choice.omitted]) for r, c in zip(choice.repeating, self.columns, strict=True)]
         columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
-        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating)
+        errors = pose_errors(self.measurements, self.model, [f.overlaps.gram.centre for f in self.freed])
+        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating, errors)
         values = before.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[~self._held] = 0.0

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.bound import bound
@@ -11,7 +12,8 @@ from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.pose_errors import PoseErrors, pose_errors
+from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.observations.surfaces.scanner_field import field_scatters
@@ -65,7 +67,11 @@ def fit(
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
         repeating = partial(field_scatters, measurements)
         captures = [m.capture for m in measurements]
-        first = correct(captures, begun.T_mount, begun.gate, recorder, repeating)
+
+        def erring(freed: Sequence[FreePoses], T_mount: Array) -> PoseErrors:
+            return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
+
+        first = correct(captures, begun.T_mount, begun.gate, recorder, repeating, erring)
         if terms_at is None:
             return first
         gates = [overlaps.gate for overlaps in first.overlaps]
@@ -121,7 +127,7 @@ def notes(session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[
     assert fitted.correction is not None
     own = fitted.sessions[index]
     more = () if own.targets is None else mixed_notes(own.targets, own.outliers, session)
-    return (*warnings(begun, fitted.correction.hand_eye.inflation), *more)
+    return (*warnings(begun, fitted.correction.hand_eye), *more)
 
 
 def _targets(measurement: Measurement, correction: Correction) -> TargetFit | None:

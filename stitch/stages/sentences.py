@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.measurement.session import Session
+from stitch.observations.surfaces.hand_eye import HandEye
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_fit import TargetFit
@@ -71,7 +72,7 @@ def coarse_note(start: Coarse) -> str:
     return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
 
 
-def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
+def warnings(start: Coarse, found: HandEye) -> tuple[str, ...]:
     """What a user should know before trusting the hand-eye."""
     notes = []
     if start.candidates and start.runner_up_ratio < _CLOSE:
@@ -79,10 +80,11 @@ def warnings(start: Coarse, inflation: float) -> tuple[str, ...]:
             f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}): "
             "give scanner.pose, or add views with other orientations."
         )
-    if inflation > _WIDENED:
+    if found.inflation > _WIDENED:
+        source, share = max(found.shares.items(), key=lambda item: item[1])
         notes.append(
-            f"Few views, or views that leave the hand-eye {np.sqrt(inflation):.1f} times less certain than independent "
-            "pose errors would: its sigma was widened by that factor."
+            f"The hand-eye is {np.sqrt(found.inflation):.1f} times less certain than independent pose errors would "
+            f"leave it; the largest part of its variance, {share:.0%}, is {source}."
         )
     return tuple(notes)
 

@@ -8,28 +8,6 @@ from stitch.frames import Array
 _FEWEST = 4
 
 
-def drawn_inflation(left_out: Array, covariance: Array) -> float:
-    """Factor on the covariance, at least 1, read against what the jackknife gives under the model itself.
-
-    The mean ratio of the jackknife's covariance to the model's over all directions, over its lower
-    quartile under the model: with a handful of views the jackknife itself reads too large, and taking
-    it at its word would widen sigmas that are right; of two readings the cautious one is taken.
-
-    Args:
-        left_out: (L, K, 1 + draws) estimates with one sample left out; column 0 from the measurement.
-        covariance: (K, K) of the estimates.
-    """
-    count = len(left_out)
-    if count < _FEWEST:
-        return 1.0
-    centred = left_out - left_out.mean(axis=0)
-    scale = np.sqrt(np.diag(covariance))
-    precision = np.linalg.inv(covariance / scale[:, None] / scale) / scale[:, None] / scale
-    squares = np.einsum("lid,ij,ljd->d", centred, precision, centred, optimize=True)
-    ratio = (count - 1) / count * squares / len(covariance)
-    return float(max(1.0, ratio[0] / np.quantile(ratio[1:], 0.25)))
-
-
 def grouped_inflation(left_out: Array, covariance: Array) -> float:
     """Factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
 

@@ -21,8 +21,8 @@ _MANY = 1e4
 class Satterthwaite:
     """The components in units of the scatter, and how well their variances are known."""
 
-    white: Array  # (3, B, m, m)
-    spread: Array  # (3, 3) covariance of the log variances
+    white: Array  # (c, B, m, m)
+    spread: Array  # (c, c) covariance of the log variances
 
     def of(self, white: Array) -> float:
         """Degrees of freedom of the scatter along whitened columns (B, m, p), on average over them."""

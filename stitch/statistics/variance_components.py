@@ -15,14 +15,20 @@ from scipy.optimize import minimize
 
 from stitch.frames import Array
 
-# A gamma(2, 0) prior on σ_r and σ_t keeps the maximum off the boundary at zero, where every sigma after it
-# would be too small, by about one standard error (Chung et al. 2013, Psychometrika 78:685).
-_OFF_BOUNDARY = np.array([1.0, 1.0, 0.0])
+# The component that is sensor noise; all others are scatter and errors of the arm. A gamma(2, 0) prior on their σ
+# keeps the maximum off the boundary at zero, where every sigma after it would be too small, by about one standard
+# error (Chung et al. 2013, Psychometrika 78:685).
+_NOISE = 2
+# Further components may well be absent: λ/s² of a scale s is a priori beta-prime(_SPIKE/2, 1/2), which piles up at zero
+# and has the tails of a half-Cauchy (Armagan, Clyde & Dunson 2011, NIPS 24; with 1 in place of _SPIKE it is the
+# half-Cauchy of Gelman 2006, Bayesian Analysis 1:515). The density counts per log σ.
+_SPIKE = 0.2
 # The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
 _USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 _ABSENT = 1e-300  # in place of a variance of zero, which has no logarithm
+_FACTORS = (float(np.log(0.3)), float(np.log(1e8)))  # and of the factor on the noise
 # The search ends where the deviance's slope is below the first; with thousands of numbers below the second: the
 # curvature grows with their count, and 0.1 then costs the deviance less than 1e-5.
 _FLAT, _FLAT_AMONG_MANY, MANY_NUMBERS = 1e-4, 0.1, 1_000
@@ -34,9 +40,12 @@ class MixedModel:
 
     z: Array  # (B, m)
     A: Array  # (B, m, a) columns of the free mean
-    components: Array  # (3, B, m, m) covariance of unit rotation scatter, translation scatter, sensor noise
+    components: (
+        Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and what there is more
+    )
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
+    scales: Array | None = None  # (c − 3,) that σ of the further components usually has; None: there are none
 
     @property
     def size(self) -> int:
@@ -44,16 +53,16 @@ class MixedModel:
         return int(self.z.size) if self.independent is None else self.independent
 
     def covariance(self, variances: Array) -> Array:
-        """(B, m, m) for variances (3,)."""
+        """(B, m, m) for variances (c,)."""
         V = np.einsum("c,cbij->bij", variances, self.components)
         return np.asarray(V if self.fixed is None else V + self.fixed)
 
 
 @dataclass(frozen=True)
 class VarianceFit:
-    """The maximum: variances λ (3,), −2 log of the (restricted) likelihood, and the mean's coefficients."""
+    """The maximum: variances λ (c,), −2 log of the (restricted) likelihood, and the mean's coefficients."""
 
-    variances: Array  # (3,)
+    variances: Array  # (c,)
     deviance: float
     mean: Array  # (a + g,)
     covariance: Array  # (a + g, a + g)
@@ -66,12 +75,12 @@ def fit_variances(
     start: Array | None = None,
     both_starts: bool = False,
 ) -> VarianceFit:
-    """Maximise over the three variances.
+    """Maximise over the variances.
 
     Args:
         G: (B, m, g) further columns of the mean.
         prior: (g,) standard deviations of their coefficients; None leaves them free.
-        start: (3,) variances to begin with; None starts from the spread of z.
+        start: (c,) variances to begin with; None starts from the spread of z.
         both_starts: also begin from noise alone, where the likelihood may have a second maximum.
 
     Returns:
@@ -80,10 +89,11 @@ def fit_variances(
     problem = _problem(mixed, G, prior)
     guess = _guess(mixed) if start is None else start
     first = np.log(np.maximum(guess, _ABSENT))
-    begin = [first, first + np.array([-9.0, -9.0, 0.0])] if both_starts else [first]
+    scattered = np.arange(len(first)) != _NOISE
+    begin = [first, first - 9.0 * scattered] if both_starts else [first]
     centre = np.log(_guess(mixed))
     flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else _FLAT
-    bounds = [(c - _SPAN[0], c + _SPAN[1]) for c in centre[:2]] + [(np.log(0.3), np.log(1e8))]
+    bounds = [(c - _SPAN[0], c + _SPAN[1]) if s else _FACTORS for c, s in zip(centre, scattered, strict=True)]
     present = np.einsum("cbii->c", mixed.components) > 0
     bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
@@ -96,7 +106,7 @@ def fit_variances(
 def at_variances(
     mixed: MixedModel, variances: Array, G: Array | None = None, prior: Array | None = None
 ) -> VarianceFit:
-    """The same without searching: mean, covariance and deviance for given variances (3,)."""
+    """The same without searching: mean, covariance and deviance for given variances (c,)."""
     problem = _problem(mixed, G, prior)
     deviance, _ = _deviance(np.log(np.maximum(variances, _ABSENT)), problem)
     V = mixed.covariance(variances)
@@ -113,6 +123,11 @@ def at_variances(
 def whitener(mixed: MixedModel, variances: Array) -> Array:
     """(B, m, m) inverse Cholesky factors of the blocks' covariance."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(mixed.covariance(variances))))
+
+
+def deviance_slope(log_variances: Array, mixed: MixedModel) -> tuple[float, Array]:
+    """−2 log of restricted likelihood and prior of the log variances (c,), up to a constant, and its slope (c,)."""
+    return _deviance(log_variances, _problem(mixed, None, None))
 
 
 @dataclass(frozen=True)
@@ -137,7 +152,11 @@ def _problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> _Proble
 def _guess(mixed: MixedModel) -> Array:
     traces = np.einsum("cbii->c", mixed.components)
     spread = float((mixed.z**2).sum()) or 1e-24
-    return np.array([spread / max(traces[0], 1e-300), spread / max(traces[1], 1e-300), 1.0]) / [4.0, 4.0, 1.0]
+    # What there is beside scatter and noise begins small: it is there only where the numbers ask for it.
+    shares = np.where(np.arange(len(traces)) < _NOISE, 0.25, 0.05)
+    guess = np.asarray(shares * spread / np.maximum(traces, 1e-300))
+    guess[_NOISE] = 1.0
+    return guess
 
 
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
@@ -148,7 +167,7 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:
-        return 1e300, np.zeros(3)
+        return 1e300, np.zeros(len(variances))
     inverse = np.linalg.inv(V)
     WX = inverse @ problem.X
     M = _summed(problem.X, WX) + np.diag(problem.precision)
@@ -168,9 +187,20 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
-    off = (log_variances[2] - _USUAL_FACTOR) / FACTOR_SPREAD
-    slope[2] += 2 * off / FACTOR_SPREAD
-    return logdet + square + off**2 - float(_OFF_BOUNDARY @ log_variances), slope - _OFF_BOUNDARY
+    believed, pull = _log_prior(log_variances, mixed.scales)
+    return logdet + square + believed, slope + pull
+
+
+def _log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]:
+    """−2 log prior of the log variances (c,), and its slope."""
+    off = (log_variances[_NOISE] - _USUAL_FACTOR) / FACTOR_SPREAD
+    value, slope = -float(log_variances[:_NOISE].sum()) + off**2, -np.ones(len(log_variances))
+    slope[_NOISE] = 2 * off / FACTOR_SPREAD
+    if scales is not None:
+        over, more = np.exp(log_variances[_NOISE + 1 :]) / scales**2, log_variances[_NOISE + 1 :]
+        value += float(((1 + _SPIKE) * np.log1p(over) - _SPIKE * more).sum())
+        slope[_NOISE + 1 :] = (1 + _SPIKE) * over / (1 + over) - _SPIKE
+    return value, slope
 
 
 def _summed(X: Array, Y: Array) -> Array:

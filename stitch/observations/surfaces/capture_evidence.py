@@ -9,13 +9,9 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.free_poses import visible_directions
 from stitch.observations.surfaces.gram import Gram, pair_squares
-from stitch.observations.surfaces.pose_channel import PoseChannel, Repeatability, covariance_of, pose_channel
+from stitch.observations.surfaces.pose_channel import PoseChannel, pose_channel
 from stitch.statistics.folds import grouped_folds
-
-# What the scatter alone would give, drawn so often.
-DRAWS = 200
 
 
 def jacobian(hand_eye_frames: Array, centre: Array) -> Array:
@@ -65,25 +61,6 @@ class CaptureEvidence:
         J = np.column_stack([jacobian(self.hand_eye_frames, self.gram.centre), self.extra])
         moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
         return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
-
-    def measured_and_drawn(self, scatter: Repeatability) -> Array:
-        """(6V, 1 + DRAWS) twists: the measured ones, then draws under the scatter and the noise alone."""
-        rng, g = np.random.default_rng(0), self.gram
-        to_centre = frames.make(np.eye(3), -g.centre)
-        carried = frames.adjoint(to_centre @ self.capture.T_reference_flange)
-        sigma = np.array([scatter.rotation] * 3 + [scatter.translation] * 3)
-        robot = np.einsum("vij,vjd->vid", carried, sigma[:, None] * rng.standard_normal((g.views, 6, DRAWS)))
-        values, vectors, scale = visible_directions(g)
-        spread = np.sqrt(scatter.noise_factor * g.variance / values)
-        noise = spread[:, None] * rng.standard_normal((len(values), DRAWS))
-        drawn = robot.reshape(6 * g.views, DRAWS) + scale[:, None] * (vectors @ noise)
-        return np.column_stack([self.twists.reshape(-1), drawn])
-
-    def information(self, scatter: Repeatability, twists: Array) -> tuple[Array, Array]:
-        """Information matrix (6 + P, 6 + P) and vectors (6 + P, D) from twists (6V, D)."""
-        X = np.column_stack([self.channel.hand_eye, self.channel.reduction @ self.extra])
-        weighted = np.linalg.solve(covariance_of(self.channel, scatter), X).T
-        return np.asarray(weighted @ X), np.asarray(weighted @ self.channel.reduction @ twists)
 
     @staticmethod
     def drop(rows: Array, views: Indices) -> Array:

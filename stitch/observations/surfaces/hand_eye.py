@@ -1,25 +1,28 @@
 """The hand-eye and the effects in use from freed views: generalised least squares, covariance, held-out error.
 
-The poses of the views scatter by the robot's repeatability, which no number of points averages
-out: views are the samples. Errors of the scanner that repeat in every view come on top: no number of views
-averages them out either. Estimates with views left out give the held-out error and show whether the
-covariance is too small for these data (jackknife; Efron & Stein 1981): a robot whose pose errors are
-not independent from view to view has a larger one, never a smaller.
+No number of points averages out the error of a pose: views are the samples. What an arm does wrong it does again, so
+that no number of views averages that out either: `pose_errors.py` says how poses may err, the views say how much,
+and hand-eye and effects are averaged over all sizes that the views allow. Errors of the scanner that repeat in
+every view come on top.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stitch import frames
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.capture_evidence import DRAWS, CaptureEvidence
+from stitch.observations.pose_errors import PoseErrors, white
+from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.pose_channel import Repeatability, estimate
-from stitch.statistics.jackknife import drawn_inflation
+from stitch.observations.surfaces.pose_channel import Repeatability, covariance_of, estimate
+from stitch.observations.surfaces.rig_model import RigModel, rig_model
+from stitch.statistics.least_squares import generalised
+from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.variance_posterior import MeanPosterior, mean_posterior
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,10 @@ class HandEye:
 
     T_mount: Array  # (4, 4) T_mount_scanner
     covariance: Array  # (6, 6)
-    inflation: float  # factor on the covariance that few views and the left-out ones ask for, ≥ 1
+    inflation: float  # of the covariance over that of independent pose errors, geometric mean over directions, ≥ 1
     repeatability: tuple[Repeatability, ...]  # per capture
     heldout_ratio: float  # rms of left-out views over rms of the fit, same correspondences
+    shares: dict[str, float] = field(default_factory=dict)  # of what may be wrong in the hand-eye's variance; sum 1
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
@@ -55,8 +59,9 @@ def fit_hand_eye(
     T_mount: Array,
     columns: Columns | None = None,
     repeating: Sequence[Array] | None = None,
+    errors: PoseErrors | None = None,
 ) -> HandEye:
-    """Generalised least squares over the pose channels of all captures.
+    """Generalised least squares over the pose channels of all captures, averaged over all variances they allow.
 
     Args:
         freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
@@ -64,33 +69,51 @@ def fit_hand_eye(
         columns: effects to fit with it.
         repeating: per capture (6V, K) twists that the views show for one standard deviation of each of K errors
             that all views and captures have in common; they widen the covariance and change nothing else.
+        errors: how the poses may err beside white scatter; None: they do not.
     """
-    columns = columns or Columns(tuple(np.zeros((6 * len(c.scans), 0)) for c in captures), np.zeros(0), np.zeros(0))
+    columns = columns or Columns(tuple(np.zeros((6 * len(f.poses), 0)) for f in freed), np.zeros(0), np.zeros(0))
     parts = [
         CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), extra)
         for c, f, extra in zip(captures, freed, columns.twists, strict=True)
     ]
-    scatter = [estimate(e.channel, e.further) for e in parts]
-    # Column 0 of the twists is what was measured; the others are draws of what this scatter alone would give.
-    twists = [e.measured_and_drawn(s) for e, s in zip(parts, scatter, strict=True)]
-    joint = _Joint(parts, scatter, twists, _prior(captures, freed, T_mount, columns), _pull(columns))
-    x, covariance = joint.solve()
-    repeated = np.zeros((len(x), 0))
+    rig = rig_model(parts, errors or white(sum(len(f.poses) for f in freed)))
+    prior = _prior(captures, freed, T_mount, columns)
+    pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
+    found = mean_posterior(rig.mixed, fit_variances(rig.mixed, both_starts=True), rig.columns, (prior, pull))
+    repeated = np.zeros((len(pull), 0))
     if repeating is not None:
-        common = [e.information(s, r)[1] for e, s, r in zip(parts, scatter, repeating, strict=True)]
-        repeated = covariance @ np.sum(common, axis=0)
-    left_out = [joint.without(k, np.array([v])) for k, e in enumerate(parts) for v in range(e.gram.views)]
-    inflation = drawn_inflation(np.array(left_out), covariance) * _student(len(left_out))
-    covariance = covariance * inflation + repeated @ repeated.T
+        repeated = rig.gain(found.variances, prior) @ rig.reduce(repeating)
+    covariance = found.covariance + repeated @ repeated.T
+    scatter = tuple(estimate(e.channel, e.further) for e in parts)
     return HandEye(
-        T_mount=T_mount @ frames.exp(x[:6, 0]),
+        T_mount=T_mount @ frames.exp(found.mean[:6]),
         covariance=covariance[:6, :6],
-        inflation=inflation,
-        repeatability=tuple(scatter),
-        heldout_ratio=joint.heldout_ratio(x),
-        values=columns.values + x[6:, 0],
+        inflation=_inflation(rig, scatter, prior, covariance),
+        shares=_shares(rig, found, repeated, covariance),
+        repeatability=scatter,
+        heldout_ratio=_heldout_ratio(rig, found, prior, pull),
+        values=columns.values + found.mean[6:],
         values_covariance=covariance[6:, 6:],
     )
+
+
+def _inflation(rig: RigModel, scatter: Sequence[Repeatability], prior: Array, covariance: Array) -> float:
+    alone = block_diag(*(covariance_of(e.channel, s) for e, s in zip(rig.parts, scatter, strict=True)))
+    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(generalised(alone, rig.columns, prior).covariance)[1]
+    return float(max(1.0, np.exp(ratio / len(covariance))))
+
+
+def _shares(rig: RigModel, found: MeanPosterior, repeated: Array, covariance: Array) -> dict[str, float]:
+    """Mean share of every source in the variance of the hand-eye, over its directions."""
+    unit = np.linalg.inv(covariance[:6, :6] / (scale := np.sqrt(np.diag(covariance)[:6])) / scale[:, None])
+
+    def share(own: Array) -> float:
+        return float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6
+
+    names = ("white rotation", "white translation", "sensor noise", *rig.errors.names)
+    shares = {name: share(own) for name, own in zip(names, found.contributions, strict=True)}
+    shares["scanner field"] = share(repeated @ repeated.T)
+    return {**shares, "their unknown sizes": 1 - sum(shares.values())}
 
 
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
@@ -100,50 +123,15 @@ def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatabil
     return estimate(own.channel)
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """All captures of a rig as normal equations of 6 + P unknowns, for the measurement and its draws."""
-
-    parts: Sequence[CaptureEvidence]
-    scatter: Sequence[Repeatability]
-    twists: Sequence[Array]  # per capture (6V, 1 + draws)
-    prior: Array  # (6 + P, 6 + P)
-    pull: Array  # (6 + P, 1 + draws)
-
-    @cached_property
-    def blocks(self) -> list[tuple[Array, Array]]:
-        """Per capture information (6 + P, 6 + P) and vectors (6 + P, 1 + draws)."""
-        return [e.information(s, t) for e, s, t in zip(self.parts, self.scatter, self.twists, strict=True)]
-
-    def solve(self, k: int | None = None, instead: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
-        """Estimates (6 + P, 1 + draws) and covariance, with another block for capture k.
-
-        Parameters count in rad and mm, so the matrix is equilibrated first.
-        """
-        blocks = list(self.blocks)
-        if k is not None and instead is not None:
-            blocks[k] = instead
-        matrix = self.prior + np.sum([block[0] for block in blocks], axis=0)
-        vector = np.sum([*(block[1] for block in blocks), self.pull], axis=0)
-        scale = 1 / np.sqrt(np.diag(matrix))
-        covariance: Array = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-        return np.asarray(covariance @ vector), covariance
-
-    def without(self, k: int, views: Indices) -> Array:
-        """(6 + P, 1 + draws) estimates without some views of capture k."""
-        fewer = self.parts[k].without(views)
-        block = (np.zeros_like(self.prior), np.zeros_like(self.pull))
-        if len(fewer.gram.pairs):
-            block = fewer.information(self.scatter[k], CaptureEvidence.drop(self.twists[k], views))
-        return self.solve(k, block)[0]
-
-    def heldout_ratio(self, x: Array) -> float:
-        """Rms of views left out in groups over that of the same pairs under the estimates x of all views."""
-        outside = np.zeros(2)
-        for k, e in enumerate(self.parts):
-            for fold in e.folds():
-                outside += e.squares(fold, (self.without(k, fold)[:, 0], x[:, 0]))
-        return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+def _heldout_ratio(rig: RigModel, found: MeanPosterior, prior: Array, pull: Array) -> float:
+    """Rms of views left out in groups over that of the same pairs under the estimates of all views."""
+    outside = np.zeros(2)
+    for k, e in enumerate(rig.parts):
+        for fold in e.folds():
+            fewer = rig.without(k, fold)
+            x = fewer.solve(found.variances, prior, pull)
+            outside += e.squares(fold, (x, found.mean))
+    return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
 
 
 def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns) -> Array:
@@ -154,15 +142,3 @@ def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Arr
     ]
     distance = float(np.median(np.concatenate(ranges)))
     return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, columns.prior**-2.0]))
-
-
-def _pull(columns: Columns) -> Array:
-    """The effects' prior is about zero, not about their present values."""
-    pull = np.zeros((6 + len(columns.values), 1 + DRAWS))
-    pull[6:, 0] = -columns.values * columns.prior**-2.0
-    return pull
-
-
-def _student(views: int) -> float:
-    """Variance of Student's t: the scatter that all sigmas rest on is itself known from so many views only."""
-    return (views - 1) / (views - 3) if views > 4 else 3.0

@@ -74,7 +74,12 @@ def mixed_model(channel: PoseChannel, further: Array | None = None) -> MixedMode
     """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
     mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
     components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
-    return MixedModel(channel.z[None], column_space(mean, _TOLD)[None], components)
+    return MixedModel(channel.z[None], mean_of(mean)[None], components)
+
+
+def mean_of(columns: Array) -> Array:
+    """(n, r) orthonormal basis of the mean's columns (n, K), less what the views cannot tell apart."""
+    return column_space(columns, _TOLD)
 
 
 def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:

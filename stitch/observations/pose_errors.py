@@ -1,0 +1,140 @@
+"""How an arm's poses may err beside white scatter, before anything was measured: the prior of pose errors of a rig.
+
+No arm is right in every joint and every link, and what it does wrong it does again at the same pose. So the errors of
+the views' poses are a sum of processes, each with a covariance of known shape and a size that the views tell
+(Kennedy & O'Hagan 2001, J. R. Statist. Soc. B 63:425):
+
+    arm       all joints and links a little wrong, as the library's effects describe it, all at once
+    smooth    errors of joints and links that follow the joint angles smoothly, by no law that anybody wrote down
+    wandering rotation and translation of the flange that views near in time share
+    stop      rotation and translation that scans from the same pose share; only where poses repeat
+
+White scatter of every scan, and the sensor's noise, come with the observation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.effects.contract import EFFECTS, Effect
+from stitch.effects.in_session import lacking
+from stitch.frames import Array, Indices
+from stitch.measurement.measurement import Measurement
+from stitch.model.jacobian import twists
+from stitch.model.model import Model
+from stitch.model.term import Term, term_of
+from stitch.statistics.kernels import alike_in_joints, alike_in_time, spread_over
+
+# Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth, or
+# wanders, is usually smaller (rad, mm).
+_ARM, _SMOOTH, _ROTATION, _TRANSLATION = 0.1, 0.03, 2e-5, 0.02
+_PER_MM = {"mm": 1.0, "m": 1e-3}
+# Poses that differ by less, per joint in rad, are the same stop.
+_SAME = 1e-4
+# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
+_EVERY_ARM = ("joints", "torque")
+_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
+_CONSTANT = ("joint_offset", "link_geometry")
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Components of the covariance of the twists of all views of a rig, session after session."""
+
+    names: tuple[str, ...]
+    components: Array  # (c, 6V, 6V) per unit of each
+    scales: Array  # (c,) of the half-Cauchy priors of their σ
+
+    def without(self, views: Indices) -> "PoseErrors":
+        """Without some views, counted through all sessions."""
+        rows = np.setdiff1d(np.arange(self.components.shape[1] // 6), views)
+        keep = (6 * rows[:, None] + np.arange(6)).ravel()
+        return PoseErrors(self.names, self.components[:, keep][:, :, keep], self.scales)
+
+
+def white(views: int) -> PoseErrors:
+    """Nothing beside white scatter."""
+    return PoseErrors((), np.zeros((0, 6 * views, 6 * views)), np.zeros(0))
+
+
+def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
+    """The prior for the sessions of a rig: one arm, one scanner, one mount.
+
+    Args:
+        model: hand-eye and effects in use; the arm errs beside these.
+        centres: per session the point (3,) about which twists count, reference frame.
+    """
+    found: dict[str, tuple[Array, float]] = {}
+    sessions = list(zip(measurements, centres, strict=True))
+    if all(m.views.has("joints") for m in measurements):
+        joints = np.concatenate([m.views.joints for m in measurements])
+        for name, effects in _families(_arm_effects(measurements)).items():
+            own = np.concatenate([_columns(m, model, centre, effects) for m, centre in sessions])
+            found[name] = (own @ own.T, _ARM)
+        constant = [EFFECTS[name] for name in _CONSTANT]
+        own = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
+        found["smooth"] = (spread_over(own, alike_in_joints(joints)), _SMOOTH)
+        same = np.abs(joints[:, None] - joints[None]).max(axis=2) < _SAME
+    else:
+        same = np.zeros((0, 0), bool)
+    flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
+    halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
+    unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}
+    near = _near_in_time(measurements)
+    for name, half in halves.items():
+        found[f"wandering {name}"] = (spread_over(half, near), unit[name])
+    if same.sum() > len(same):
+        for name, half in halves.items():
+            found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
+    components = np.array([c for c, _ in found.values()])
+    return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]))
+
+
+def _carried(measurement: Measurement, centre: Array) -> Array:
+    """(V, 6, 6) twists of the views about the centre for twists of the flange in its own frame."""
+    return np.asarray(frames.adjoint(frames.make(np.eye(3), -centre) @ measurement.capture.T_reference_flange))
+
+
+def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
+    """What the library knows of every joint and link, as far as all sessions can have it."""
+    possible = [
+        e
+        for e in EFFECTS.values()
+        if e.tier == "physical" and e.place in ("robot", "links") and e.needs and set(e.needs) <= set(_EVERY_ARM)
+    ]
+    per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
+    return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
+
+
+def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
+    """Effects of one cause share a size."""
+    out: dict[str, list[Effect]] = {}
+    for e in effects:
+        out.setdefault(_FAMILY.get(e.name, e.name), []).append(e)
+    return out
+
+
+def _columns(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
+    """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
+    in_use: dict[str, Term] = {term.name: term for term in model.terms}
+    out = []
+    for effect in effects:
+        term = in_use.get(effect.name) or term_of(measurement, effect)
+        moved = twists(measurement, model, term, centre)
+        out.append(moved.reshape(len(moved), -1).T * term.typical)
+    return np.hstack(out)
+
+
+def _near_in_time(measurements: Sequence[Measurement]) -> Array:
+    """(V, V) how alike views err that are near in time; sessions are far from each other."""
+    counts = [m.views.count for m in measurements]
+    out, at = np.zeros((sum(counts), sum(counts))), 0
+    for m, count in zip(measurements, counts, strict=True):
+        steps = np.diff(m.views.time)
+        usual = float(np.median(steps)) if m.views.has("time") and (steps > 0).any() else 0.0
+        time = m.views.time / usual if usual > 0 else np.arange(count, dtype=float)
+        out[at : at + count, at : at + count] = alike_in_time(time)
+        at += count
+    return out
