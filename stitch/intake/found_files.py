@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stitch.errors import InputError
 from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
 from stitch.reading.clouds import CLOUD_SUFFIXES
@@ -88,10 +90,22 @@ def _clouds(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def _is_cloud(file: Path) -> bool:
+    if file.suffix.lower() == ".npy":
+        return _is_cloud_array(file)
     if file.suffix.lower() not in _EITHER:
         return True
     with file.open("rb") as stream:
         return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
+
+
+def _is_cloud_array(file: Path) -> bool:
+    """An image of points, or more rows than a campaign has views; matrices (V, 4, 4) are poses."""
+    try:
+        shape = np.load(file, mmap_mode="r", allow_pickle=False).shape or (0,)
+    except (ValueError, OSError):
+        return False
+    image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
+    return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
 
 
 def _may_hold_poses(file: Path) -> bool:

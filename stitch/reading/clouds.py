@@ -1,4 +1,4 @@
-"""Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept."""
+"""Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept; other formats in `more_clouds.py`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,13 +10,15 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.reading.csv_number import is_number
+from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, read_mesh, read_ptx
+from stitch.reading.organised import is_organised, measured
 from stitch.reading.pcd import read_pcd
 from stitch.reading.text_file import require_file, shortened
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")
 # Kinds that are read, by the ending of the file's name.
-CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT)
+CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz")
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
@@ -29,12 +31,16 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
         raise InputError(f"{path}: no such cloud file; correct the column cloud of views.csv")
     require_file(path, "name a file in the column cloud of views.csv")
     readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": _read_ply, ".pcd": read_pcd}
-    readers |= dict.fromkeys(_TEXT, _read_text)
-    reader = readers.get(path.suffix.lower())
+    readers |= dict.fromkeys(_TEXT, _read_text) | dict.fromkeys(MESHES, read_mesh)
+    readers |= {".npy": read_array, ".ptx": read_ptx, ".e57": read_e57, ".las": read_las, ".laz": read_las}
+    kind = path.suffix.lower()
+    reader = readers.get(kind)
     if reader is None:
         raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use PLY, PCD, XYZ or CSV")
     try:
         columns = reader(path)
+        if kind in (".ply", ".pcd") and is_organised(path):
+            columns = measured(columns)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no cloud

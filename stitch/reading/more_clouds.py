@@ -1,0 +1,90 @@
+"""Scans in formats of other trades: meshes (STL, OBJ, OFF, glTF), NumPy arrays, PTX, and E57 and LAS by their packages.
+
+A mesh counts by its vertices, with the normals of its faces. Of a file with several scans the first is read; points
+stay in the scanner's own frame.
+"""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.reading.organised import measured
+
+MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
+_PTX_HEADER = 10
+
+
+def read_mesh(path: Path) -> dict[str, Array]:
+    """Vertices, each once, with the mean normal of the faces around them where there are faces."""
+    import trimesh
+
+    scene = trimesh.load_scene(str(path))
+    pieces = [g for g in scene.dump() if hasattr(g, "vertices") and len(g.vertices)]
+    if not pieces:
+        raise InputError(f"{path}: holds no surface; export the scan again")
+    points, normals = [], []
+    for piece in pieces:
+        if getattr(piece, "faces", None) is not None and len(piece.faces):
+            piece.merge_vertices(merge_norm=True, merge_tex=True)
+            normals.append(np.asarray(piece.vertex_normals))
+        points.append(np.asarray(piece.vertices))
+    columns = dict(zip("xyz", np.vstack(points).T, strict=True))
+    if len(normals) == len(points):
+        columns |= dict(zip(("nx", "ny", "nz"), np.vstack(normals).T, strict=True))
+    return columns
+
+
+def read_array(path: Path) -> dict[str, Array]:
+    """NumPy's .npy: (N, 3) or more columns, or an image (H, W, 3) whose empty pixels are NaN."""
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or array.shape[-1] < 3:
+        raise InputError(f"{path}: an array {array.shape} is no cloud; save (N, 3) or (H, W, 3) numbers")
+    table = array.reshape(-1, array.shape[-1])
+    names = [*"xyz", *(f"scalar_{i}" for i in range(table.shape[1] - 3))]
+    columns = dict(zip(names, table.T, strict=True))
+    return measured(columns) if array.ndim == 3 else columns
+
+
+def read_ptx(path: Path) -> dict[str, Array]:
+    """Leica's PTX: columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured."""
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    count = int(lines[0]) * int(lines[1])
+    rows = lines[_PTX_HEADER : _PTX_HEADER + count]
+    if len(rows) < count:
+        raise InputError(f"{path}: {count} points announced, data for {len(rows)}; export it again")
+    table = np.loadtxt(rows, ndmin=2)
+    return dict(zip([*"xyz", "intensity"], table.T, strict=False))
+
+
+def read_las(path: Path) -> dict[str, Array]:
+    """LAS and LAZ, by laspy."""
+    las = _package("laspy", path).read(path)
+    xyz = np.asarray(las.xyz, float)
+    return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
+
+
+def read_e57(path: Path) -> dict[str, Array]:
+    """The first scan of an E57 in its own frame, by pye57."""
+    scan = _package("pye57", path).E57(str(path)).read_scan(0, ignore_missing_fields=True, transform=False)
+    columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
+    if "intensity" in scan:
+        columns["intensity"] = np.asarray(scan["intensity"], float)
+    return measured(columns)
+
+
+def _package(name: str, path: Path) -> Any:
+    """A package that only these files need.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(
+            f"{path}: needs the package {name}; to fix: pip install 'stitch[formats]', or export the scan as PLY"
+        ) from None
