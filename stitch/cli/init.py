@@ -2,8 +2,9 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +14,9 @@ from stitch.intake.first_session import FirstSession, first_session
 from stitch.intake.guesses import Guess
 from stitch.intake.session_draft import require_free, write_draft
 from stitch.intake.stated import Stated
+
+# Guesses that are asked for one by one; the fields of `Stated` bear the same names.
+_ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
 
 
 def init(
@@ -44,9 +48,8 @@ def init(
     stated = Stated(poses, names, rotation, angles, unit, cloud_unit, mount, inverse)
     first = first_session(folder, stated)
     _tell(first)
-    untold = [guess for guess in first.guesses if not guess.told]
     if not yes:
-        _ask(out, untold)
+        first = _asked(folder, out, first, stated)
     write_draft(out, first)
     if as_json:
         emit(json.dumps(_document(out, first), indent=1))
@@ -59,20 +62,40 @@ def _tell(first: FirstSession) -> None:
         print(f"{'' if guess.told else '? '}{guess.line}", file=sys.stderr)
 
 
-def _ask(out: Path, untold: list[Guess]) -> None:
-    """On a terminal whether to go on; elsewhere a refusal where something cannot be told.
+def _asked(folder: Path, out: Path, first: FirstSession, stated: Stated) -> FirstSession:
+    """On a terminal what cannot be told is asked, and judged anew; elsewhere it is refused.
 
     Raises:
-        InputError: names the flags that would tell it.
+        InputError: names the flags that would tell it; or a person does not want the session.
     """
-    if sys.stdin.isatty():
-        question = f"{len(untold)} guesses cannot be told from these views. " if untold else ""
-        if not typer.confirm(f"{question}Write the session?", default=not untold, err=True):
-            raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
-    elif untold:
-        flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
-        what = ", ".join(guess.what for guess in untold)
-        raise InputError(f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes")
+    untold = [guess for guess in first.guesses if not guess.told]
+    if not sys.stdin.isatty():
+        if untold:
+            flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
+            what = ", ".join(guess.what for guess in untold)
+            raise InputError(
+                f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes"
+            )
+        return first
+    answers: dict[str, Any] = {guess.what: _answer(guess) for guess in untold if guess.what in _ASKED}
+    if any(answers[guess.what] != _own(guess) for guess in untold if guess.what in answers):
+        # What was kept counts as stated too: the person has seen it.
+        first = first_session(folder, replace(stated, **answers))
+        _tell(first)
+    if not typer.confirm("Write the session?", default=True, err=True):
+        raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
+    return first
+
+
+def _answer(guess: Guess) -> str:
+    """What a person says instead of a guess, or the guess."""
+    text = f"{guess.what} cannot be told from these views; enter another, or keep"
+    return str(typer.prompt(text, default=_own(guess), err=True)).strip()
+
+
+def _own(guess: Guess) -> str:
+    """The word of a guess, as its flag takes it."""
+    return guess.value.split(",")[0]
 
 
 def _document(out: Path, first: FirstSession) -> dict[str, object]:

@@ -10,6 +10,7 @@ from stitch.controllers import tracker_csv, universal
 from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique
 from stitch.controllers.importer import Imported
 from stitch.errors import InputError
+from stitch.intake.covariates import covariate_columns
 from stitch.intake.layouts import Layout, layouts
 from stitch.intake.number_table import read_number_table
 from stitch.intake.plausible_units import POSE_UNITS, pose_units
@@ -77,6 +78,9 @@ def import_table(file: Path, unit: str, stated: Stated) -> Imported:
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
         )
+    rest = covariate_columns(layout, range(len(cells)))
+    header += rest
+    cells = [[*row, *(column[i] for column in rest.values())] for i, row in enumerate(cells)]
     return Imported("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), ())
 
 

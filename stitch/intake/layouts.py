@@ -1,6 +1,6 @@
 """Which columns of a table hold the position, the rotation or the joint angles: by name, by count, by their values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class Layout:
     length_unit: str | None = None
     angle_unit: str | None = None
     named: bool = False  # the file names its columns
+    rest: dict[str, Array] = field(default_factory=dict)  # other named columns (V,): times, temperatures
 
     @property
     def angles(self) -> Array:
@@ -63,7 +64,8 @@ def _by_name(raw: RawPoses) -> Layout | None:
     x = raw.numbers
     if len(named.rotation) in (12, 16):
         matrices = (_sixteen if len(named.rotation) == 16 else _twelve)(x[:, named.rotation])
-        return matrices[0] if matrices else None
+        rest = {name: x[:, i] for name, i in named.rest.items()}
+        return replace(matrices[0], rest=rest) if matrices else None
     posed = bool(named.position and named.rotation)
     if not posed and not named.joints:
         return None
@@ -77,6 +79,7 @@ def _by_name(raw: RawPoses) -> Layout | None:
         length_unit=named.length_unit,
         angle_unit=named.angle_unit,
         named=True,
+        rest={name: x[:, i] for name, i in named.rest.items()},
     )
 
 

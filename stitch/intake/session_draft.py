@@ -11,6 +11,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.covariates import covariate_columns
 from stitch.intake.first_session import FirstSession
 from stitch.intake.guesses import Guess
 from stitch.intake.joint_poses import JOINT_ANGLES
@@ -103,6 +104,7 @@ def views_text(folder: Path, first: FirstSession) -> str:
         columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
     if reading.rotation != JOINT_ANGLES:
         columns |= {name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_poses(first, rows)).items()}
+    columns |= covariate_columns(reading.layout, rows)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)

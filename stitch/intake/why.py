@@ -40,12 +40,6 @@ def judged_words(judged: Judged) -> str:
     return f"views {judged.misfit:.2f} mm apart{motions}"
 
 
-def _next(decided: Decided) -> str:
-    return (
-        "" if decided.runner_up is None else f"; the next best way leaves them {decided.runner_up.misfit:.2f} mm apart"
-    )
-
-
 def _files(found: Found, raw: RawPoses) -> Guess:
     clouds = f"{len(found.clouds)} clouds {found.clouds[0].name} … {found.clouds[-1].name}"
     aside = f"; left aside: {', '.join(f.name for f in found.aside[:5])}" if found.aside else ""
@@ -75,7 +69,7 @@ def _rotation(decided: Decided, stated: Stated) -> Guess:
         return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
     if best.layout.convention is not None:
         return Guess("rotation", best.words, "told by the file", True, "--rotation")
-    reason = f"{judged_words(decided.best)}{_next(decided)}"
+    reason = judged_words(decided.best)
     alike = [w.reading.words for w in decided.alike if w.reading.words != best.words]
     if alike:
         reason += f"; {', '.join(dict.fromkeys(alike[:3]))} would stitch alike, with another hand-eye"

@@ -56,6 +56,21 @@ def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, ca
     assert not (raw / "session.toml").exists() and not (raw / "views.csv").exists()
 
 
+def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
+    table = raw / "RobotPoses.dat"
+    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
+    answers = iter(["zyx-intrinsic", "", "eye_in_hand", "y"])
+    asked = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.prompt", lambda text, default, err: asked.append(text) or next(answers) or default)
+    monkeypatch.setattr("typer.confirm", lambda text, default, err: next(answers) == "y")
+    code, _, err = ended(capsys, "init", raw)
+    assert code == 0, err
+    assert [text.split()[0] for text in asked] == ["rotation", "length_unit", "mount"]
+    text = (raw / "session.toml").read_text(encoding="utf-8")
+    assert "zyx-intrinsic" in text and 'mount = "eye_in_hand"' in text
+
+
 @pytest.mark.parametrize(
     ("spoil", "arguments", "told"),
     [

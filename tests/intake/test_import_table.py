@@ -41,6 +41,13 @@ def test_poses_of_the_base_in_the_flange_are_inverted(imported):
     assert [float(rows[1][axis]) for axis in "xyz"] == [-600, 500, -700]
 
 
+def test_times_and_temperatures_come_along(imported):
+    text = "time,x,y,z,qx,qy,qz,qw,scanner temperature [C]\n7.5,100,0,500,0,0,0,1,20.5\n9,100,0,510,0,0,0,1,21\n"
+    _, rows, _ = imported("t.txt", text)
+    assert [row["time_s"] for row in rows] == ["0", "1.5"]
+    assert [row["scanner_temperature_c"] for row in rows] == ["20.5", "21"]
+
+
 def test_joint_angles(imported):
     code, rows, _ = imported("t.txt", JOINTS, "--angles", "rad")
     assert code == 0 and "x" not in rows[0]
