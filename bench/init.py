@@ -58,10 +58,10 @@ def conventions(seed: int) -> list[Convention]:
 class Cell:
     """The scans of an object, prepared once: they are the same under every table."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, views: int) -> None:
         self.folder, self.mount = SHARED / "reghec" / name, OBJECTS[name]
-        self.T, clouds = session_poses(self.folder)
-        self.clouds = [self.folder / cloud for cloud in clouds]
+        T, clouds = session_poses(self.folder)
+        self.T, self.clouds = T[:views], [self.folder / cloud for cloud in clouds[:views]]
         self.capture: Capture = capture_of([read_cloud(cloud) for cloud in self.clouds], 1000.0)
         self.motions = cache(lambda: relative_scans(self.capture))
 
@@ -90,10 +90,11 @@ def main() -> None:
     parser.add_argument("--tables", action="store_true", help="write the table of docs/own-data.md")
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--views", type=int, default=9, help="the first so many of nine")
     asked = parser.parse_args()
     rows, spent = {}, time.process_time()
     for number, name in enumerate(asked.objects):
-        cell, counts = Cell(name), Counter[str]()
+        cell, counts = Cell(name, asked.views), Counter[str]()
         for convention in conventions(asked.seed + number):
             result, said = cell.outcome(convention)
             counts[result] += 1
