@@ -20,7 +20,7 @@ import numpy as np
 from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
@@ -46,12 +46,6 @@ class PoseErrors:
     names: tuple[str, ...]
     components: Array  # (c, 6V, 6V) per unit of each
     scales: Array  # (c,) of the half-Cauchy priors of their σ
-
-    def without(self, views: Indices) -> "PoseErrors":
-        """Without some views, counted through all sessions."""
-        rows = np.setdiff1d(np.arange(self.components.shape[1] // 6), views)
-        keep = (6 * rows[:, None] + np.arange(6)).ravel()
-        return PoseErrors(self.names, self.components[:, keep][:, :, keep], self.scales)
 
 
 def white(views: int) -> PoseErrors:

@@ -22,7 +22,7 @@ _NOISE = 2
 # Further components may well be absent: λ/s² of a scale s is a priori beta-prime(_SPIKE/2, 1/2), which piles up at zero
 # and has the tails of a half-Cauchy (Armagan, Clyde & Dunson 2011, NIPS 24; with 1 in place of _SPIKE it is the
 # half-Cauchy of Gelman 2006, Bayesian Analysis 1:515). The density counts per log σ.
-_SPIKE = 0.2
+_SPIKE = 0.1
 # The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
 _USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5

@@ -1,16 +1,15 @@
 """The hand-eye and the effects in use from freed views: generalised least squares, covariance, held-out error.
 
-No number of points averages out the error of a pose: views are the samples. What an arm does wrong it does again, so
-that no number of views averages that out either: `pose_errors.py` says how poses may err, the views say how much,
-and hand-eye and effects are averaged over all sizes that the views allow. Errors of the scanner that repeat in
-every view come on top.
+No number of points averages out the error of a pose: views are the samples, and they weigh by the scatter that they
+show, so that what remains is as small as it can be. What an arm does wrong it does again: no number of views averages
+that out. `pose_errors.py` says how poses may err, the views say how much, and that is what the covariance of hand-eye
+and effects counts. Errors of the scanner that repeat in every view come on top.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from stitch import frames
 from stitch.frames import Array
@@ -18,11 +17,10 @@ from stitch.measurement.capture import Capture
 from stitch.observations.pose_errors import PoseErrors, white
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.pose_channel import Repeatability, covariance_of, estimate
-from stitch.observations.surfaces.rig_model import RigModel, rig_model
-from stitch.statistics.least_squares import generalised
+from stitch.observations.surfaces.pose_channel import Repeatability, estimate
+from stitch.observations.surfaces.rig_model import rig_model
 from stitch.statistics.variance_components import fit_variances
-from stitch.statistics.variance_posterior import MeanPosterior, mean_posterior
+from stitch.statistics.variance_posterior import mean_variances
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def fit_hand_eye(
     repeating: Sequence[Array] | None = None,
     errors: PoseErrors | None = None,
 ) -> HandEye:
-    """Generalised least squares over the pose channels of all captures, averaged over all variances they allow.
+    """Generalised least squares over the pose channels of all captures; covariance under all errors of the poses.
 
     Args:
         freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
@@ -76,44 +74,49 @@ def fit_hand_eye(
         CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), extra)
         for c, f, extra in zip(captures, freed, columns.twists, strict=True)
     ]
-    rig = rig_model(parts, errors or white(sum(len(f.poses) for f in freed)))
+    rig, scatter = rig_model(parts), [estimate(e.channel, e.further) for e in parts]
     prior = _prior(captures, freed, T_mount, columns)
     pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
-    found = mean_posterior(rig.mixed, fit_variances(rig.mixed, both_starts=True), rig.columns, (prior, pull))
-    repeated = np.zeros((len(pull), 0))
+    weighed = rig.weighed(scatter, prior)
+    x = weighed.solve(rig.z, pull)
+    errors = errors or white(sum(len(f.poses) for f in freed))
+    mixed = rig.mixed(errors)
+    sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
+    sources = dict(
+        zip(
+            ("white rotation", "white translation", "sensor noise", *errors.names),
+            (size * weighed.gain @ C[0] @ weighed.gain.T for size, C in zip(sizes, mixed.components, strict=True)),
+            strict=True,
+        )
+    )
     if repeating is not None:
-        repeated = rig.gain(found.variances, prior) @ rig.reduce(repeating)
-    covariance = found.covariance + repeated @ repeated.T
-    scatter = tuple(estimate(e.channel, e.further) for e in parts)
+        repeated = weighed.gain @ rig.reduce(repeating)
+        sources["scanner field"] = repeated @ repeated.T
+    # The rest is what the prior leaves where nothing is seen.
+    sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
+    covariance = np.sum(list(sources.values()), axis=0)
     return HandEye(
-        T_mount=T_mount @ frames.exp(found.mean[:6]),
+        T_mount=T_mount @ frames.exp(x[:6]),
         covariance=covariance[:6, :6],
-        inflation=_inflation(rig, scatter, prior, covariance),
-        shares=_shares(rig, found, repeated, covariance),
-        repeatability=scatter,
-        heldout_ratio=_heldout_ratio(rig, found, prior, pull),
-        values=columns.values + found.mean[6:],
+        inflation=_inflation(covariance, weighed.covariance),
+        repeatability=tuple(scatter),
+        heldout_ratio=_heldout_ratio(parts, scatter, (prior, pull), x),
+        shares=_shares(sources, covariance),
+        values=columns.values + x[6:],
         values_covariance=covariance[6:, 6:],
     )
 
 
-def _inflation(rig: RigModel, scatter: Sequence[Repeatability], prior: Array, covariance: Array) -> float:
-    alone = block_diag(*(covariance_of(e.channel, s) for e, s in zip(rig.parts, scatter, strict=True)))
-    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(generalised(alone, rig.columns, prior).covariance)[1]
+def _inflation(covariance: Array, alone: Array) -> float:
+    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(alone)[1]
     return float(max(1.0, np.exp(ratio / len(covariance))))
 
 
-def _shares(rig: RigModel, found: MeanPosterior, repeated: Array, covariance: Array) -> dict[str, float]:
-    """Mean share of every source in the variance of the hand-eye, over its directions."""
-    unit = np.linalg.inv(covariance[:6, :6] / (scale := np.sqrt(np.diag(covariance)[:6])) / scale[:, None])
-
-    def share(own: Array) -> float:
-        return float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6
-
-    names = ("white rotation", "white translation", "sensor noise", *rig.errors.names)
-    shares = {name: share(own) for name, own in zip(names, found.contributions, strict=True)}
-    shares["scanner field"] = share(repeated @ repeated.T)
-    return {**shares, "their unknown sizes": 1 - sum(shares.values())}
+def _shares(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
+    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1."""
+    scale = np.sqrt(np.diag(covariance)[:6])
+    unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
+    return {name: float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6 for name, own in sources.items()}
 
 
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
@@ -123,14 +126,24 @@ def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatabil
     return estimate(own.channel)
 
 
-def _heldout_ratio(rig: RigModel, found: MeanPosterior, prior: Array, pull: Array) -> float:
-    """Rms of views left out in groups over that of the same pairs under the estimates of all views."""
+def _heldout_ratio(
+    parts: Sequence[CaptureEvidence], scatter: Sequence[Repeatability], prior: tuple[Array, Array], x: Array
+) -> float:
+    """Rms of views left out in groups over that of the same pairs under the estimates x (6 + P,) of all views.
+
+    Args:
+        prior: precision (6 + P, 6 + P), and that times its middle (6 + P,).
+    """
     outside = np.zeros(2)
-    for k, e in enumerate(rig.parts):
+    for k, e in enumerate(parts):
         for fold in e.folds():
-            fewer = rig.without(k, fold)
-            x = fewer.solve(found.variances, prior, pull)
-            outside += e.squares(fold, (x, found.mean))
+            fewer = e.without(fold)
+            rest = [(o, s) for i, (o, s) in enumerate(zip(parts, scatter, strict=True)) if i != k]
+            rest += [(fewer, scatter[k])] if len(fewer.gram.pairs) else []
+            if rest:
+                rig = rig_model([o for o, _ in rest])
+                left_out = rig.weighed([s for _, s in rest], prior[0]).solve(rig.z, prior[1])
+                outside += e.squares(fold, (left_out, x))
     return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
 
 

@@ -1,0 +1,44 @@
+"""How alike two views err: limits that anybody can check, and no negative variance."""
+
+import numpy as np
+import pytest
+
+from stitch.statistics.kernels import alike_in_joints, alike_in_time, spread_over
+
+JOINTS = np.random.default_rng(0).uniform(-np.pi, np.pi, (25, 6))
+
+
+def test_covariances_have_no_negative_direction():
+    for alike in (alike_in_joints(JOINTS), alike_in_time(np.cumsum(JOINTS[:, 0] ** 2))):
+        assert np.linalg.eigvalsh(alike).min() > -1e-12
+        assert np.diag(alike) == pytest.approx(1.0)
+
+
+def test_a_whole_turn_of_a_joint_changes_nothing():
+    turned = JOINTS.copy()
+    turned[:, 2] += 2 * np.pi * np.arange(25)
+    assert np.allclose(alike_in_joints(turned), alike_in_joints(JOINTS))
+
+
+def test_what_one_joint_moves_far_stays_half_alike_and_near_views_are_alike():
+    """One joint of one: (1 + k)/2 with k from 1 at no distance to exp(−2) half a turn away."""
+    assert alike_in_joints(np.array([[0.0], [np.pi]]))[0, 1] == pytest.approx((1 + np.exp(-2)) / 2)
+
+
+def test_time_forgets():
+    alike = alike_in_time(np.array([0.0, 1.0, 500.0]))
+    assert alike[0, 1] == pytest.approx(0.5 * (np.exp(-0.5) + np.exp(-0.1)))
+    assert alike[0, 2] < 1e-12
+
+
+def test_spread_is_the_covariance_of_drawn_processes():
+    """10,000 draws of two processes through their columns; each number within five of its standard errors."""
+    rng = np.random.default_rng(1)
+    alike, columns, draws = alike_in_time(np.arange(4.0)), rng.normal(size=(24, 2)), 10_000
+    half = np.linalg.cholesky(alike)
+    drawn = np.zeros((draws, 24))
+    for p in range(2):
+        drawn += np.repeat(rng.normal(size=(draws, 4)) @ half.T, 6, axis=1) * columns[:, p]
+    wanted = spread_over(columns, alike)
+    variance = np.outer(np.diag(wanted), np.diag(wanted)) + wanted**2
+    assert np.all(np.abs(drawn.T @ drawn / draws - wanted) < 5 * np.sqrt(variance / draws))

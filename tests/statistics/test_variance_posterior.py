@@ -1,0 +1,52 @@
+"""Posterior means of variances against an integral on a grid."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from stitch.statistics.variance_components import MixedModel, fit_variances
+from stitch.statistics.variance_posterior import mean_variances
+
+N, SCALE = 40, 0.5
+
+
+def shared_errors(size: float, seed: int = 3) -> MixedModel:
+    """Numbers of known noise with an error in common to fives of them, about one unknown mean."""
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.eye(N // 5), 5, axis=0)
+    z = 1.0 + rng.standard_normal(N) + size * groups @ rng.standard_normal(N // 5)
+    # Of the first two components there is nothing; the noise is there with a factor near two.
+    components = np.array([np.zeros((N, N)), np.zeros((N, N)), 0.5 * np.eye(N), groups @ groups.T])[:, None]
+    return MixedModel(z[None], np.full((1, N, 1), N**-0.5), components, scales=np.array([SCALE]))
+
+
+def on_a_grid(mixed: MixedModel) -> np.ndarray:
+    """The same by brute force: flat prior of the mean, densities of scipy, priors of the variances written out."""
+    noise, group = np.meshgrid(np.linspace(-1.0, 3.0, 25), np.linspace(-16, 7, 47), indexing="ij")
+    logs, ones = [], np.ones(N)
+    for a, b in zip(noise.ravel(), group.ravel(), strict=True):
+        V = np.exp(a) * mixed.components[2, 0] + np.exp(b) * mixed.components[3, 0]
+        weights = np.linalg.solve(V, ones)
+        mean = float(weights @ mixed.z[0] / weights.sum())
+        likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
+        prior = -0.5 * ((a - np.log(2)) / 1.5) ** 2 + 0.5 * 0.1 * b - 0.5 * 1.1 * np.log1p(np.exp(b) / SCALE**2)
+        logs.append(likelihood + prior)
+    w = np.exp(np.array(logs) - max(logs))
+    return np.array([w @ np.exp(noise.ravel()), w @ np.exp(group.ravel())]) / w.sum()
+
+
+@pytest.mark.parametrize("size", [0.0, 2.0])
+def test_the_average_is_the_integral(size):
+    mixed = shared_errors(size)
+    found = mean_variances(mixed, fit_variances(mixed))
+    # 48 draws know the mean of what spreads by as much as itself to a seventh of it; three of these. What is far below
+    # the noise, of which rare large values are the mean, need only stay there.
+    assert found[2:] == pytest.approx(on_a_grid(mixed), rel=3 / 7, abs=0.02)
+    assert (found[:2] == 0).all() or (found[:2] < 1e-100).all()
+
+
+def test_among_very_many_numbers_the_maximum_must_do(monkeypatch):
+    monkeypatch.setattr("stitch.statistics.variance_posterior._NO_DRAWS", N)
+    mixed = shared_errors(1.0)
+    fit = fit_variances(mixed)
+    assert mean_variances(mixed, fit) == pytest.approx(fit.variances)
