@@ -16,6 +16,7 @@ from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, 
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
 from stitch.diagnosis.validation.cross_validation import cross_validate
+from stitch.diagnosis.variance_budget import variance_budget
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.state import State
@@ -56,6 +57,7 @@ def diagnose_state(state: State) -> Diagnosis:
             notes=notes,
             scatter_limit=limit,
             implausible=implausible(linear, limit),
+            budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))
 

@@ -8,6 +8,7 @@ from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
 from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 
@@ -48,6 +49,7 @@ class Diagnosis:
     scatter_limit: ScatterLimit  # what "adequate" is measured against
     implausible: bool  # the poses scatter by more than that
     notes: tuple[str, ...] = ()
+    budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

@@ -19,6 +19,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term
+from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.response import PointSums, Response
 from stitch.statistics.folds import JointEnd
 from stitch.statistics.least_squares import column_space
@@ -94,6 +95,7 @@ class LinearModel:
     design: Array  # (·, a) response to hand-eye, landmarks and effects in use
     mixed: MixedModel  # the same in the channel, with the components of the covariance
     null: VarianceFit  # fitted without further columns
+    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
 
     @cached_property
     def satterthwaite(self) -> Satterthwaite:

@@ -13,7 +13,7 @@ White scatter of every scan, and the sensor's noise, come with the observation.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,7 +45,11 @@ class PoseErrors:
 
     names: tuple[str, ...]
     components: Array  # (c, 6V, 6V) per unit of each
-    scales: Array  # (c,) of the half-Cauchy priors of their σ
+    scales: Array  # (c,) that their σ usually has
+
+    def reduced(self, reduction: Array) -> "PoseErrors":
+        """The same of numbers reduction (n, 6V) @ twists."""
+        return replace(self, components=np.array([reduction @ C @ reduction.T for C in self.components]))
 
 
 def white(views: int) -> PoseErrors:

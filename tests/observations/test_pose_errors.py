@@ -8,13 +8,15 @@ from scipy.stats import chi2
 
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
-from data_synth.ordinary_arm import draw_arm
+from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch import frames
+from stitch.diagnosis.variance_budget import variance_budget
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.observations.surfaces.surface_model import surface_model
 
 VIEWS, SIZE = 12, 0.5
 
@@ -97,3 +99,20 @@ def test_sigmas_hold_on_arms_that_are_a_little_wrong_everywhere(cell):
             squares[k] += xi @ np.linalg.solve(found.covariance, xi)
     assert squares[0] < chi2.ppf(0.999, 36)
     assert squares[1] > chi2.ppf(0.999, 36)
+
+
+def test_the_budget_adds_up_and_tells_an_ordinary_arm_from_one_that_wanders(cell):
+    """All joints and links wrong: most of what is left is the arm's. 0.2 mm and 0.2 mrad of memory: it wanders."""
+    measured, measurement, freed = cell
+    arm, q = measured.scene.arm, measured.plan.joints
+    bent = draw_arm(arm.joints, SIZE, np.random.default_rng(1)).flange(arm, q)
+    memory = with_memory(VIEWS, 0.9, np.random.default_rng(2)) * np.repeat([2e-4, 0.2], 3)
+    shares = []
+    for T in (bent, measured.T_base_flange @ frames.exp(memory)):
+        seen = replace(freed, twists=freed.twists + moved(cell, T))
+        budget = variance_budget(surface_model(measurement, Model(measured.T_mount), measurement.capture, seen))
+        assert sum(line.variance_share for line in budget) == pytest.approx(1.0)
+        share = {line.source: line.variance_share for line in budget}
+        shares.append((sum(x for name, x in share.items() if "every joint" in name), share["wandering in time"]))
+    assert shares[0][0] > 0.5 > shares[0][1]
+    assert shares[1][1] > shares[0][1]

@@ -11,6 +11,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term, stacked
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import pose_errors
 from stitch.observations.response import PointSums, Response
 from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses
@@ -90,4 +91,5 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
     mixed = replace(mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
     design = np.hstack([jacobian(frames_of_mount, g.centre), extra[:, seen]])
     null = fit_variances(mixed, both_starts=True)
-    return LinearModel(measurement, model, Surfaces(capture, freed, channel), design, mixed, null)
+    errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
+    return LinearModel(measurement, model, Surfaces(capture, freed, channel), design, mixed, null, errors)

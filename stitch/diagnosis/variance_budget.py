@@ -1,0 +1,77 @@
+"""What the poses leave, by source: named effects, smooth errors without a name, wandering, white scatter, noise."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.score import Score
+from stitch.frames import Array
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import PoseErrors
+from stitch.statistics.identifiability import project_out
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.variance_posterior import mean_variances
+
+# Components as people call them; the arm's own keep the name of their effects.
+_WHITE = ("white rotation", "white translation", "sensor noise")
+_CALLED = {
+    "sensor noise": "sensor noise",
+    "white rotation": "white repeatability",
+    "white translation": "white repeatability",
+    "smooth": "smooth, unnamed",
+    "wandering rotation": "wandering in time",
+    "wandering translation": "wandering in time",
+    "stop rotation": "shared by the scans of a stop",
+    "stop translation": "shared by the scans of a stop",
+}
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """One source of what the poses leave."""
+
+    source: str
+    variance_share: float  # of all sources; they add up to 1
+    sigma: float  # rms over the directions that are seen
+    unit: str
+
+
+def variance_budget(linear: LinearModel, named: Sequence[Score] = ()) -> tuple[BudgetLine, ...]:
+    """Shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
+
+    Args:
+        named: candidates that are said to be missing: what they explain is theirs.
+    """
+    if linear.pose_errors is None:
+        return ()
+    hand_eye = linear.reduce(linear.design[:, :6])
+    squares: dict[str, float] = {}
+    for term, response in zip(linear.model.terms, linear.responses(linear.model.terms), strict=True):
+        squares[term.name] = _square(hand_eye, linear.reduce(response.columns) @ term.values)
+    for score in named:
+        squares[score.name] = _square(hand_eye, score.form.columns @ score.values)
+    for name, square in _remaining(linear, linear.pose_errors, [s.form.columns for s in named]):
+        squares[name] = squares.get(name, 0.0) + square
+    total, unit, n = sum(squares.values()), linear.measurement.length_unit, linear.mixed.size
+    lines = [BudgetLine(s, x / max(total, 1e-300), float(np.sqrt(max(x, 0.0) / n)), unit) for s, x in squares.items()]
+    return tuple(sorted(lines, key=lambda line: -line.variance_share))
+
+
+def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) -> Iterator[tuple[str, float]]:
+    """Sums of squares that each component leaves beside the model and what is named."""
+    U = column_space(np.hstack([linear.reduce(linear.design), *named]))
+    components = np.concatenate([linear.mixed.components, errors.components[:, None]])
+    mixed = replace(linear.mixed, A=U[None], components=components, scales=errors.scales)
+    sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
+    for name, size, C in zip((*_WHITE, *errors.names), sizes, components[:, 0], strict=True):
+        yield _CALLED.get(name, f"{name} of every joint"), float(size * (np.trace(C) - np.sum(U * (C @ U))))
+    if linear.mixed.fixed is not None:
+        C = linear.mixed.fixed[0]
+        yield "scanner field", float(np.trace(C) - np.sum(U * (C @ U)))
+
+
+def _square(base: Array, numbers: Array) -> float:
+    """What no hand-eye explains of numbers (n,), squared."""
+    return float(np.sum(project_out(base, numbers[:, None]) ** 2))
