@@ -1,66 +1,129 @@
-"""What the viewer opens on: the result and the verdict first, the way there on further tabs."""
+"""What the viewer opens on: before and after side by side, the model's history and the cell on further tabs."""
 
 import os
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
+import numpy as np
 import rerun.blueprint as rrb
 
+from stitch.frames import Array
+from viz.model_timeline import FRAMES, ModelScene, shown_steps
+from viz.part_camera import Camera
 
-def blueprint(changed: bool = False) -> rrb.Blueprint:
-    """Result | the model's history | before and after | every iteration; `changed`: an effect came or went."""
-    side = rrb.Vertical(
-        rrb.TextDocumentView(origin="verdict", name="Verdict"),
-        rrb.BarChartView(origin="views", contents=["views/correction_um"], name="Correction per view (µm)"),
-        rrb.BarChartView(origin="views", contents=["views/rms_um"], name="Rms per view after register (µm)"),
-        row_shares=[3, 1, 1],
-    )
-    fused = rrb.Spatial3DView(origin="fused", name="Stitched, by disagreement of the views")
-    result = rrb.Horizontal(fused, side, column_shares=[3, 2], name="Result")
-    pictures = [rrb.Spatial2DView(origin="history/waterfall", name="The error over the history of the model")]
-    if changed:
-        pictures.append(rrb.Spatial2DView(origin="history/change", name="Where the last change of the model helped"))
-    else:
-        pictures.append(rrb.Spatial2DView(origin="history/register", name="Before and after register, rms on the part"))
-    history = rrb.Vertical(*pictures, name="History of the model")
+# Of the longest side of the part, from its middle: all of it is in the picture.
+_AWAY = 1.2
+_GROUND = [24, 27, 31]
+_COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
+
+
+def model_blueprint(scene: ModelScene, camera: Camera, stages: tuple[str, ...]) -> rrb.Blueprint:
+    """Before and after | the model step by step | what is missing | the cell | every iteration."""
+    before, after = shown_steps(scene.history)
+    unit = "" if len(scene.history.models) > 1 else " (single views moved)"
     compare = rrb.Horizontal(
-        rrb.Spatial3DView(origin="before", name="One hand-eye: before register"),
-        rrb.Spatial3DView(origin="after", name="After register, same colour scale"),
-        name="Before and after",
-    )
-    scans = rrb.Vertical(
-        rrb.Spatial3DView(origin="scans/by_view", name="Scans by view"),
-        rrb.Spatial3DView(origin="scans/by_residual", name="Scans by distance from the others"),
-    )
-    curves = rrb.Vertical(
-        rrb.TimeSeriesView(origin="convergence/rms_um", name="Rms (µm)"),
-        rrb.TimeSeriesView(origin="convergence/gate_um", name="Gate: partners within (µm)"),
-        rrb.Spatial3DView(origin="robot", name="Robot: flange poses in the base frame"),
-        rrb.TextLogView(origin="log", name="Stages"),
-    )
-    steps = rrb.Horizontal(scans, curves, column_shares=[3, 2], name="Every iteration")
-    # Opens at the end of the timeline: the result is there, the way back is the slider.
-    time = rrb.TimePanel(state="collapsed", timeline="step", play_state="following")
-    return rrb.Blueprint(rrb.Tabs(result, history, compare, steps, active_tab=0), time, collapse_panels=True)
-
-
-def diagnosis_blueprint() -> rrb.Blueprint:
-    """Verdict and candidate effects | seen against predicted | aliases | what the poses follow."""
-
-    def picture(name: str, title: str) -> rrb.Spatial2DView:
-        return rrb.Spatial2DView(origin=f"diagnosis/{name}", name=title)
-
-    verdict = rrb.Vertical(
-        rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict"),
-        rrb.Horizontal(
-            picture("candidates", "Candidate effects, best first"), picture("budget", "Where the error comes from")
+        _part("part/before", scene.title(before), scene, camera),
+        _part("part/after", scene.title(after) + unit, scene, camera),
+        rrb.Vertical(
+            rrb.TextDocumentView(origin="verdict", name="What was found"),
+            _bar("colours/field", "Views disagree by (µm)"),
+            row_shares=[5, 1],
         ),
-        row_shares=[1, 2],
-        name="What is missing",
+        column_shares=[3, 3, 2],
+        name="Before | after",
     )
-    unexplained = rrb.Vertical(
-        picture("shape", "Bins of the covariates that the displacement follows most"),
-        picture("views", "Displacement of every view"),
-        name="What the poses follow",
+    steps = rrb.Horizontal(
+        _part("part/now", f"Where the views disagree; full colour at {scene.limit * scene.um:.3g} µm", scene, camera),
+        rrb.Spatial3DView(
+            origin="/",
+            contents=["stitched", "scans/**", "displacements"],
+            name=f"Views farthest off, displaced {scene.magnified[1]:g} times as far (coarse: {scene.magnified[0]:g})",
+            eye_controls=_eye(scene, camera),
+            background=_GROUND,
+            line_grid=False,
+        ),
+        rrb.Vertical(
+            rrb.TextDocumentView(origin="now", name="Step of the model"),
+            rrb.BarChartView(
+                origin="bars",
+                contents=["bars/first", "bars/views"],
+                name="Each view off the others (µm)",
+                plot_legend=rrb.PlotLegend(visible=False),
+            ),
+            rrb.BarChartView(origin="bars/moved", name="Each view moved by register (µm)"),
+            _bar("colours/field", "Views disagree by (µm)"),
+            row_shares=[5, 6, 6, 3],
+        ),
+        column_shares=[3, 3, 2],
+        name="The model, step by step",
     )
-    predicted, aliases = picture("added_variable", "Seen against predicted"), picture("aliases", "Aliases")
-    return rrb.Blueprint(rrb.Tabs(verdict, predicted, aliases, unexplained, active_tab=0), collapse_panels=True)
+    time = rrb.TimePanel(state="collapsed", timeline="model", play_state="paused", fps=FRAMES)
+    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), _iterations(stages), active_tab=0)
+    return rrb.Blueprint(tabs, time, collapse_panels=True)
+
+
+def target_blueprint(cell: Array) -> rrb.Blueprint:
+    """Targets and what was found | what is missing | the cell, some points (N, 3) of which are given, base frame."""
+    result = rrb.Horizontal(
+        rrb.Spatial3DView(
+            origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
+        ),
+        rrb.Vertical(
+            rrb.TextDocumentView(origin="verdict", name="What was found"),
+            rrb.TextDocumentView(origin="now", name="Sticks"),
+            rrb.BarChartView(origin="bars/moved", name="Each view moved by register (µm)"),
+            row_shares=[4, 1, 2],
+        ),
+        column_shares=[3, 2],
+        name="Targets",
+    )
+    return rrb.Blueprint(rrb.Tabs(result, _diagnosis(), _cell(cell), active_tab=0), collapse_panels=True)
+
+
+def _part(origin: str, name: str, scene: ModelScene, camera: Camera) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        origin=origin, name=name, eye_controls=_eye(scene, camera), background=_GROUND, line_grid=False
+    )
+
+
+def _eye(scene: ModelScene, camera: Camera) -> rrb.EyeControls3D:
+    """The same eye for all views of the part."""
+    vertices = scene.surface.vertices
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    position = middle + _AWAY * float(np.ptp(vertices, axis=0).max()) * camera.towards
+    return rrb.EyeControls3D(position=position, look_target=middle, eye_up=camera.up)
+
+
+def _bar(origin: str, name: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(origin=origin, name=name)
+
+
+def _cell(points: Array) -> rrb.Vertical:
+    """Everything in the picture, from the side and a little from above."""
+    middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    across = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+    # Turned a little: the shortest way through a cell is often along the scanner's rays.
+    across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
+    level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
+    eye = rrb.EyeControls3D(
+        position=middle + size * (1.1 * level + [0.0, 0.0, 0.35]), look_target=middle, eye_up=[0, 0, 1]
+    )
+    view = rrb.Spatial3DView(
+        origin="robot",
+        name="Arm at every view (grey), field of the scanner (lines), part; base frame",
+        background=_GROUND,
+        eye_controls=eye,
+    )
+    return rrb.Vertical(view, name="The cell")
+
+
+def _iterations(stages: tuple[str, ...]) -> rrb.Vertical:
+    bars = [rrb.BarChartView(origin=f"iterations/{s}", name=f"{s}: rms of every iteration (µm)") for s in stages]
+    return rrb.Vertical(*bars, name="Every iteration")
+
+
+def _diagnosis() -> rrb.Horizontal:
+    """Verdict with candidate effects | their evidence, and where the overlaps put the views."""
+    verdict = rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict and candidate effects, best first")
+    evidence = rrb.BarChartView(origin="diagnosis/evidence", name="Log Bayes factor of each candidate effect")
+    moved = rrb.BarChartView(origin="diagnosis/displaced", name="Displacement of every view in x, y, z (µm)")
+    return rrb.Horizontal(verdict, rrb.Vertical(evidence, moved), column_shares=[3, 2], name="What is missing")

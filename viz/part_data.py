@@ -51,7 +51,7 @@ def part_data(surface: PartSurface, camera: Camera, history: ModelHistory, names
         "colours": {"field": _stops(FIELD), "signed": _stops(SIGNED)},
         "radius": f"{history.patches.radius:.3g} {length_unit}",
         "begin": 1,
-        "end": len(history.steps) - 2 if len(history.models) > 1 else len(history.steps) - 1,
+        "end": len(history.steps) - 2,
     }
 
 

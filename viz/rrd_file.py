@@ -3,17 +3,25 @@
 Rerun's own file sink writes from a thread of its own: on a full disk it reports nothing and waits without end.
 """
 
+import uuid
 from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 
+def id_of(session: str) -> str:
+    """The same for all recordings of one session, so that a viewer takes them for one."""
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, f"stitch:{session}"))
+
+
 class RecordingFile:
     """A recording in memory, and the file that it becomes."""
 
-    def __init__(self, name: str, path: Path, default: rrb.Blueprint | None = None) -> None:
-        self.stream = rr.RecordingStream(name)
+    def __init__(
+        self, name: str, path: Path, recording: str | None = None, default: rrb.Blueprint | None = None
+    ) -> None:
+        self.stream = rr.RecordingStream(name, recording_id=recording)
         self._path = path
         self._memory = self.stream.memory_recording()
         if default is not None:

@@ -1,10 +1,10 @@
-"""What comparison and diagnosis add to a run folder: sections of the page, pictures, a recording of their own."""
+"""What comparison and diagnosis add to a run folder: sections of the page, pictures, a tab of the recording."""
 
 import re
 from pathlib import Path
 from typing import NamedTuple
 
-import rerun as rr
+from markupsafe import escape
 from matplotlib.figure import Figure
 
 from stitch.comparison.tables import Comparison
@@ -15,18 +15,17 @@ from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
 from viz import captions
 from viz import diagnosis_figures as draw
-from viz.blueprint import diagnosis_blueprint
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
 from viz.comparison_figures import comparison
+from viz.diagnosis_recording import add_diagnosis
 from viz.page_parts import render, script_json, svg_address, svg_text
-from viz.rrd_file import RecordingFile
 
 # Candidate effects in the table of the page.
 _SHOWN = 8
 
 
 def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
-    """Section of report.html, pictures/*.svg and *.png, diagnosis.rrd."""
+    """Section of report.html, pictures/*.svg and *.png, a tab of the recording."""
     pictures = _pictures(found, state.session.length_unit)
     addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
     unit, fields = state.session.length_unit, candidate_fields(found)
@@ -41,7 +40,25 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
     )
     _insert(folder / "report.html", "diagnosis", html)
-    _record(found, folder)
+    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(_finding(found, fields, unit))}</p>')
+    add_diagnosis(found, fields, unit, folder / "recording.rrd")
+
+
+def _finding(found: Diagnosis, fields: CandidateFields | None, length_unit: str) -> str:
+    """What is missing, for everybody; the sentence with its numbers stands below."""
+    named = " or ".join(found.effects)
+    match found.verdict:
+        case "adequate":
+            return "No physical effect is missing in the model."
+        case "cannot_tell":
+            return f"Something is missing in the model, and these views cannot tell whether it is {named}."
+        case "unknown_effect":
+            return "Something is missing in the model that no effect of the library explains."
+    if fields is None or found.effects[0] not in fields.if_added:
+        return f"Missing in the model: {named}."
+    um = MICROMETRES[length_unit]
+    now, then = (f"{f.mean_abs * um:.3g} µm" for f in (fields.present, fields.if_added[found.effects[0]]))
+    return f"Missing in the model: {named}. Added, the views should disagree by {then} instead of {now}."
 
 
 class _Picture(NamedTuple):
@@ -123,15 +140,3 @@ def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
             file.write_text(text, encoding="utf-8")
         addresses[name] = svg_address(text)
     return addresses
-
-
-def _record(found: Diagnosis, folder: Path) -> None:
-    """The verdict and its pictures; `stitch view` opens it beside the recording of the run."""
-    text = f"# {found.verdict}\n\n{found.sentence}"
-    with whole(folder / "diagnosis.rrd") as file:
-        written = RecordingFile("stitch_diagnosis", file, diagnosis_blueprint())
-        recording = written.stream
-        recording.log("diagnosis/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
-        for picture in sorted((folder / "pictures").glob("*.png")):
-            recording.log(f"diagnosis/{picture.stem}", rr.EncodedImage(path=picture), static=True)
-        written.write()

@@ -1,15 +1,14 @@
 """`stitch view RUN`: open a recording in the Rerun viewer."""
 
 import os
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stitch.errors import InputError, NoResultError
+from viz.diagnosis_recording import rerun_program
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]) -> None:
@@ -18,7 +17,7 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]
 
 
 def open_recording(run: Path) -> None:
-    """Show RUN/recording.rrd, and RUN/diagnosis.rrd where there is one.
+    """Show RUN/recording.rrd.
 
     Raises:
         InputError: the run has no recording.
@@ -27,7 +26,6 @@ def open_recording(run: Path) -> None:
     path = run / "recording.rrd" if run.is_dir() else run
     if not path.is_file():
         raise InputError(f"{path}: no recording; run `stitch run` without --no-recording")
-    viewer = shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
-    files = [str(p) for p in (path, path.with_name("diagnosis.rrd")) if p.is_file()]
-    if subprocess.run([viewer, *files], env=os.environ | {"RERUN_ANALYTICS": "off"}, check=False).returncode:
+    quiet = os.environ | {"RERUN_ANALYTICS": "off"}
+    if subprocess.run([rerun_program(), str(path)], env=quiet, check=False).returncode:
         raise NoResultError(f"the viewer could not open {path}; is there a screen?")

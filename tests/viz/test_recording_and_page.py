@@ -1,5 +1,6 @@
-"""What people see: the recording and the page of a small run."""
+"""What people see: the recording of a small run, and of one to which an effect was added; its page."""
 
+import json
 import re
 import subprocess
 import sys
@@ -7,7 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
+from rerun.chunk import RrdReader
 
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.write import write_session
+from stitch.comparison.model_history import model_history
+from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
 from viz.run_page import write_report
 
@@ -17,23 +24,65 @@ def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
 
 
-def test_recording_is_whole_and_shows_every_stage(recorded):
-    _, path = recorded
+def columns(path, column):
+    """Entity → values of the last chunk that has this column."""
+    batches = ((chunk.entity_path, chunk.to_record_batch()) for chunk in RrdReader(str(path)).stream())
+    return {entity: batch.column(column)[-1].as_py() for entity, batch in batches if column in batch.schema.names}
+
+
+def names_of_views(path):
+    """As the blueprint has them."""
+    reader = RrdReader(str(path))
+    batches = (chunk.to_record_batch() for chunk in reader.stream(store=reader.blueprints()[-1]))
+    named = ((batch, key) for batch in batches for key in batch.schema.names if "display_name" in key)
+    return {name for batch, key in named for name in batch.column(key)[-1].as_py()}
+
+
+def titles(rows):
+    """Names of the views of a step, as result.json has its numbers."""
+    return [f"{row['step']}: views disagree by {row['mean'] * 1e3:.3g} µm on average" for row in rows]
+
+
+def test_the_recording_is_whole_and_small_and_shows_everything(recorded):
+    result, path = recorded
     assert rerun("rrd", "verify", str(path)).returncode == 0
-    printed = rerun("rrd", "print", str(path)).stdout
-    for entity in (
-        "/scans/by_view/v000",
-        "/scans/by_residual/v004",
-        "/fused",
-        "/verdict",
-        "/before",
-        "/after",
-        "/convergence/rms_um/correct",
-        "/convergence/rms_um/register",
-        "/views/correction_um",
-        "/robot/flange_path",
-    ):
-        assert entity in printed, entity
+    assert path.stat().st_size < 15_000_000
+    off = np.nanmean(np.abs(model_history(result).models[0].field.values), axis=1)
+    farthest = [result.session.views[v].name for v in np.argsort(-off)[:4]]
+    shown = {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
+    parts = {f"/part/{name}" for name in ("now", "before", "after")} | {f"/scans/{name}" for name in farthest}
+    cell = {"/robot/arm", "/robot/flanges", "/robot/part", "/robot/scanner/scanner"}
+    bars = {"/bars/views", "/bars/moved", "/iterations/correct", "/iterations/register", "/colours/field/ticks"}
+    assert parts | cell | bars | {"/stitched", "/displacements", "/now", "/verdict", "/diagnosis/verdict"} <= shown
+
+
+def test_titles_and_words_say_what_the_result_says(recorded):
+    run, path = recorded
+    stated = result_document(run)["disagreement"]["steps"]
+    before, after = titles([stated[1], stated[-1]])
+    assert {before, f"{after} (single views moved)"} <= names_of_views(path)
+    last = columns(path, "TextDocument:text")["/now"][0]
+    assert titles(stated[-1:])[0].partition(": ")[2] in last
+
+
+@pytest.mark.slow
+def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp_path, stitch_command):
+    """The end of `add --suggested` is fitted once more for the recording: that must not count as the change."""
+    cell = measured_blade(3, views=10, pixels=90, hidden={"joint_compliance": 2.0}, repeatability=(5e-6, 0.005))
+    write_session(tmp_path / "s", cell, "s")
+    stitch_command("run", tmp_path / "s", "-o", tmp_path / "r", "--no-recording")
+    stitch_command("add", tmp_path / "r", "--suggested")
+    stated = json.loads((tmp_path / "r" / "result.json").read_text())["disagreement"]["steps"]
+    assert [row["step"] for row in stated] == ["coarse", "hand-eye alone", "+ joint_compliance", "register"]
+    recording = tmp_path / "r" / "recording.rrd"
+    assert set(titles(stated[1:3])) <= names_of_views(recording)
+    colours = columns(recording, "Mesh3D:vertex_colors")
+    before, after = (np.array(colours[f"/part/{name}"]) for name in ("before", "after"))
+    assert np.mean(before != after) > 0.5
+    # The diagnosis lies in the same file, in place of the line that asks for it.
+    assert rerun("rrd", "verify", str(recording)).returncode == 0
+    words = columns(recording, "TextDocument:text")["/diagnosis/verdict"][0]
+    assert json.loads((tmp_path / "r" / "diagnosis.json").read_text())["sentence"] in words
 
 
 def test_page_needs_nothing_beside_it_and_says_everything(recorded, tmp_path):

@@ -27,7 +27,7 @@ def stage(path: Path, system: str, words: str) -> Iterator[rr.RecordingStream]:
     scene = rrb.Spatial3DView(origin="world", name=system)
     side = rrb.TextDocumentView(origin="words", name="What was found")
     layout = rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 1]), collapse_panels=True)
-    file = RecordingFile(f"stitch_{system.replace(' ', '_')}", path, layout)
+    file = RecordingFile(f"stitch_{system.replace(' ', '_')}", path, default=layout)
     recording = file.stream
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("words", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)

@@ -1,0 +1,79 @@
+"""A diagnosis as native views in the recording of its run: the tab "What is missing"."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.sentences import amounts_of
+from stitch.system.whole_file import whole
+from stitch.units import MICROMETRES
+from viz.candidate_fields import CandidateFields
+from viz.colours import COLOURS_OF_FEW
+from viz.rrd_file import RecordingFile, id_of
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+import rerun as rr
+
+_SHOWN = 8
+NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."
+
+
+def add_diagnosis(found: Diagnosis, fields: CandidateFields | None, length_unit: str, path: Path) -> None:
+    """Put a diagnosis into a recording, in place of an earlier one; nothing where there is no recording.
+
+    Raises:
+        OSError: the recording cannot be written.
+    """
+    if not path.is_file():
+        return
+    own = path.with_name(".diagnosis.part.rrd")
+    try:
+        file = RecordingFile("stitch", own, id_of(found.linear.measurement.capture.name))
+        log_diagnosis(file.stream, found, fields, length_unit)
+        file.write()
+        with whole(path) as scratch:
+            subprocess.run(
+                [rerun_program(), "rrd", "merge", str(path), str(own), "-o", str(scratch)],
+                env=os.environ | {"RERUN_ANALYTICS": "off"},
+                capture_output=True,
+                check=True,
+            )
+    except subprocess.CalledProcessError:
+        raise OSError(f"{path}: the diagnosis could not be put into this recording; run `stitch run` again") from None
+    finally:
+        own.unlink(missing_ok=True)
+
+
+def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFields | None, length_unit: str) -> None:
+    """Verdict with the table of candidate effects, bars of the evidence, displacements of the views."""
+    um = MICROMETRES[length_unit]
+    shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
+    on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
+    lines = [f"# {found.verdict.replace('_', ' ')}", "", found.sentence, ""]
+    lines += [
+        "| | candidate effect | p | posterior | on the part if added (µm) | size |",
+        "|---:|---|---:|---:|---:|---|",
+    ]
+    lines += [
+        f"| {i} | {c.name} | {c.ranked.adjusted:.1g} | {c.ranked.posterior:.2f} | {on_part.get(c.name, '–')} "
+        f"| {amounts_of(c.ranked)} |"
+        for i, c in enumerate(shown)
+    ]
+    lines += ["", *(f"- Next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
+    text = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+    rec.log("diagnosis/verdict", text, static=True)
+    evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
+    rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
+    for i, axis in enumerate("xyz"):
+        moved = found.linear.displaced()[:, i] * um
+        rec.log(f"diagnosis/displaced/{axis}", rr.BarChart(moved, color=COLOURS_OF_FEW[i]), static=True)
+
+
+def rerun_program() -> str:
+    """The program that came with the library."""
+    return shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"

@@ -1,0 +1,176 @@
+"""The timeline `model` of a recording: the part fades, the scans move and the bars fall from step to step of the model.
+
+Step k stands at 10·k; between two steps colours and places run over evenly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from stitch import frames
+from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.model_history import ModelHistory, ModelStep
+from stitch.frames import Array
+from stitch.runs.run import Run
+from stitch.units import MICROMETRES
+from viz.colours import COLOURS_OF_FEW, unsigned_colours
+from viz.part_surface import PartSurface
+from viz.run_figures import shown_points
+
+FRAMES = 10  # of the timeline from one step to the next
+_BETWEEN = 2  # frames between two that are kept
+# What a screen can show; the run folder keeps everything.
+_POINTS, _STILL = 5_000, 15_000
+# Views whose scans are shown displaced: those farthest off under the first model.
+_FEW = 4
+# The largest displacement is shown as this share of the part's size.
+_SHOWN_SHARE = 0.08
+_THICK = rr.Radius.ui_points(3.0)
+_GREY, _BAR = (95, 100, 106), (244, 114, 43)
+
+
+@dataclass(frozen=True)
+class ModelScene:
+    """The steps ready to be drawn; V views. Lengths in length_unit."""
+
+    history: ModelHistory
+    surface: PartSurface
+    names: tuple[str, ...]
+    um: float
+    limit: float  # full colour of the field
+    centre: Array  # (3,) of the part
+    twists: Array  # (S, V, 6) about the centre: from where register puts a view to where the step puts it
+    magnified: Array  # (S,)
+    farthest: tuple[int, ...]  # views that are off most under the first model
+    cell: Array  # (N, 3) some points of the cell, base frame
+
+    def title(self, step: ModelStep) -> str:
+        """Name of a step and how far the views disagree there."""
+        return f"{step.name}: views disagree by {step.field.mean_abs * self.um:.3g} µm on average"
+
+
+def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:
+    """Where every step puts the views, and by how much that has to be magnified to be seen."""
+    centre = surface.vertices.mean(axis=0)
+    to_centre = frames.make(np.eye(3), -centre)
+    at_rest = frames.inverse(to_centre @ history.steps[-1].poses)
+    twists = np.array([frames.log(to_centre @ s.poses @ at_rest) for s in history.steps])
+    # A motion that all views share moves the part, and nothing against anything.
+    twists -= twists.mean(axis=1, keepdims=True)
+    size = float(np.ptp(surface.vertices, axis=0).max())
+    far = np.linalg.norm(twists[..., 3:], axis=2) + 0.3 * size * np.linalg.norm(twists[..., :3], axis=2)
+    first = history.models[0].field
+    models = np.array([size * _SHOWN_SHARE / max(x, 1e-12) for x in far.max(axis=1)])
+    # One factor for all that is fitted, its own for the coarse step, which is so much farther off.
+    factors = np.array([_round(models[0]), *[_round(models[1:-1].min())] * (len(models) - 1)])
+    return ModelScene(
+        history=history,
+        surface=surface,
+        names=tuple(view.name for view in run.session.views),
+        um=MICROMETRES[run.session.length_unit],
+        limit=full_colour(first),
+        centre=centre,
+        twists=twists,
+        magnified=factors,
+        farthest=tuple(int(v) for v in np.argsort(-_means(first.values), kind="stable")[:_FEW]),
+        cell=cell,
+    )
+
+
+def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene) -> None:
+    """Everything that stands still, and all frames of the timeline."""
+    for name in ("now", "before", "after"):
+        _log_part(recording, f"part/{name}", scene)
+    before, after = shown_steps(scene.history)
+    for name, step in (("before", before), ("after", after)):
+        recording.log(f"part/{name}", _colours(scene, step.field.overall), static=True)
+    rest = run.fused.points[np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _STILL)).astype(int)]
+    recording.log("stitched", rr.Points3D(rest.astype(np.float32), colors=[_GREY]), static=True)
+    places = []
+    for v, view in enumerate(run.session.views):
+        at_rest = frames.transform(run.poses[v], shown_points(view))
+        places.append(at_rest.mean(axis=0))
+        if v in scene.farthest:
+            points = at_rest[np.linspace(0, len(at_rest) - 1, min(len(at_rest), _POINTS)).astype(int)] - scene.centre
+            colour = COLOURS_OF_FEW[scene.farthest.index(v)]
+            recording.log(f"scans/{view.name}", rr.Points3D(points.astype(np.float32), colors=[colour]), static=True)
+    means = _means(scene.history.models[0].field.values) * scene.um
+    recording.log("bars/first", rr.BarChart(means, color=_GREY), static=True)
+    for frame in range(0, FRAMES * (len(scene.history.steps) - 1) + 1, _BETWEEN):
+        recording.set_time("model", sequence=frame)
+        _log_frame(recording, scene, frame / FRAMES, np.array(places))
+    recording.reset_time()
+
+
+def shown_steps(history: ModelHistory) -> tuple[ModelStep, ModelStep]:
+    """Before and after: the first model and the last, or the only one and register."""
+    models = history.models
+    return models[0], models[-1] if len(models) > 1 else history.steps[-1]
+
+
+def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, places: Array) -> None:
+    """A moment between two steps: their values in proportion."""
+    steps, k = scene.history.steps, min(int(at), len(scene.history.steps) - 2)
+    share = at - k
+    one, other = steps[k].field, steps[k + 1].field
+    recording.log("part/now", _colours(scene, (1 - share) * one.overall + share * other.overall))
+    moved = (1 - share) * scene.magnified[k] * scene.twists[k] + share * scene.magnified[k + 1] * scene.twists[k + 1]
+    T = frames.exp(moved)
+    for v in scene.farthest:
+        placed = rr.Transform3D(translation=T[v, :3, 3] + scene.centre, mat3x3=T[v, :3, :3])
+        recording.log(f"scans/{scene.names[v]}", placed)
+    from_centre = places - scene.centre
+    ends = np.einsum("vij,vj->vi", T[:, :3, :3], from_centre) + T[:, :3, 3]
+    few = list(scene.farthest)
+    recording.log(
+        "displacements",
+        rr.Arrows3D(
+            origins=places[few],
+            vectors=(ends - from_centre)[few],
+            labels=[scene.names[v] for v in few],
+            colors=list(COLOURS_OF_FEW[: len(few)]),
+            radii=_THICK,
+            show_labels=True,
+        ),
+    )
+    means = _means((1 - share) * one.values + share * other.values) * scene.um
+    recording.log("bars/views", rr.BarChart(means, color=_BAR))
+    if share in (0.0, 1.0):
+        now = k + round(share)
+        factor = f"Displacements are shown {scene.magnified[now]:g} times larger than they are."
+        text = f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; noise alone would leave "
+        text += f"{steps[now].field.noise * scene.um:.2g} µm.\n\n{factor}"
+        recording.log("now", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _log_part(recording: rr.RecordingStream, path: str, scene: ModelScene) -> None:
+    s = scene.surface
+    if len(s.triangles):
+        mesh = rr.Mesh3D.from_fields(
+            vertex_positions=s.vertices.astype(np.float32),
+            vertex_normals=s.normals.astype(np.float32),
+            triangle_indices=s.triangles.astype(np.uint32),
+        )
+        recording.log(path, mesh, static=True)
+    else:
+        recording.log(path, rr.Points3D.from_fields(positions=s.vertices.astype(np.float32)), static=True)
+
+
+def _colours(scene: ModelScene, values: Array) -> rr.Mesh3D | rr.Points3D:
+    colours = unsigned_colours(scene.surface.coloured(values), scene.limit)
+    if len(scene.surface.triangles):
+        return rr.Mesh3D.from_fields(vertex_colors=colours)
+    return rr.Points3D.from_fields(colors=colours)
+
+
+def _means(values: Array) -> Array:
+    """(V,) mean size of the values (V, K) that are known; 0 where none is."""
+    known = np.isfinite(values)
+    return np.where(known, np.abs(np.nan_to_num(values)), 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+
+
+def _round(factor: float) -> float:
+    """The next smaller of 1, 2, 5, 10, …"""
+    power = 10.0 ** np.floor(np.log10(factor))
+    return float(max(x * power for x in (1, 2, 5) if x * power <= factor * (1 + 1e-9)))

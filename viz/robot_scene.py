@@ -1,0 +1,78 @@
+"""The cell in the base frame: the arm at every view, the scanner's field, and the part."""
+
+import numpy as np
+import rerun as rr
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.measurement.robot import link_frames
+from stitch.runs.run import Run
+from viz.colours import view_colours
+from viz.run_figures import shown_points
+
+# Of lines, in pixels.
+_THIN = rr.Radius.ui_points(1.0)
+_GREY, _PART = (110, 110, 110), (190, 195, 200)
+_SEEN = 0.98  # share of the points that lie within the drawn field of the scanner
+_POINTS = 20_000
+
+
+def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
+    """Chain of joints where the arm is known, else the flanges; a frustum for every place of the scanner.
+
+    Returns:
+        (N, 3) some points of the cell, base frame.
+    """
+    flange = np.array([view.T_base_flange for view in run.session.views])
+    colours, names = view_colours(len(flange)), [view.name for view in run.session.views]
+    recording.log("robot", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    arm = _log_arm(recording, run, flange)
+    corners = _frustum(run)
+    in_hand = run.session.mount == "eye_in_hand"
+    T_base_scanner = flange @ run.T_mount if in_hand else run.T_mount[None]
+    seen = [arm]
+    for name, T, colour in zip(names, T_base_scanner, colours, strict=False):
+        lines = [frames.transform(T, strip) for strip in corners]
+        seen.append(np.concatenate(lines))
+        shown, label = (colour, name) if in_hand else (_GREY, "scanner")
+        recording.log(f"robot/scanner/{label}", rr.LineStrips3D(lines, colors=[shown], radii=_THIN), static=True)
+    points = run.fused.points[
+        np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _POINTS)).astype(int)
+    ]
+    if not in_hand:
+        points = frames.transform(flange[0], points)
+    recording.log("robot/part", rr.Points3D(points.astype(np.float32), colors=[_PART]), static=True)
+    return np.concatenate(seen)
+
+
+def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
+    robot, joints = run.session.robot, run.session.joints
+    if robot is None or joints is None:
+        shown = flange[:, :3, 3]
+        recording.log("robot/path", rr.LineStrips3D([flange[:, :3, 3]], colors=[_GREY], radii=_THIN), static=True)
+    else:
+        chains = link_frames(robot, joints)[..., :3, 3]
+        shown = chains.reshape(-1, 3)
+        recording.log("robot/arm", rr.LineStrips3D(chains, colors=[_GREY], radii=_THIN), static=True)
+        recording.log(
+            "robot/joints", rr.Points3D(chains[0], colors=[_GREY], radii=rr.Radius.ui_points(2.5)), static=True
+        )
+    recording.log(
+        "robot/flanges",
+        rr.Points3D(flange[:, :3, 3], colors=view_colours(len(flange)), radii=rr.Radius.ui_points(2.5)),
+        static=True,
+    )
+    return np.asarray(shown)
+
+
+def _frustum(run: Run) -> list[Array]:
+    """Line strips in the scanner frame: what the scanner sees, to the farthest points."""
+    points = np.concatenate([shown_points(view) for view in run.session.views])
+    # A tracker sees all around: it has no frustum.
+    points = points[points[:, 2] > 0]
+    if not len(points):
+        return [np.zeros((2, 3))]
+    a, b = (np.quantile(np.abs(points[:, i] / points[:, 2]), _SEEN) for i in range(2))
+    depth = float(np.quantile(points[:, 2], _SEEN))
+    corners = depth * np.array([[a, b, 1], [-a, b, 1], [-a, -b, 1], [a, -b, 1]])
+    return [corners[[0, 1, 2, 3, 0]], *(np.array([np.zeros(3), corner]) for corner in corners)]
