@@ -10,11 +10,10 @@ from stitch.frames import Array
 from stitch.intake.layouts import Layout
 from stitch.intake.raw_poses import RawPoses
 from stitch.intake.readings import Reading, angle_units
+from stitch.intake.urdf_links import arm_of
 from stitch.measurement.robot import forward
-from stitch.reading.urdf import robot_from_urdf
 
 JOINT_ANGLES = "joint angles"
-_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def joint_readings(layout: Layout, urdf: Path | None, angle_unit: str | None) -> list[Reading]:
@@ -30,11 +29,7 @@ def joint_readings(layout: Layout, urdf: Path | None, angle_unit: str | None) ->
             "joint angles need the robot: put its URDF into the folder, or give poses; with DH rows write session.toml "
             "by hand"
         )
-    robot = robot_from_urdf(urdf, None, None, "mm", _GRAVITY)
-    if robot.n_joints != joints.shape[1]:
-        raise InputError(
-            f"{urdf}: has {robot.n_joints} joints, the table {joints.shape[1]}; to fix: name the columns with --columns"
-        )
+    robot, _, _ = arm_of(urdf, joints.shape[1])
     out = []
     for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
         T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)

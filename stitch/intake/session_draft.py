@@ -16,6 +16,7 @@ from stitch.intake.first_session import FirstSession
 from stitch.intake.guesses import Guess
 from stitch.intake.joint_poses import JOINT_ANGLES
 from stitch.intake.plausible_units import POSE_UNITS
+from stitch.intake.urdf_links import arm_of
 from stitch.reading.session_toml import FORMAT
 from stitch.system.whole_file import whole
 from stitch.units import METRES
@@ -69,8 +70,8 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     urdf = first.found.urdf
     if reading.layout.joints is not None and urdf is not None:
         path = Path(os.path.relpath(urdf, folder)).as_posix()
-        lines += ["", "[robot]", "# base_link and flange_link where the chain does not end at the flange"]
-        lines += [f'urdf = "{path}"']
+        _, base, flange = arm_of(urdf, reading.layout.joints.shape[1])
+        lines += ["", "[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
     return "\n".join(lines) + "\n"
 
 
