@@ -20,7 +20,7 @@ import numpy as np
 from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
@@ -31,8 +31,10 @@ from stitch.statistics.kernels import alike_in_joints, alike_in_time, spread_ove
 # wanders, is usually smaller (rad, mm).
 _ARM, _SMOOTH, _ROTATION, _TRANSLATION = 0.1, 0.03, 2e-5, 0.02
 _PER_MM = {"mm": 1.0, "m": 1e-3}
-# Poses that differ by less, per joint in rad, are the same stop.
+# Poses of the flange that differ by less, in rad and as a share of its distance from the base, are the same stop.
 _SAME = 1e-4
+# Dense matrices of more views take minutes; there the scatter alone must do.
+_MOST_VIEWS = 150
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
 _EVERY_ARM = ("joints", "torque")
 _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
@@ -58,12 +60,14 @@ def white(views: int) -> PoseErrors:
 
 
 def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
-    """The prior for the sessions of a rig: one arm, one scanner, one mount.
+    """The prior for the sessions of a rig: one arm, one scanner, one mount; none for very many views.
 
     Args:
         model: hand-eye and effects in use; the arm errs beside these.
         centres: per session the point (3,) about which twists count, reference frame.
     """
+    if sum(m.views.count for m in measurements) > _MOST_VIEWS:
+        return white(sum(m.views.count for m in measurements))
     found: dict[str, tuple[Array, float]] = {}
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
@@ -74,15 +78,13 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         constant = [EFFECTS[name] for name in _CONSTANT]
         own = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
         found["smooth"] = (spread_over(own, alike_in_joints(joints)), _SMOOTH)
-        same = np.abs(joints[:, None] - joints[None]).max(axis=2) < _SAME
-    else:
-        same = np.zeros((0, 0), bool)
     flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
     halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
     unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}
     near = _near_in_time(measurements)
     for name, half in halves.items():
         found[f"wandering {name}"] = (spread_over(half, near), unit[name])
+    same = _same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
         for name, half in halves.items():
             found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
@@ -123,6 +125,14 @@ def _columns(measurement: Measurement, model: Model, centre: Array, effects: Seq
         moved = twists(measurement, model, term, centre)
         out.append(moved.reshape(len(moved), -1).T * term.typical)
     return np.hstack(out)
+
+
+def _same_stop(T_base_flange: Array) -> Mask:
+    """(V, V) views taken from one and the same pose, whatever else they saw."""
+    turned = np.abs(T_base_flange[:, None, :3, :3] - T_base_flange[None, :, :3, :3]).max(axis=(2, 3))
+    away = np.linalg.norm(T_base_flange[:, None, :3, 3] - T_base_flange[None, :, :3, 3], axis=2)
+    reach = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).mean())
+    return np.asarray((turned < _SAME) & (away < _SAME * max(reach, 1e-300)))
 
 
 def _near_in_time(measurements: Sequence[Measurement]) -> Array:

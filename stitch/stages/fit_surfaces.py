@@ -11,7 +11,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import split, stacked
-from stitch.observations.pose_errors import pose_errors
+from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import pair_squares
 from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
@@ -40,6 +40,8 @@ class _Step:
     hand_eye: HandEye
     fitted: Mask
     freed: list[FreePoses]
+    linearised: "_Linearised"
+    choice: _Choice
 
 
 @dataclass(frozen=True)
@@ -71,11 +73,14 @@ class _Linearised:
         return _Choice(fitted, np.where(self._held, 0.0, omitted), repeating)
 
     def solve(self, choice: _Choice) -> _Step:
+        return self.step(choice)
+
+    def step(self, choice: _Choice, errors: PoseErrors | None = None) -> _Step:
+        """The step, with a covariance that counts how poses may err; without, one of scatter alone."""
         fitted, before = choice.fitted, self.values
         # A parameter at zero that is not zero errs alike in every view, as the scanner does.
         repeating = [np.hstack([r, c * choice.omitted]) for r, c in zip(choice.repeating, self.columns, strict=True)]
         columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
-        errors = pose_errors(self.measurements, self.model, [f.overlaps.gram.centre for f in self.freed])
         found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating, errors)
         values = before.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
@@ -89,7 +94,14 @@ class _Linearised:
             hand_eye=found,
             fitted=fitted,
             freed=self.freed,
+            linearised=self,
+            choice=choice,
         )
+
+    def with_errors(self, choice: _Choice) -> _Step:
+        """The step again, with all that the arm may do wrong in its covariance."""
+        centres = [f.overlaps.gram.centre for f in self.freed]
+        return self.step(choice, pose_errors(self.measurements, self.model, centres))
 
     @property
     def _held(self) -> Mask:
@@ -126,6 +138,7 @@ def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Seque
         NoResultError: no two views overlap.
     """
     last, history = iterate(_Surfaces(measurements, gates), model)
+    last = last.linearised.with_errors(last.choice)
     sigmas = np.full(len(last.fitted), np.nan)
     sigmas[last.fitted] = np.sqrt(np.diag(last.hand_eye.values_covariance))
     values = np.array([p.value for p in stacked(last.model.terms)], float)

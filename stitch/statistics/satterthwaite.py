@@ -11,7 +11,8 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.statistics.least_squares import column_space
-from stitch.statistics.variance_components import FACTOR_SPREAD, MixedModel, VarianceFit
+from stitch.statistics.variance_components import MixedModel, VarianceFit
+from stitch.statistics.variance_prior import FACTOR_SPREAD
 
 # More is as good as knowing it.
 _MANY = 1e4

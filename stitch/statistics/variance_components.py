@@ -14,18 +14,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from stitch.frames import Array
+from stitch.statistics.variance_prior import NOISE, log_prior, usual_variances
 
-# The component that is sensor noise; all others are scatter and errors of the arm. A gamma(2, 0) prior on their σ
-# keeps the maximum off the boundary at zero, where every sigma after it would be too small, by about one standard
-# error (Chung et al. 2013, Psychometrika 78:685).
-_NOISE = 2
-# Further components may well be absent: λ/s² of a scale s is a priori beta-prime(_SPIKE/2, 1/2), which piles up at zero
-# and has the tails of a half-Cauchy (Armagan, Clyde & Dunson 2011, NIPS 24; with 1 in place of _SPIKE it is the
-# half-Cauchy of Gelman 2006, Bayesian Analysis 1:515). The density counts per log σ.
-_SPIKE = 0.1
-# The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
-# A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
-_USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 _ABSENT = 1e-300  # in place of a variance of zero, which has no logarithm
 _FACTORS = (float(np.log(0.3)), float(np.log(1e8)))  # and of the factor on the noise
@@ -87,11 +77,11 @@ def fit_variances(
         A component that no number has is at variance zero.
     """
     problem = _problem(mixed, G, prior)
-    guess = _guess(mixed) if start is None else start
+    guess = usual_variances(mixed.z, mixed.components) if start is None else start
     first = np.log(np.maximum(guess, _ABSENT))
-    scattered = np.arange(len(first)) != _NOISE
+    scattered = np.arange(len(first)) != NOISE
     begin = [first, first - 9.0 * scattered] if both_starts else [first]
-    centre = np.log(_guess(mixed))
+    centre = np.log(usual_variances(mixed.z, mixed.components))
     flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else _FLAT
     bounds = [(c - _SPAN[0], c + _SPAN[1]) if s else _FACTORS for c, s in zip(centre, scattered, strict=True)]
     present = np.einsum("cbii->c", mixed.components) > 0
@@ -149,16 +139,6 @@ def _problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> _Proble
     return _Problem(mixed, X, precision, float(2 * np.log(prior).sum()))
 
 
-def _guess(mixed: MixedModel) -> Array:
-    traces = np.einsum("cbii->c", mixed.components)
-    spread = float((mixed.z**2).sum()) or 1e-24
-    # What there is beside scatter and noise begins small: it is there only where the numbers ask for it.
-    shares = np.where(np.arange(len(traces)) < _NOISE, 0.25, 0.05)
-    guess = np.asarray(shares * spread / np.maximum(traces, 1e-300))
-    guess[_NOISE] = 1.0
-    return guess
-
-
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     variances = np.exp(log_variances)
@@ -187,20 +167,8 @@ def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
     logdet = 2 * float(np.log(np.einsum("bii->bi", L)).sum())
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
-    believed, pull = _log_prior(log_variances, mixed.scales)
+    believed, pull = log_prior(log_variances, mixed.scales)
     return logdet + square + believed, slope + pull
-
-
-def _log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]:
-    """−2 log prior of the log variances (c,), and its slope."""
-    off = (log_variances[_NOISE] - _USUAL_FACTOR) / FACTOR_SPREAD
-    value, slope = -float(log_variances[:_NOISE].sum()) + off**2, -np.ones(len(log_variances))
-    slope[_NOISE] = 2 * off / FACTOR_SPREAD
-    if scales is not None:
-        over, more = np.exp(log_variances[_NOISE + 1 :]) / scales**2, log_variances[_NOISE + 1 :]
-        value += float(((1 + _SPIKE) * np.log1p(over) - _SPIKE * more).sum())
-        slope[_NOISE + 1 :] = (1 + _SPIKE) * over / (1 + over) - _SPIKE
-    return value, slope
 
 
 def _summed(X: Array, Y: Array) -> Array:

@@ -37,7 +37,7 @@ def _drawn(mixed: MixedModel, centre: Array) -> Array:
     rng = np.random.default_rng(0)
     here, (deviance, slope) = centre, deviance_slope(centre, mixed)
     out = []
-    wanted = int(np.clip(_DRAWS * (_AMONG / mixed.size) ** 2, _BURNT, _DRAWS))
+    wanted = int(np.clip(_DRAWS * (_AMONG / mixed.size) ** 3, _BURNT, _DRAWS))
     for _ in range(_BURNT + wanted):
         momentum = rng.standard_normal(len(centre))
         leap, energy = rng.uniform(*_LEAP), 0.5 * deviance + 0.5 * momentum @ momentum

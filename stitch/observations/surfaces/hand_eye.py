@@ -18,9 +18,13 @@ from stitch.observations.pose_errors import PoseErrors, white
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.pose_channel import Repeatability, estimate
-from stitch.observations.surfaces.rig_model import rig_model
+from stitch.observations.surfaces.rig_model import RigModel, rig_model
+from stitch.statistics.least_squares import Generalised
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
+
+# White scatter of more numbers is known well enough to take its maximum.
+_PLUG_IN = 300
 
 
 @dataclass(frozen=True)
@@ -79,19 +83,7 @@ def fit_hand_eye(
     pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
     weighed = rig.weighed(scatter, prior)
     x = weighed.solve(rig.z, pull)
-    errors = errors or white(sum(len(f.poses) for f in freed))
-    mixed = rig.mixed(errors)
-    sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
-    sources = dict(
-        zip(
-            ("white rotation", "white translation", "sensor noise", *errors.names),
-            (size * weighed.gain @ C[0] @ weighed.gain.T for size, C in zip(sizes, mixed.components, strict=True)),
-            strict=True,
-        )
-    )
-    if repeating is not None:
-        repeated = weighed.gain @ rig.reduce(repeating)
-        sources["scanner field"] = repeated @ repeated.T
+    sources = _sources(rig, weighed, errors or white(sum(len(f.poses) for f in freed)), repeating)
     # The rest is what the prior leaves where nothing is seen.
     sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
     covariance = np.sum(list(sources.values()), axis=0)
@@ -105,6 +97,22 @@ def fit_hand_eye(
         values=columns.values + x[6:],
         values_covariance=covariance[6:, 6:],
     )
+
+
+def _sources(
+    rig: RigModel, weighed: Generalised, errors: PoseErrors, repeating: Sequence[Array] | None
+) -> dict[str, Array]:
+    """What each source does to the covariance (6 + P, 6 + P)."""
+    mixed = rig.mixed(errors)
+    sizes = fit_variances(mixed, both_starts=True)
+    mean = sizes.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, sizes)
+    names = ("white rotation", "white translation", "sensor noise", *errors.names)
+    found = zip(names, mean, mixed.components[:, 0], strict=True)
+    sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in found}
+    if repeating is not None:
+        repeated = weighed.gain @ rig.reduce(repeating)
+        sources["scanner field"] = repeated @ repeated.T
+    return sources
 
 
 def _inflation(covariance: Array, alone: Array) -> float:

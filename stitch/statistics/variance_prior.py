@@ -1,0 +1,45 @@
+"""What is believed of variance components before anything was seen: scatter, noise, and what may well be absent."""
+
+import numpy as np
+
+from stitch.frames import Array
+
+# The component that is sensor noise; all others are scatter and errors of the arm. A gamma(2, 0) prior on their σ
+# keeps the maximum off the boundary at zero, where every sigma after it would be too small, by about one standard
+# error (Chung et al. 2013, Psychometrika 78:685).
+NOISE = 2
+# Further components may well be absent: λ/s² of a scale s is a priori beta-prime(_SPIKE/2, 1/2), which piles up at zero
+# and has the tails of a half-Cauchy (Armagan, Clyde & Dunson 2011, NIPS 24; with 1 in place of _SPIKE it is the
+# half-Cauchy of Gelman 2006, Bayesian Analysis 1:515). The density counts per log σ.
+_SPIKE = 0.1
+# The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
+# A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
+_USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
+
+
+def log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]:
+    """−2 log prior of the log variances (c,), and its slope."""
+    off = (log_variances[NOISE] - _USUAL_FACTOR) / FACTOR_SPREAD
+    value, slope = -float(log_variances[:NOISE].sum()) + off**2, -np.ones(len(log_variances))
+    slope[NOISE] = 2 * off / FACTOR_SPREAD
+    if scales is not None:
+        over, more = np.exp(log_variances[NOISE + 1 :]) / scales**2, log_variances[NOISE + 1 :]
+        value += float(((1 + _SPIKE) * np.log1p(over) - _SPIKE * more).sum())
+        slope[NOISE + 1 :] = (1 + _SPIKE) * over / (1 + over) - _SPIKE
+    return value, slope
+
+
+def usual_variances(z: Array, components: Array) -> Array:
+    """(c,) where a search begins: what was seen, mostly scatter and noise.
+
+    Args:
+        z: (B, m) numbers that were seen.
+        components: (c, B, m, m) of their covariance.
+    """
+    traces = np.einsum("cbii->c", components)
+    spread = float((z**2).sum()) or 1e-24
+    # What there is beside scatter and noise begins small: it is there only where the numbers ask for it.
+    shares = np.where(np.arange(len(traces)) < NOISE, 0.25, 0.05)
+    guess = np.asarray(shares * spread / np.maximum(traces, 1e-300))
+    guess[NOISE] = 1.0
+    return guess
