@@ -19,7 +19,7 @@ from stitch.cli.main import main as stitch
 from stitch.cli.printing import print_page, printing_browser
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
-COLOURS = 128  # enough for shades and letters
+COLOURS = 256  # enough for shades, letters and the colour bar
 _DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 _PAGES = {
     "report-light": (1100, 1500),

@@ -105,7 +105,7 @@ def _cell(points: Array) -> rrb.Vertical:
     across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
     eye = rrb.EyeControls3D(
-        position=middle + size * (1.1 * level + [0.0, 0.0, 0.35]), look_target=middle, eye_up=[0, 0, 1]
+        position=middle + size * (0.8 * level + [0.0, 0.0, 0.25]), look_target=middle, eye_up=[0, 0, 1]
     )
     view = rrb.Spatial3DView(
         origin="robot",
@@ -125,5 +125,5 @@ def _diagnosis() -> rrb.Horizontal:
     """Verdict with candidate effects | their evidence, and where the overlaps put the views."""
     verdict = rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict and candidate effects, best first")
     evidence = rrb.BarChartView(origin="diagnosis/evidence", name="Log Bayes factor of each candidate effect")
-    moved = rrb.BarChartView(origin="diagnosis/displaced", name="Displacement of every view in x, y, z (µm)")
+    moved = rrb.BarChartView(origin="diagnosis/displaced", name="Every view off where the model puts it (µm)")
     return rrb.Horizontal(verdict, rrb.Vertical(evidence, moved), column_shares=[3, 2], name="What is missing")

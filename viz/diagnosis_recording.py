@@ -69,9 +69,8 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     rec.log("diagnosis/verdict", text, static=True)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
-    for i, axis in enumerate("xyz"):
-        moved = found.linear.displaced()[:, i] * um
-        rec.log(f"diagnosis/displaced/{axis}", rr.BarChart(moved, color=COLOURS_OF_FEW[i]), static=True)
+    moved = np.linalg.norm(found.linear.displaced(), axis=1) * um
+    rec.log("diagnosis/displaced", rr.BarChart(moved, color=COLOURS_OF_FEW[0]), static=True)
 
 
 def rerun_program() -> str:

@@ -49,7 +49,7 @@ def _finding(found: Diagnosis, fields: CandidateFields | None, length_unit: str)
     named = " or ".join(found.effects)
     match found.verdict:
         case "adequate":
-            return "No physical effect is missing in the model."
+            return "No effect is found missing: noise and the arm's scatter explain what is left."
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":
