@@ -1,12 +1,12 @@
 """Does the hand-eye's sigma hold on arms that are a little wrong everywhere? χ² of the hand-eye against the truth.
 
-Usage: python bench/ordinary_arms.py [--draws N] [--held-out] [--scenes A,B] [--alone] [--scans N]
+Usage: python bench/ordinary_arms.py [--draws N] [--held-out] [--scenes A,B] [--alone]
 
 Cells are simulated and run once each; what their views show under other errors of the poses is then drawn in the
 pose channel: true poses of data_synth's own kinematics, noise of the normal equations. Each cell counts with its mean
 over draws. χ²/6 is 1 on the average where sigmas are right; medians are put over the median of χ²(6)/6, 0.891.
---alone fits as if poses scattered independently; --scans runs N whole sessions a kind and mount instead. Seeds are of
-two kinds: those of development, and held-out ones, to be run once for each version of the statistics.
+--alone fits as if poses scattered independently. Seeds are of two kinds: those of development, and held-out ones, to be
+run once for each version of the statistics.
 """
 
 import argparse

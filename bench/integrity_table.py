@@ -1,0 +1,66 @@
+"""The rows of bench/integrity.py as tables: python bench/integrity_table.py good.jsonl sizes.jsonl …"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+# Too small a mistake for these cells to tell: nothing may be said of it.
+_BELOW = ("shift 0.2 mm",)
+
+
+def cases(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: str(r["case"])) -> dict[str, list[Row]]:
+    """The rows of each case; a row that was written twice counts once."""
+    once = {(r["part"], r["mount"], r["seed"], r["case"]): r for r in rows}
+    out: dict[str, list[Row]] = {}
+    for row in once.values():
+        out.setdefault(key(row), []).append(row)
+    return out
+
+
+def good(rows: Sequence[Row]) -> None:
+    """Sessions without a mistake."""
+    print("| sessions without a mistake | sessions | lost a view | a view suspected |\n|---|---|---|---|")
+    found = cases(rows, lambda r: str(r["case"]).removeprefix("good ") or "nothing hidden")
+    every = [r for rows_of_case in found.values() for r in rows_of_case]
+    for case, own in [*sorted(found.items()), ("all", every)]:
+        lost, suspected = (sum(bool(r[what]) for r in own) for what in ("left_out", "suspected"))
+        print(f"| {case.strip() or 'nothing hidden'} | {len(own)} | {lost} | {suspected} |")
+
+
+def sizes(rows: Sequence[Row]) -> None:
+    """One view displaced by a multiple of what can be detected or identified."""
+    print("| one view off by | cells | a view stands out | the right one, and no other |\n|---|---|---|---|")
+    for case, own in cases([r for r in rows if "named" in r]).items():
+        print(f"| {case} | {len(own)} | {sum(r['detected'] for r in own)} | {sum(r['named'] for r in own)} |")
+
+
+def kinds(rows: Sequence[Row]) -> None:
+    """Every kind of mistake."""
+    print("| mistake | cells | silent | culprit among those named | kind of mistake named |\n|---|---|---|---|---|")
+    found = {case: own for case, own in cases(rows).items() if case != "nothing"}
+    every = [r for case, rows_of_case in found.items() if case not in _BELOW for r in rows_of_case]
+    for case, own in [*found.items(), ("all but those too small to be told", every)]:
+        counts = (sum(bool(r[what]) for r in own) for what in ("silent", "culprit", "named"))
+        print(f"| {case} | {len(own)} | {' | '.join(map(str, counts))} |")
+
+
+def real(rows: Sequence[Row]) -> None:
+    """Measured scans with mistakes."""
+    print("| mistake in measured scans | objects | refused | ran without those views | ran | named |")
+    print("|---|---|---|---|---|---|")
+    for case, own in cases(rows).items():
+        refused = sum(r["ended"].startswith("refused") for r in own)
+        clean = sum(r["ended"].endswith("left out none") for r in own)
+        counts = (len(own), refused, len(own) - refused - clean, clean, sum(r["named"] for r in own))
+        print(f"| {case} | {' | '.join(map(str, counts))} |")
+
+
+if __name__ == "__main__":
+    for file in map(Path, sys.argv[1:]):
+        {"good": good, "sizes": sizes, "kinds": kinds, "real": real}[file.stem](
+            [json.loads(line) for line in file.read_text().splitlines()]
+        )
+        print()
