@@ -1,6 +1,7 @@
 """run, diagnose, add, compare and drop on a session on disk."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -15,19 +16,21 @@ from stitch.stored.load_state import load_state
 
 
 @pytest.fixture(scope="module")
-def session_on_disk(tmp_path_factory):
+def session_on_disk(tmp_path_factory, stitch_command):
+    """A folder with a session `s`, what was hidden in it, and a run `r0` of it."""
     folder = tmp_path_factory.mktemp("cli")
     scene = load_scene("blade")
-    scene = replace(scene, scanner=replace(scene.scanner, columns=100, rows=100))
-    measured = simulated(scene, {"joint_compliance": 3.0}, 0, 14)
+    scene = replace(scene, scanner=replace(scene.scanner, columns=75, rows=75))
+    measured = simulated(scene, {"joint_compliance": 3.0}, 0, 13)
     write_session(folder / "s", measured, "s")
     write_truth(folder / "s.truth.json", measured, 0)
+    stitch_command("run", folder / "s", "-o", folder / "r0", "--no-recording")
     return folder
 
 
 def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     folder = session_on_disk
-    stitch_command("run", folder / "s", "-o", folder / "r", "--no-recording")
+    shutil.copytree(folder / "r0", folder / "r")
     told = json.loads(stitch_command("diagnose", folder / "r", "--json"))
     assert told["format"] == "stitch-diagnosis/1"
     assert told["effects"] == ["joint_compliance"]
@@ -67,10 +70,8 @@ def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
         (["effects", "elbow"], ["no effect 'elbow'"]),
     ],
 )
-def test_bad_use_ends_in_one_line(session_on_disk, stitch_command, capsys, arguments, words):
+def test_bad_use_ends_in_one_line(session_on_disk, capsys, arguments, words):
     folder = session_on_disk
-    if not (folder / "r0").exists():
-        stitch_command("run", folder / "s", "-o", folder / "r0", "--no-recording")
     capsys.readouterr()
     with pytest.raises(SystemExit) as stop:
         main([a.replace("RUN", str(folder / "r0")).replace("SESSION", str(folder / "s")) for a in arguments])
@@ -80,10 +81,8 @@ def test_bad_use_ends_in_one_line(session_on_disk, stitch_command, capsys, argum
     assert all(word in line for word in words)
 
 
-def test_state_of_a_vanished_session_is_refused(tmp_path, session_on_disk, stitch_command):
+def test_state_of_a_vanished_session_is_refused(tmp_path, session_on_disk):
     folder = session_on_disk
-    if not (folder / "r0").exists():
-        stitch_command("run", folder / "s", "-o", folder / "r0", "--no-recording")
     document = json.loads((folder / "r0" / "result.json").read_text())
     document["session"] = str(tmp_path / "gone")
     (tmp_path / "r").mkdir()

@@ -31,7 +31,7 @@ def nothing_hidden():
 VISIBLE = [
     pytest.param("joint_offset", "eye_in_hand", 4.0, marks=pytest.mark.slow),
     ("joint_compliance", "eye_to_hand", 3.0),
-    ("lens_distortion", "eye_to_hand", 3.0),
+    pytest.param("lens_distortion", "eye_to_hand", 3.0, marks=pytest.mark.slow),
 ]
 
 
