@@ -75,7 +75,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         for name, effects in _families(_arm_effects(measurements)).items():
             own = np.concatenate([_columns(m, model, centre, effects) for m, centre in sessions])
             found[name] = (own @ own.T, _ARM)
-        constant = [EFFECTS[name] for name in _CONSTANT]
+        constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
         own = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
         found["smooth"] = (spread_over(own, alike_in_joints(joints)), _SMOOTH)
     flange = np.concatenate([_carried(m, centre) for m, centre in sessions])

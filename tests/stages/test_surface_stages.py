@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade, disturbed
+from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.measurement import measurement_of
+from stitch.model.model import Model
+from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.stages.coarse import coarse
@@ -27,21 +31,29 @@ def at_part(capture: Capture, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_hand_eye_error_is_what_the_covariance_predicts(mount):
-    """From 5° and 30 mm, 4 draws of scatter and noise a mount: rms error at the part below 1.2 of the prediction, sigmas honest."""
-    errors, predicted, z = [], [], []
+    """From 5° and 30 mm, 4 draws of scatter and noise a mount: the error at the part is no larger than predicted.
+
+    It may be smaller: these arms are perfect but for their scatter, and the views do not say so. Of what the scatter alone
+    predicts it may not be half.
+    """
+    errors, predicted, alone, z = [], [], [], []
     for seed in range(4):
         measured, capture = captured_blade(seed, mount=mount, pixels=90, plan_seed=5)
-        start = disturbed(measured.T_mount, seed)
-        found = correct([capture], start, 0.35 * part_size([capture])).hand_eye
+        start, own = disturbed(measured.T_mount, seed), measurement_of(session_of(measured), capture)
+
+        def erring(freed, T_mount, own=own):
+            return pose_errors([own], Model(T_mount), [f.overlaps.gram.centre for f in freed])
+
+        gate = 0.35 * part_size([capture])
+        found = correct([capture], start, gate, erring=erring).hand_eye
         xi = frames.log(frames.inverse(measured.T_mount) @ found.T_mount)
         _, J = at_part(capture, found.T_mount)
         errors.append(np.sum((J @ xi) ** 2))
         predicted.append(np.trace(J @ found.covariance @ J.T))
+        alone.append(np.trace(J @ correct([capture], start, gate).hand_eye.covariance @ J.T))
         z.append(xi / np.sqrt(np.diag(found.covariance)))
-    ratio = np.sqrt(np.mean(errors) / np.mean(predicted))
-    assert ratio < 1.2
-    # 4 seeds x about 6 independent numbers: a ratio under 0.6 would mean sigmas twice too large.
-    assert ratio > 0.6
+    assert np.sqrt(np.mean(errors) / np.mean(predicted)) < 1.2
+    assert np.sqrt(np.mean(errors) / np.mean(alone)) > 0.5
     assert np.sqrt(np.mean(np.square(z))) < 1.3
 
 
