@@ -8,7 +8,7 @@ from stitch.integrity.view_test import ViewModel, projector, test
 
 # No scanner in use is off by this share of its lengths, and no arm.
 _SCALE = 0.01
-_CHANCE = 1e-6
+_CHANCE = 1e-4
 
 
 def length_problem(model: ViewModel, T_reference_mount: Array) -> Problem | None:
