@@ -45,7 +45,9 @@ def init(
     out = folder if output is None else output
     require_free(out)
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
-    stated = Stated(poses, names, rotation, angles, unit, cloud_unit, mount, inverse)
+    stated = Stated(
+        poses, names, rotation, angle_unit=angles, length_unit=unit, cloud_unit=cloud_unit, mount=mount, inverse=inverse
+    )
     first = first_session(folder, stated)
     _tell(first)
     if not yes:
