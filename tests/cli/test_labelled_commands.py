@@ -11,7 +11,7 @@ from data_synth.fixtures.labelled_arm import (
 from data_synth.fixtures.labelled_files import write_labelled
 
 
-@pytest.mark.parametrize("kind", ["points", "frames"])
+@pytest.mark.parametrize("kind", ["points", pytest.param("frames", marks=pytest.mark.slow)])
 def test_every_command_works(kind, tmp_path, stitch_command, monkeypatch, few_effects):
     monkeypatch.chdir(tmp_path)
     session, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")

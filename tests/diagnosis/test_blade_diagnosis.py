@@ -75,6 +75,7 @@ def test_what_the_library_does_not_know_gets_no_name(name, follows):
     assert follows in [d.covariate for d in found.depends_on[:3]]
 
 
+@pytest.mark.slow
 def test_offset_of_the_first_joint_is_never_named_where_the_hand_eye_hides_it():
     """eye_to_hand: joint 1 turns everything about one axis of the base; that is a hand-eye."""
     measured = measured_blade(3, views=16, pixels=90)

@@ -40,6 +40,7 @@ def test_sigmas_hold_whatever_the_scanner_repeats():
     assert np.mean(large[1]) > 1.5 * np.mean(small[1])
 
 
+@pytest.mark.slow
 def test_what_incidence_shows_is_not_laid_on_the_field():
     """A carried scanner on a coarse surface: grazing points pretend a bias, while its field has no error at all."""
     scene = load_scene("blade-table")
