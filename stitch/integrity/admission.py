@@ -10,7 +10,14 @@ from scipy.stats import chi2
 from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.deep_check import beyond_any_arm, contradicts, deep_check, judged_by_size
+from stitch.integrity.deep_check import (
+    beyond_any_arm,
+    contradicted_by,
+    contradicts,
+    deep_check,
+    judged_by_size,
+    stands_off,
+)
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.robot_lengths import length_problem
@@ -104,8 +111,7 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
 
 def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
     name, scan = session.views[found.view].name, own.scans[found.view]
-    why = f"stands off by {found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
-    return LeftOut(name, why, own.poses(T_mount)[found.view], len(scan.points))
+    return LeftOut(name, stands_off(session, found), own.poses(T_mount)[found.view], len(scan.points))
 
 
 def _beyond_any_slip(session: Session, found: Snooping) -> bool:
@@ -144,7 +150,7 @@ def _apart(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
 
 
 def _unexplained(session: Session, found: Snooping) -> NoResultError:
-    off = f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+    off = contradicted_by(session, found)
     return NoResultError(
         f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
         "it; to fix: check that rows and clouds belong together and how the poses were converted"

@@ -105,14 +105,23 @@ def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
     return Problem(best.kind, tuple(only(best.rows, names)), fix)
 
 
+def stands_off(session: Session, found: Misplaced) -> str:
+    """How far a suspected view stands off, in words."""
+    return f"stands off by {found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
+
+
+def contradicted_by(session: Session, found: Snooping) -> str:
+    """By how much the poses contradict the scans, in words."""
+    return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+
+
 def _suspected(session: Session, found: Misplaced) -> Problem:
-    amount = f"{found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
-    fix = f"stands off by {amount}, as effects of an arm may do too: run and diagnose, and look at this scan"
+    fix = f"{stands_off(session, found)}, as effects of an arm may do too: run and diagnose, and look at this scan"
     return Problem("displaced", (session.views[found.view].name,), fix, certain=False)
 
 
 def _unexplained(session: Session, found: Snooping) -> Problem:
-    off = f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+    off = contradicted_by(session, found)
     fix = (
         f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and "
         "clouds belong together and how the poses were converted"
