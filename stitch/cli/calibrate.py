@@ -32,6 +32,7 @@ from stitch.writing.json_file import to_json, write_json
 calibrate = typer.Typer(
     help="Find hand-eyes from known objects and from trackers, and an arm's own errors.",
     no_args_is_help=True,
+    add_completion=False,
     rich_markup_mode=None,
 )
 _SESSION = Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")]

@@ -1,49 +1,20 @@
-"""`stitch`: parsing and printing only; every command is also a library function.
-
-Other packages, and the cells, add commands through the entry-point group `stitch.commands`.
-"""
+"""`stitch`: the command line, and how errors end it."""
 
 import errno
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
-from importlib.metadata import entry_points
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import typer
 
-from stitch.cli.batch import batch
-from stitch.cli.calibrate import calibrate
-from stitch.cli.change import add, drop
-from stitch.cli.check import check
-from stitch.cli.compare import compare_run
-from stitch.cli.diagnose import diagnose_run, next_measurement
-from stitch.cli.effects import effects
-from stitch.cli.import_file import import_command
-from stitch.cli.init import init
-from stitch.cli.report import report
-from stitch.cli.run import run
-from stitch.cli.streams import results_alone, speak_any_terminal
+from stitch.cli.commands import CommandGroup
+from stitch.cli.streams import speak_any_terminal
 from stitch.errors import StitchError
 from stitch.reading.text_file import shortened
 from stitch.system import time_limit
 
-_COMMANDS: dict[str, Callable[..., Any]] = {
-    "init": init,
-    "run": run,
-    "check": check,
-    "compare": compare_run,
-    "diagnose": diagnose_run,
-    "add": add,
-    "drop": drop,
-    "next": next_measurement,
-    "effects": effects,
-    "report": report,
-    "batch": batch,
-    "import": import_command,
-}
 _LONGEST = 2000
 _ROOM = "; to fix: make room there, then run it again; what stood there is as it was"
 _RIGHTS = "; to fix: name a folder that may be written, or change its rights"
@@ -62,17 +33,14 @@ _FIXES = {
 def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app = typer.Typer(
+        cls=CommandGroup,
         help="Stitch robot scans: find and correct the hand-eye, register, fuse, and say what is left.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
-    for name, command in _COMMANDS.items():
-        app.command(name)(results_alone(command))
-    app.add_typer(calibrate, name="calibrate")
-    for entry in sorted(entry_points(group="stitch.commands"), key=lambda e: e.name):
-        app.command(entry.name)(entry.load())
+    app.callback()(lambda: None)
     return app
 
 

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, IMPLAUSIBLE
 from stitch.measurement.session import Session
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.tails import chi2_limit
 from stitch.units import METRES
 
 
@@ -49,7 +49,7 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
         chance = 1.0
         if stated:
             known = 2 / max(float(linear.satterthwaite.spread[i, i]), 1e-9)
-            chance = float(np.sqrt(chi2.isf(ALPHA_UNKNOWN, known) / known))
+            chance = float(np.sqrt(chi2_limit(ALPHA_UNKNOWN, known) / known))
         if np.sqrt(linear.null.variances[i]) > chance * allowed:
             return True
     return False

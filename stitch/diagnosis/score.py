@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import f as f_distribution
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances, fit_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
@@ -108,7 +108,7 @@ def _try(linear: LinearModel, form: Form) -> _Tried:
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
     rank, square = _wald(theta, covariance, form.sizes)
     rest = max(mixed.size - a - rank, 1)
-    p = float(f_distribution.sf(square / max(rank, 1), max(rank, 1), rest))
+    p = f_tail(square / max(rank, 1), max(rank, 1), rest)
     return _Tried(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance)
 
 

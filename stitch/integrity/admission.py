@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.stats import chi2
 
 from stitch import frames
 from stitch.errors import InputError, NoResultError
@@ -32,6 +31,7 @@ from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
+from stitch.statistics.tails import chi2_limit
 
 # A hand-eye that differs by chance alone is refused once in a million.
 _CHANCE = 1e-6
@@ -134,7 +134,7 @@ def _require_own_model(session: Session, correction: Correction, index: int) -> 
     fitted = fit_hand_eye([own], [freed], fitted.T_mount)
     turn, shift = _apart(own, T_mount, fitted.T_mount)
     xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
-    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2.isf(_CHANCE, 6)
+    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2_limit(_CHANCE, 6)
     if clear and beyond_any_arm(session, turn, shift):
         raise NoResultError(
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "

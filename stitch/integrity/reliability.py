@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
 from scipy.optimize import brentq
 
 from stitch.frames import Array
 from stitch.integrity.blunders import FAMILY_WISE, Found
 from stitch.integrity.view_test import ViewModel
+from stitch.statistics.tails import chi2_limit, noncentral_chi2_tail, normal_limit
 
 POWER = 0.8
 # Share of cases in which the right view is to be named.
@@ -55,8 +55,8 @@ def noncentrality(degrees: int, tests: int, power: float = POWER) -> float:
 
 @lru_cache(maxsize=64)
 def _noncentrality(degrees: int, tests: int, power: float) -> float:
-    limit = stats.chi2.isf(FAMILY_WISE / tests, degrees)
-    return float(brentq(lambda x: stats.ncx2.sf(limit, degrees, x) - power, 1e-3, 1e3))
+    limit = chi2_limit(FAMILY_WISE / tests, degrees)
+    return float(brentq(lambda x: noncentral_chi2_tail(limit, degrees, x) - power, 1e-3, 1e3))
 
 
 def normal_blocks(model: ViewModel, found: Found) -> Array:
@@ -90,7 +90,7 @@ def blunder_sizes(normal: Array, view: int, directions: Array) -> tuple[Array, A
     # The statistics of the right view and of the most similar one differ by own − shared, with a standard deviation
     # of 2√(own − shared) for a blunder much larger than the scatter.
     lead = np.maximum(own - shared, 0.0)
-    needed = 2 * stats.norm.isf((1 - NAMED) / max(views - 1, 1))
+    needed = 2 * normal_limit((1 - NAMED) / max(views - 1, 1))
     told = seen & (lead > 1e-9 * safe)
     identifiable = np.where(told, needed / np.sqrt(np.where(told, lead, 1.0)), np.inf)
     return detectable, np.maximum(detectable, identifiable)

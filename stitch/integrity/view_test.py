@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
 from stitch.statistics.least_squares import column_space
+from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
@@ -135,7 +135,7 @@ def test(under: Projector, columns: Array) -> Test:
         return Test(0.0, degrees, 1.0, np.zeros(len(N)), N)
     # The scatter is estimated with the view in it: T/ν is a beta variable, told as the F of the left-out estimate.
     rest = max(under.degrees - statistic, 1e-9 * under.degrees)
-    p = float(stats.f.sf(statistic / degrees / (rest / nu), degrees, nu))
+    p = f_tail(statistic / degrees / (rest / nu), degrees, nu)
     return Test(statistic, degrees, p, inverse @ u, N)
 
 

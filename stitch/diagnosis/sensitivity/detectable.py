@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import f as f_distribution
-from scipy.stats import ncf
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.tails import f_limit, noncentral_f_tail
 
 
 def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degrees_of_freedom: float) -> float:
@@ -35,12 +34,14 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degr
     rank = int((information > 1e-2).sum())
     if rank == 0:
         return float("inf")
-    by_p = rank * float(f_distribution.isf(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1)))
+    by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1))
     factor = LOG_BAYES_FACTOR - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
     needed = max(by_p, degrees_of_freedom * float(np.expm1(2 * factor / degrees_of_freedom)))
-    return float(
-        brentq(lambda size: ncf.sf(needed / rank, rank, degrees_of_freedom, size) - POWER, 1e-9, 9 * needed + 99)
-    )
+
+    def missed(shift: float) -> float:
+        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - POWER
+
+    return float(brentq(missed, 1e-9, 9 * needed + 99))
 
 
 @dataclass(frozen=True)

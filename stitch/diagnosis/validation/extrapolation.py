@@ -8,12 +8,12 @@ one worse by more than chance, however much it helps elsewhere.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
 
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.validation.cross_validation import believed_size, share_of
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.folds import JointEnd
+from stitch.statistics.tails import normal_limit, normal_tail
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Extrapolation:
 
         Of many ends one is worse by a standard error sooner than a single one is (Bonferroni).
         """
-        chance = float(norm.isf(norm.sf(1.0) / self.count))
+        chance = normal_limit(normal_tail(1.0) / self.count)
         return self.share <= 1 - self.sigma and self.worst_share <= 1 + chance * self.worst_sigma
 
     def objection(self, name: str) -> str:

@@ -1,0 +1,76 @@
+"""The commands of `stitch`: its own, and those that other packages add through the entry-point group `stitch.commands`.
+
+A command is imported when it is asked for, so that one does not wait for the libraries of all.
+"""
+
+from collections.abc import Iterator, MutableMapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from stitch.cli.streams import results_alone
+
+GROUP = "stitch.commands"
+_OWN = {
+    "init": "stitch.cli.init:init",
+    "run": "stitch.cli.run:run",
+    "check": "stitch.cli.check:check",
+    "compare": "stitch.cli.compare:compare_run",
+    "diagnose": "stitch.cli.diagnose:diagnose_run",
+    "add": "stitch.cli.change:add",
+    "drop": "stitch.cli.change:drop",
+    "next": "stitch.cli.diagnose:next_measurement",
+    "effects": "stitch.cli.effects:effects",
+    "report": "stitch.cli.report:report",
+    "batch": "stitch.cli.batch:batch",
+    "import": "stitch.cli.import_file:import_command",
+    "calibrate": "stitch.cli.calibrate:calibrate",
+}
+
+
+class Commands(MutableMapping[str, Any]):
+    """Name to command, loaded at first use."""
+
+    def __init__(self) -> None:
+        own = [EntryPoint(name, place, GROUP) for name, place in _OWN.items()]
+        added = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+        self._entries = {entry.name: entry for entry in (*own, *added)}
+        self._load = cache(_loaded)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._load(self._entries[name])
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        raise TypeError("commands are added through the entry-point group stitch.commands")
+
+    def __delitem__(self, name: str) -> None:
+        del self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+
+def _loaded(entry: EntryPoint) -> Any:
+    """The command behind an entry; a `typer.Typer` is a group of commands."""
+    found = entry.load()
+    if not isinstance(found, typer.Typer):
+        alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        alone.command(entry.name)(results_alone(found) if entry.value in _OWN.values() else found)
+        found = alone
+    command = typer.main.get_command(found)
+    command.name = entry.name
+    return command
+
+
+class CommandGroup(TyperGroup):
+    """`stitch` with its commands."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.commands = Commands()
