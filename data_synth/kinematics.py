@@ -64,9 +64,8 @@ def inverse(arm: Arm, T_base_flange: Array, near: Array) -> Array | None:
     towards = arm.home.copy()
     towards[0] = np.arctan2(T_base_flange[1, 3], T_base_flange[0, 3])
     for start in (near, arm.home, towards):
-        found = least_squares(
-            _off, np.clip(start, lower, upper), args=(arm, T_base_flange), bounds=(lower, upper), max_nfev=40
-        )
+        start = np.clip(start, lower, upper)
+        found = least_squares(_off, start, _slope, args=(arm, T_base_flange), bounds=(lower, upper), max_nfev=40)
         q = found.x
         # With a joint to spare the search above creeps along its valley; short Newton steps end it.
         for _ in range(_NEWTON_STEPS):
@@ -85,13 +84,15 @@ def velocity(arm: Arm, q: Array, v: Array) -> Array:
 
 
 def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
-    """(6, n) change of `_off` a radian of every joint; central differences."""
+    """(6, n) change of `_off` a radian of every joint; central differences, all joints at once."""
     step = 1e-6
     steps = np.eye(arm.joints) * step
-    return np.column_stack([(_off(q + e, arm, wanted) - _off(q - e, arm, wanted)) / (2 * step) for e in steps])
+    off = _off(q + np.concatenate([steps, -steps]), arm, wanted)
+    return np.asarray((off[: arm.joints] - off[arm.joints :]).T / (2 * step))
 
 
 def _off(q: Array, arm: Arm, wanted: Array) -> Array:
+    """(..., 6) rotation, as the lever makes it a length, and position, mm, from the wanted flange to that at q (..., n)."""
     T = flange(arm, q)
-    turn = Rotation.from_matrix(wanted[:3, :3].T @ T[:3, :3]).as_rotvec()
-    return np.concatenate([turn * _LEVER, T[:3, 3] - wanted[:3, 3]])
+    turn = Rotation.from_matrix(wanted[:3, :3].T @ T[..., :3, :3]).as_rotvec()
+    return np.concatenate([turn * _LEVER, T[..., :3, 3] - wanted[:3, 3]], axis=-1)

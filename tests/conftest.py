@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
 from data_synth.write import write_session
@@ -70,6 +71,19 @@ def stitch_command():
         return out.getvalue()
 
     return call
+
+
+@pytest.fixture
+def no_drawing(monkeypatch):
+    """Pictures are written empty: most of the time of a page, for tests that look at its words alone."""
+    monkeypatch.setattr(Figure, "savefig", _empty)
+
+
+def _empty(_, file, **options):
+    if isinstance(file, Path):
+        file.touch()
+    else:
+        file.write("" if options["format"] == "svg" else b"")
 
 
 @pytest.fixture(scope="session")

@@ -3,9 +3,12 @@
 import math
 import re
 
+import pytest
+
 from bench.readme_output import commands, printed, shown
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_the_example_of_the_readme_prints_what_it_shows(tmp_path):
     page = shown()
     anew = printed(commands(page), tmp_path)

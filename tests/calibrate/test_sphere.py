@@ -103,8 +103,7 @@ def test_decoupled_is_exact_where_orientations_are_equal_and_absent_where_none_a
 
 
 @pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
-def test_command_on_both_mounts(mount, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+def test_command_on_both_mounts(mount, tmp_path, capsys):
     cell = sphere_cell(5, "line", turns=0.6)
     folder = write_spheres(cell, tmp_path / "s", mount)
     with pytest.raises(SystemExit) as ended:
@@ -117,8 +116,7 @@ def test_command_on_both_mounts(mount, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_metres_give_what_millimetres_give(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+def test_metres_give_what_millimetres_give(tmp_path, capsys):
     cell = sphere_cell(6, "line", turns=0.6)
     found = [
         calibrate_sphere(load_session(write_spheres(cell, tmp_path / unit, unit=unit))).fit for unit in ("mm", "m")

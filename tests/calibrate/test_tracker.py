@@ -66,8 +66,7 @@ def test_error_is_that_of_the_covariance(mount, tmp_path):
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_command(as_json, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+def test_command(as_json, tmp_path, capsys):
     truth = session(tmp_path / "s", "eye_to_hand")
     with pytest.raises(SystemExit) as ended:
         cli.main(["calibrate", "tracker", str(tmp_path / "s"), *(["--json"] if as_json else [])])

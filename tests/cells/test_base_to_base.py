@@ -104,6 +104,7 @@ def test_many_points_without_a_level_of_the_second_base():
             project(s)
 
 
+@pytest.mark.slow
 def test_covariance_is_the_scatter_of_repeated_measurements():
     """200 draws: a variance is known to ±√(2/200) = 10 %; five of those on the mean of all six is far below 30 %."""
     scaled = []
@@ -167,11 +168,13 @@ def errors():
     return {name: np.array(values) for name, values in found.items()}
 
 
+@pytest.mark.slow
 def test_least_squares_beats_the_projection(errors):
     rms = {name: np.sqrt(np.mean(values**2, axis=0)) for name, values in errors.items()}
     assert (rms["least squares"] < rms["projection"]).all()
 
 
+@pytest.mark.slow
 def test_published_errors_are_ordinary_draws(errors):
     """Published at λ = 0.5: 0.00017 rad and 0.00022 m, one draw; it lies within the middle 95 % of ours."""
     for column, published in ((0, 1.7e-4), (1, 2.2e-4)):

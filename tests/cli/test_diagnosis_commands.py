@@ -28,6 +28,7 @@ def session_on_disk(tmp_path_factory, stitch_command):
     return folder
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     folder = session_on_disk
     shutil.copytree(folder / "r0", folder / "r")

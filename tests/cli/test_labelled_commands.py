@@ -11,6 +11,7 @@ from data_synth.fixtures.labelled_arm import (
 from data_synth.fixtures.labelled_files import write_labelled
 
 
+@pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("kind", ["points", pytest.param("frames", marks=pytest.mark.slow)])
 def test_every_command_works(kind, tmp_path, stitch_command, monkeypatch, few_effects):
     monkeypatch.chdir(tmp_path)

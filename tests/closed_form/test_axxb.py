@@ -31,6 +31,7 @@ def test_exact_without_noise(name):
         assert np.abs(error[3:]).max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "flag"),
     [("Tsai-Lenz", "TSAI"), ("Park-Martin", "PARK"), ("Horaud-Dornaika", "HORAUD"), ("Andreff", "ANDREFF"),

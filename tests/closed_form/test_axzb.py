@@ -40,6 +40,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_two_hundred_cells_no_worse_than_opencv():
     cv2 = pytest.importorskip("cv2")
     ours, theirs, closed = [], {"SHAH": [], "LI": []}, {"SHAH": [], "LI": []}

@@ -90,14 +90,14 @@ def test_offset_of_the_first_joint_is_never_named_where_the_hand_eye_hides_it():
 
 def test_turning_the_last_joint_alone_names_nothing():
     measured = measured_blade(
-        4, views=16, pixels=90, tilt=0.0, roll=0.0, aim=0.0, distance=0.0, hidden={"joint_offset": 3.0}
+        4, views=10, pixels=90, tilt=0.0, roll=0.0, aim=0.0, distance=0.0, hidden={"joint_offset": 3.0}
     )
     found = diagnose(run(session_of(measured)))
     assert found.verdict in ("adequate", "cannot_tell")
 
 
-def test_prediction_of_the_null_is_the_present_residual():
-    _, result = blade_run(6, {})
+def test_prediction_of_the_null_is_the_present_residual(nothing_hidden):
+    result, _ = nothing_hidden
     linear = linear_model_of(state_of(result))
     g, present = linear.observation.freed.overlaps.gram, linear.present
     assert np.sqrt(present.squares(present.solve()).sum() / g.weight.sum()) == pytest.approx(

@@ -18,6 +18,7 @@ def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
     assert np.sqrt(least) == pytest.approx(norm.isf(ALPHA_NAME / 2 / tests) + norm.ppf(0.8), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_the_smallest_size_shows_in_eight_of_ten():
     """Drawn with few views: the likelihoods and the F test themselves, not the approximation."""
     rng, draws, tests, n, p = np.random.default_rng(3), 250, 20, 36, 3
