@@ -26,7 +26,8 @@ from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
 from stitch.errors import StitchError
-from stitch.integrity.deep_check import deep_check, judged_by_size
+from stitch.integrity.arm_limits import judged_by_size
+from stitch.integrity.deep_check import deep_check
 from stitch.integrity.reliability import blunder_sizes, normal_blocks
 from stitch.integrity.snooping import Snooping, snoop
 from stitch.integrity.usual_effects import usual_twists

@@ -92,7 +92,7 @@ def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
 
 
 def _off(q: Array, arm: Arm, wanted: Array) -> Array:
-    """(..., 6) rotation, as the lever makes it a length, and position, mm, from the wanted flange to that at q (..., n)."""
+    """(..., 6) rotation (mm, at the lever) and position from the wanted flange to that at q (..., n)."""
     T = flange(arm, q)
     turn = Rotation.from_matrix(wanted[:3, :3].T @ T[..., :3, :3]).as_rotvec()
     return np.concatenate([turn * _LEVER, T[..., :3, 3] - wanted[:3, 3]], axis=-1)

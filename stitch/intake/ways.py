@@ -11,6 +11,7 @@ from stitch.intake.cloud_pairs import Pairing
 from stitch.intake.plausible_units import POSE_UNITS
 from stitch.intake.readings import Reading
 from stitch.integrity.hypotheses import Hypothesis
+from stitch.measurement.session import Mount
 
 # The doctor counts in millimetres.
 MM = 1e-3
@@ -38,7 +39,7 @@ class Way:
 
     def hypothesis(self, number: int) -> Hypothesis:
         """The same for the judges of integrity, which know it again by its number."""
-        mount = "eye_in_hand" if self.carries else "eye_to_hand"
+        mount: Mount = "eye_in_hand" if self.carries else "eye_to_hand"
         complete = len(self.pairing.used) == len(self.pairing.rows)
         return Hypothesis(str(number), self.T, mount, "", used=None if complete else self.pairing.used)
 

@@ -9,14 +9,14 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.deep_check import (
+from stitch.integrity.arm_limits import (
     beyond_any_arm,
     contradicted_by,
     contradicts,
-    deep_check,
     judged_by_size,
     stands_off,
 )
+from stitch.integrity.deep_check import deep_check
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.robot_lengths import length_problem
@@ -78,7 +78,7 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     if contradicts(session, found):
         refuse(session, deep_check(session))
         raise _unexplained(session, found)
-    size = length_problem(found.model, own.T_reference_mount)
+    size = length_problem(found.model, own.T_reference_mount, found.found.further)
     if size is not None:
         refuse(session, [size])
     if found.block is not None and not _beyond_any_slip(session, found):

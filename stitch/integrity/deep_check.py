@@ -1,9 +1,14 @@
 """`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
+from stitch.errors import NoResultError
 from stitch.frames import Array
+from stitch.integrity.arm_limits import contradicted_by, contradicts, judged_by_size, stands_off
 from stitch.integrity.conventions import explained, verdict
+from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.linkage import only
 from stitch.integrity.motion_fit import Explained
 from stitch.integrity.pairing import explain
@@ -11,6 +16,7 @@ from stitch.integrity.problems import Problem
 from stitch.integrity.relative_scans import relative_scans
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
+from stitch.integrity.surface_verdict import surface_verdict
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture, part_size
@@ -21,14 +27,9 @@ from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.thinning import thinned
 from stitch.stages.coarse import coarse
 from stitch.stages.correct import close_in
-from stitch.units import METRES
 
 # Enough points a view to judge millimetres.
 _POINTS = 8000
-# No arm scatters by more.
-_ROTATION, _TRANSLATION_M = 0.010, 0.005
-# No effect of an arm is believed to displace a single view by more than half of that.
-_VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 # A hand-eye from the scans' own motions is right within this share of the part's size, a stated one within the other.
 _GATE, _STATED_GATE = 0.15, 0.35
 _CLOSES = 0.5
@@ -47,72 +48,86 @@ def deep_check(session: Session) -> list[Problem]:
     named = verdict(found)
     if named and named[0].hypothesis.kind != "exchanged":
         return [_convention(session, named)]
-    T_mount, snooped = examined(session, capture, found)
-    size = length_problem(snooped.model, capture.T_reference_mount)
+    try:
+        problems, contradicted = _of_views(session, capture, found)
+    except NoResultError:
+        undone = _undone(session, capture, found)
+        if undone is None:
+            raise
+        return [undone]
+    if not contradicted and not (problems and _rivalled(found)):
+        return problems
+    undone = _convention(session, named) if named and contradicted else _undone(session, capture, found)
+    return problems if undone is None else [undone]
+
+
+def _of_views(session: Session, capture: Capture, found: Sequence[Explained]) -> tuple[list[Problem], bool]:
+    """What is wrong with single views under the poses as stated, and whether these contradict the scans altogether."""
+    T_mount, snooped = examined(session, capture, _start(session, capture, found))
+    size = length_problem(snooped.model, capture.T_reference_mount, snooped.found.further)
     if size is not None:
-        return [size]
+        return [size], False
     problems = explain(session, capture, T_mount, snooped)
-    if contradicts(session, snooped) and not any(p.kind == "disconnected" for p in problems):
-        if named:
-            return [_convention(session, named)]
+    contradicted = contradicts(session, snooped) and not any(p.kind == "disconnected" for p in problems)
+    if contradicted:
         problems.append(_unexplained(session, snooped))
-    return problems + [_suspected(session, m) for m in snooped.suspected]
+    return problems + [_suspected(session, m) for m in snooped.suspected], contradicted
 
 
-def examined(session: Session, capture: Capture, found: list[Explained]) -> tuple[Array, Snooping]:
-    """The hand-eye that these poses allow, and what snooping says under it."""
+def _rivalled(found: Sequence[Explained]) -> bool:
+    """True if the scanner's motions agree with poses that were read otherwise, and with those as stated hardly."""
+    stated = max((e.closed for e in found if e.hypothesis.kind == "stated"), default=1.0)
+    return bool(found) and stated < _CLOSES * found[0].closed
+
+
+def _start(session: Session, capture: Capture, found: Sequence[Explained]) -> tuple[Array, float]:
+    """A hand-eye that these poses allow, and the distance between partners to begin with."""
     stated = next((e for e in found if e.hypothesis.kind == "stated" and e.scale == 1.0), None)
     size = part_size([capture])
     if stated is not None and stated.closed >= _CLOSES:
-        start, gate = stated.T_mount, _GATE * size
-    elif session.scanner.T_mount is not None:
-        start, gate = session.scanner.T_mount, _STATED_GATE * size
-    else:
-        begun = coarse([capture])
-        start, gate = begun.T_mount, begun.gate
-    T_mount, overlaps, _ = close_in([capture], start, [gate])
+        return stated.T_mount, _GATE * size
+    if session.scanner.T_mount is not None:
+        return session.scanner.T_mount, _STATED_GATE * size
+    begun = coarse([capture])
+    return begun.T_mount, begun.gate
+
+
+def examined(session: Session, capture: Capture, start: tuple[Array, float]) -> tuple[Array, Snooping]:
+    """The hand-eye closed in on from a start (hand-eye, gate), and what snooping says under it."""
+    T_mount, overlaps, _ = close_in([capture], start[0], [start[1]])
     freed = free_poses(capture, capture.poses(T_mount), overlaps[0].gate)
     usual = partial(usual_twists, measurement_of(session, capture), Model(T_mount))
     return T_mount, judged_by_size(session, snoop(capture, T_mount, overlaps[0].gate, freed, usual))
 
 
-def judged_by_size(session: Session, found: Snooping) -> Snooping:
-    """Suspected views that are off by more than what effects of an arm are believed to do are misplaced."""
-
-    def too_far(m: Misplaced) -> bool:
-        return m.rotation > _VIEW_ROTATION or m.distance * METRES[session.length_unit] > _VIEW_M
-
-    return found.settled(too_far)
-
-
-def contradicts(session: Session, found: Snooping) -> bool:
-    """True if the poses contradict the scans beyond what any arm does."""
-    lost = len(found.left_out) > len(session.views) / 2
-    return lost or beyond_any_arm(session, found.rotation, found.translation)
-
-
-def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
-    """True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
-    return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]
+def _undone(session: Session, capture: Capture, found: Sequence[Explained]) -> Problem | None:
+    """The mistake without which the surfaces fall together and nothing contradicts any more; None if there is none."""
+    fallen = surface_verdict(capture, found)
+    if not fallen or fallen[0].hypothesis.used is not None:
+        return None
+    best = fallen[0].hypothesis
+    views = zip(session.views, best.T_base_flange, strict=True)
+    right = replace(session, mount=best.mount, views=tuple(replace(v, T_base_flange=T, joints=None) for v, T in views))
+    try:
+        _, snooped = examined(right, thinned(right, _POINTS)[1], (fallen[0].T_mount, _GATE * part_size([capture])))
+    except NoResultError:
+        return None
+    if contradicts(right, snooped):
+        return None
+    return _named(session, best, [f.hypothesis.fix for f in fallen])
 
 
 def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:
     """One problem from hypotheses that explain the motions equally well."""
-    best = named[0].hypothesis
-    fixes = list(dict.fromkeys(e.hypothesis.fix for e in named))
+    return _named(session, named[0].hypothesis, [e.hypothesis.fix for e in named])
+
+
+def _named(session: Session, best: Hypothesis, fixes: Sequence[str]) -> Problem:
+    """The problem of a hypothesis, with what is as likely."""
+    fixes = list(dict.fromkeys(fixes))
     fix = fixes[0] + (f"; as likely: {'; '.join(fixes[1:3])}" if len(fixes) > 1 else "")
     names = [view.name for view in session.views]
     return Problem(best.kind, tuple(only(best.rows, names)), fix)
-
-
-def stands_off(session: Session, found: Misplaced) -> str:
-    """How far a suspected view stands off, in words."""
-    return f"stands off by {found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
-
-
-def contradicted_by(session: Session, found: Snooping) -> str:
-    """By how much the poses contradict the scans, in words."""
-    return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
 
 
 def _suspected(session: Session, found: Misplaced) -> Problem:

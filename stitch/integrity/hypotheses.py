@@ -14,7 +14,7 @@ from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.integrity.misread_rotations import degrees_for_radians, other_angles, other_quaternions
 from stitch.measurement.robot import forward
-from stitch.measurement.session import Session
+from stitch.measurement.session import Mount, Session
 
 # Factors by which lengths are too large when units are mixed up, and how that comes about.
 UNITS = {
@@ -25,7 +25,7 @@ UNITS = {
     10.0: "mm where cm are stated",
     0.1: "cm where mm are stated",
 }
-_OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
+_OTHER: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
 _HANDED = "the scans are left-handed: two of their columns are exchanged, or one has the wrong sign"
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -37,7 +37,7 @@ class Hypothesis:
 
     kind: str  # as in `stitch check --deep`; "stated" for the poses as they are
     T_base_flange: Array  # (V, 4, 4)
-    mount: str
+    mount: Mount
     fix: str
     rows: tuple[int, ...] = ()  # whose poses change places; empty: all
     used: tuple[int, ...] | None = None  # scans that still have a pose; None: all
@@ -93,14 +93,14 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
     )
 
 
-def _mount_or_inverse(mount: str) -> str:
+def _mount_or_inverse(mount: Mount) -> str:
     return (
         f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER[mount]}" in session.toml '
         "(these scans cannot tell the two apart, the size of the hand-eye can)"
     )
 
 
-def _rows(T: Array, mount: str) -> Iterator[Hypothesis]:
+def _rows(T: Array, mount: Mount) -> Iterator[Hypothesis]:
     """Poses that belong to other rows."""
     V = len(T)
     index = np.arange(V)
@@ -115,7 +115,7 @@ def _rows(T: Array, mount: str) -> Iterator[Hypothesis]:
         yield Hypothesis("exchanged", T[order], mount, "exchange the clouds of these rows", (a, b))
 
 
-def _shifted(T: Array, mount: str, by: int, kept: Indices) -> Hypothesis:
+def _shifted(T: Array, mount: Mount, by: int, kept: Indices) -> Hypothesis:
     where = "below" if by > 0 else "above"
     fix = f"every cloud belongs to the pose {abs(by)} row{'s' * (abs(by) > 1)} {where} it: shift the column back"
     return Hypothesis("shifted", np.roll(T, -by, axis=0), mount, fix, (), tuple(int(v) for v in kept))

@@ -3,24 +3,23 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.common_step import common_step
 from stitch.integrity.linkage import only
+from stitch.integrity.one_joint import one_joint
 from stitch.integrity.placing import shows_no_surface, surface_of
 from stitch.integrity.problems import Problem
 from stitch.integrity.scan_faults import ScanFault, copies, same_poses, scale_fault, scan_fault
 from stitch.integrity.snooping import Misplaced, Snooping
+from stitch.integrity.unlinked_views import CLOSE_SHARE
 from stitch.measurement.capture import Capture, part_size
-from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
 
 # A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
-# (share of the part's size).
-_CLOSER, _CLOSE_SHARE = 0.2, 0.03
-# One joint explains a displacement if it leaves less than this share of it.
-_ONE_JOINT = 0.1
+# (`CLOSE_SHARE` of the part's size).
+_CLOSER = 0.2
 _COPY = "this scan is a copy of that of {}: put the right file in its row"
 
 
@@ -45,12 +44,16 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
     for cycle in cycles:
         told |= set(cycle)
         out.append(Problem("exchanged", tuple(only(cycle, names)), _exchange(cycle, rows, names)))
+    step = common_step(capture, poses, [m for m in misplaced if m.view not in told]) if found.block is None else None
+    if step is not None:
+        told |= set(step[0])
+        out.append(_reclamped(step[0].start or step[0].stop, step[1], names))
     same = same_poses(capture)
     for m in misplaced:
         if m.view not in told:
             out.append(_single(session, capture, T_mount, found, m, same))
     if found.block is not None:
-        out.append(_reclamped(found, names))
+        out.append(_reclamped(found.block.start, found.block.what, names))
     if len(found.disconnected) > 1:
         shown = " | ".join(", ".join(only(group, names)) for group in found.disconnected)
         views = tuple(n for group in found.disconnected[1:] for n in only(group, names))
@@ -70,7 +73,7 @@ def _row_of(capture: Capture, poses: Array, m: Misplaced) -> int | None:
     there = frames.transform(m.T, points)
     off = np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1))
     best = int(np.argmin(off))
-    close = off[best] < max(_CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER * off[m.view]
+    close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER * off[m.view]
     return best if close and best != m.view else None
 
 
@@ -115,7 +118,7 @@ def _single(
         what = "joint angles" if joint else "pose"
         fix = f"{own[0]} has the {what} of {names[partner]}, and is off by {amount}: put in its own"
         return Problem(kind, (*own, names[partner]), fix)
-    digit = _one_joint(session, capture, T_mount, m)
+    digit = one_joint(session, capture, T_mount, m)
     if digit is not None:
         joint_name, stated, fits, neighbour = digit
         kind = "joint_row" if neighbour else "displaced"
@@ -135,42 +138,7 @@ def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> S
     return look(scan, T_pose, surface, part_size([capture]), found.needed)
 
 
-def _one_joint(
-    session: Session, capture: Capture, T_mount: Array, m: Misplaced
-) -> tuple[str, float, float, bool] | None:
-    """The joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
-    robot, joints = session.robot, session.views[m.view].joints
-    if robot is None or joints is None or m.T is None:
-        return None
-    points = capture.scans[m.view].points[::50]
-    there = frames.transform(m.T, points)
-
-    def off(q: Array) -> float:
-        T = forward(robot, q)
-        T = frames.inverse(T) if session.mount == "eye_to_hand" else T
-        return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
-
-    start = off(joints)
-    best: tuple[float, int, float] = (np.inf, 0, 0.0)
-    for j in range(len(joints)):
-        unit = np.eye(len(joints))[j]
-        grid = np.linspace(-np.pi, np.pi, 181)
-        near = grid[int(np.argmin([off(joints + a * unit) for a in grid]))]
-        for a in (near, 0.0):
-            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(a - 0.02, a + 0.02))
-            best = min(best, (float(fit.fun), j, float(fit.x)))
-    left, j, turn = best
-    if left > _ONE_JOINT * start:
-        return None
-    fits = joints[j] + turn
-    others = [session.views[r].joints for r in (m.view - 1, m.view + 1) if 0 <= r < len(session.views)]
-    neighbour = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)
-    return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(fits)), neighbour
-
-
-def _reclamped(found: Snooping, names: Sequence[str]) -> Problem:
-    assert found.block is not None
-    start = found.block.start
+def _reclamped(start: int, moved: str, names: Sequence[str]) -> Problem:
     views = tuple(names[start:]) if start >= len(names) / 2 else tuple(names[:start])
-    what = "the part was clamped anew" if found.block.what == "part" else "the scanner moved on its mount"
+    what = "the part was clamped anew" if moved == "part" else "the scanner moved on its mount"
     return Problem("reclamped", views, f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it")

@@ -11,14 +11,16 @@ _SCALE = 0.01
 _CHANCE = 1e-4
 
 
-def length_problem(model: ViewModel, T_reference_mount: Array) -> Problem | None:
+def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | None = None) -> Problem | None:
     """The robot's lengths, tested as one factor on all its translations; None if they agree with the scans'.
 
     Args:
+        further: (n, K) columns of what was found beside: a factor must not explain what single views do.
         T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
     """
     column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
-    found = test(projector(model, model.fit(column)), column)
+    beside = column if further is None else np.column_stack([further, column])
+    found = test(projector(model, model.fit(beside), further), column)
     share = float(found.estimate[0])
     if abs(share) < _SCALE or found.p_value > _CHANCE:
         return None

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import (
@@ -16,11 +17,16 @@ from stitch.integrity.placing import (
     surface_of,
 )
 from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.free_poses import FreePoses
 
 # A placement is right if at least this share of what linked views have on the others' surface lies on it. Right ones
 # have 0.9 to 1 of it, scans of other parts up to 0.35, scaled by 2.5 % up to 0.7.
 _ACCEPTED = 0.8
+# A placement at some row's very pose is believed sooner: by chance none lies there. Other parts still do not reach it.
+_AT_A_ROW = 0.75
+CLOSE_SHARE = 0.03  # of the part's size
+_NEAR = 0.2
 # Views that cannot be seen to belong: the smallest share of a linked view that counts for that comparison.
 _FEW_SHARED = 0.1
 
@@ -51,8 +57,11 @@ def placed_views(
             if shows_no_surface(scan):
                 continue
             starts = [starts_about(model_poses[v], scan, size), model_poses, starts_anywhere(surface, scan)]
-            best = place(scan, surface, np.concatenate(starts), size)[0]
-            if best.closure > needed and best.near > _FEW_SHARED:
+            found = place(scan, surface, np.concatenate(starts), size)
+            # A part clamped anew lies near: a wide gate would lead past it.
+            found += place(scan, surface, model_poses[v][None], _NEAR * size)
+            best = _likeliest(scan, [p for p in found if p.near > _FEW_SHARED], model_poses, (needed, size))
+            if best is not None:
                 new[v] = best
         if not new:
             break
@@ -62,6 +71,19 @@ def placed_views(
         core += list(new)
         waiting = [v for v in waiting if v not in new]
     return placed, waiting
+
+
+def _likeliest(
+    scan: Scan, found: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
+) -> Placement | None:
+    """Of the placements that close the one nearest to any row's pose: a part may look alike from several sides."""
+    needed, size = limits
+    points = scan.points[::50]
+    rows = frames.transform(model_poses, points)
+    away = [np.sqrt(((rows - frames.transform(p.T, points)) ** 2).sum(axis=2).mean(axis=1)).min() for p in found]
+    limit = [needed * (_AT_A_ROW if a < CLOSE_SHARE * size else 1.0) for a in away]
+    closed = [i for i, p in enumerate(found) if p.closure > limit[i]]
+    return found[min(closed, key=lambda i: away[i])] if closed else None
 
 
 def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:

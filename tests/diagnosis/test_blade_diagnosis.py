@@ -96,8 +96,8 @@ def test_turning_the_last_joint_alone_names_nothing():
     assert found.verdict in ("adequate", "cannot_tell")
 
 
-def test_prediction_of_the_null_is_the_present_residual(nothing_hidden):
-    result, _ = nothing_hidden
+def test_prediction_of_the_null_is_the_present_residual():
+    _, result = blade_run(6, {})
     linear = linear_model_of(state_of(result))
     g, present = linear.observation.freed.overlaps.gram, linear.present
     assert np.sqrt(present.squares(present.solve()).sum() / g.weight.sum()) == pytest.approx(

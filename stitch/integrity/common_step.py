@@ -1,0 +1,49 @@
+"""Misplaced views that stand off by one and the same displacement: the part was clamped anew, or the scanner moved."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.integrity.snooping import Misplaced
+from stitch.measurement.capture import Capture
+
+# So many views make a step, and this share of those on its side; displacements agree within this share of their size.
+_FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
+
+
+def common_step(capture: Capture, poses: Array, misplaced: Sequence[Misplaced]) -> tuple[range, str] | None:
+    """The views at one end of the list that stand off alike, with what moved: part or scanner; None if none do.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner of the model.
+    """
+    placed = {m.view: m.T for m in misplaced if m.T is not None}
+    for views in _ends({m.view for m in misplaced}, len(poses)):
+        for what in ("part", "scanner"):
+            if _alike(capture, poses, {v: placed[v] for v in views if v in placed}, what) >= _SHARE * len(views):
+                return views, what
+    return None
+
+
+def _ends(misplaced: set[int], count: int) -> list[range]:
+    """The unbroken runs of misplaced views at the end and at the beginning of the list, if they are long enough."""
+    good = [v for v in range(count) if v not in misplaced]
+    runs = [range(good[-1] + 1, count), range(good[0])] if good else []
+    return [run for run in runs if len(run) >= _FEWEST]
+
+
+def _alike(capture: Capture, poses: Array, placed: Mapping[int, Array], what: str) -> int:
+    """How many views at most share one displacement: a left twist if the part moved, a right one if the scanner did."""
+    best = 0
+    for v, T in placed.items():
+        back = frames.inverse(poses[v])
+        alike = 0
+        for w, there in placed.items():
+            expected = T @ back @ poses[w] if what == "part" else poses[w] @ back @ T
+            points = capture.scans[w].points[::50]
+            stated, fitted, shared = (frames.transform(pose, points) for pose in (poses[w], there, expected))
+            alike += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
+        best = max(best, alike)
+    return best if best >= _FEWEST else 0
