@@ -27,6 +27,7 @@ _OWN = {
     "report": "stitch.cli.report:report",
     "batch": "stitch.cli.batch:batch",
     "import": "stitch.cli.import_file:import_command",
+    "export": "stitch.cli.export_run:export_run",
     "calibrate": "stitch.cli.calibrate:calibrate",
 }
 

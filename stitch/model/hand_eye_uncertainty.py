@@ -4,6 +4,8 @@ Its covariance Σ belongs to a right perturbation T·exp(ξ) in the scanner fram
 in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so that theirs is J·Σ·Jᵀ (to first order).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -12,6 +14,8 @@ from stitch.frames import Array
 
 # Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
 COVERAGE_FACTOR = 2.0
+# Of a twist, for central differences: far above rounding, far below the bend of any angle.
+_STEP = 1e-6
 
 
 def printed_covariance(T_mount: Array, covariance: Array) -> Array:
@@ -25,6 +29,19 @@ def printed_covariance(T_mount: Array, covariance: Array) -> Array:
     J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
     J[3:, 3:] = T_mount[:3, :3]
     return J @ covariance @ J.T
+
+
+def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
+    """(n, n) of whatever numbers (n,) a controller writes of a hand-eye, to first order.
+
+    Args:
+        numbers: of a pose (4, 4); near T_mount they must not jump.
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    steps = _STEP * np.eye(6)
+    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
+    return np.asarray(np.transpose(J) @ covariance @ np.array(J))
 
 
 def expanded(T_mount: Array, covariance: Array) -> Array:

@@ -1,0 +1,1 @@
+"""What a run found in the words of other programs: hand-eye, arm, robot programs, clouds."""
