@@ -36,8 +36,13 @@ def calibrated(run: Run) -> CalibratedRobot:
     robot = run.session.robot
     if robot is None or not run.measurement.views.joints.shape[1]:
         raise InputError(f"{run.session.path}: no joint angles or no [robot]; a kinematic calibration needs both")
-    of_the_arm = [term.name for term in run.terms if term.effect.place in ("robot", "links")]
-    return CalibratedRobot(with_geometry(robot, run.terms), tuple(name for name in of_the_arm if name not in GEOMETRY))
+    return calibrated_arm(robot, run.terms)
+
+
+def calibrated_arm(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
+    """A robot with the joint offsets and link errors of a model."""
+    of_the_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
+    return CalibratedRobot(with_geometry(robot, terms), tuple(name for name in of_the_arm if name not in GEOMETRY))
 
 
 def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:

@@ -19,9 +19,16 @@ _HEADER = """# The [robot] table of session.toml with the offsets and link error
 def write_robot(run: Run, found: CalibratedRobot, folder: Path) -> None:
     """robot.toml (for an arm of DH rows) and robot.urdf."""
     (folder / "robot.urdf").write_text(to_urdf(found.robot), encoding="utf-8")
+    table = robot_toml(found)
+    if table is not None:
+        (folder / "robot.toml").write_text(table, encoding="utf-8")
+
+
+def robot_toml(found: CalibratedRobot) -> str | None:
+    """The [robot] table of session.toml, commented; None for an arm that came as URDF."""
     rows = dh_rows(found.robot)
     if rows is None:
-        return
+        return None
     table: dict[str, Any] = {
         "name": found.robot.name,
         "dh": found.robot.convention,
@@ -30,8 +37,7 @@ def write_robot(run: Run, found: CalibratedRobot, folder: Path) -> None:
     }
     if found.robot.payload_mass:
         table["payload"] = {"mass": found.robot.payload_mass, "com": found.robot.payload_com.tolist()}
-    header = _HEADER.format(beyond=beyond_sentence(found))
-    (folder / "robot.toml").write_text(header + tomli_w.dumps({"robot": table}), encoding="utf-8")
+    return _HEADER.format(beyond=beyond_sentence(found)) + tomli_w.dumps({"robot": table})
 
 
 def beyond_sentence(found: CalibratedRobot) -> str:

@@ -6,38 +6,76 @@ from typing import Annotated
 
 import typer
 
+from stitch.cli.export_program import export_program
+from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.cli.streams import results
 from stitch.errors import InputError
+from stitch.export.arm_formats import ARM_FORMATS
+from stitch.export.arm_model import arm_of
+from stitch.export.compensated_program import LIMIT_MM
 from stitch.export.hand_eye import hand_eye_of
 from stitch.export.hand_eye_formats import FORMATS, ros_launch
 from stitch.system.whole_file import whole
 
+_KINDS = f"hand-eye: {', '.join(FORMATS)}; arm: {', '.join(ARM_FORMATS)}"
+
 
 def export_run(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
-    to: Annotated[
-        str | None, typer.Option("--to", metavar="FORMAT", help=f"The hand-eye as {', '.join(FORMATS)}.")
+    to: Annotated[str | None, typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.")] = None,
+    program: Annotated[
+        Path | None,
+        typer.Option("--program", metavar="FILE", help="Move the targets of a KUKA, FANUC, ABB or UR program."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="File to write; default standard output.")
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="File to write; texts: standard output.")
     ] = None,
     parent: Annotated[
         str | None, typer.Option("--parent", help="Name of the frame that carries the scanner: flange, base_link …")
     ] = None,
     child: Annotated[str, typer.Option("--child", help="Name of the scanner's frame.")] = "scanner",
+    frame: Annotated[
+        str | None, typer.Option("--frame", help="Of a program's poses in the base, numbers as the controller shows.")
+    ] = None,
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Of a program's poses in the flange, numbers as the controller shows.")
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", metavar="MM", help="Largest move of a target that is believed.")
+    ] = LIMIT_MM,
+    near: Annotated[
+        str | None, typer.Option("--near", help="Joint angles in degrees about which the program works.")
+    ] = None,
+    j3: Annotated[
+        str | None, typer.Option("--j3", help="Of a FANUC program: own, or j2+j3 where the session's joint 3 is that.")
+    ] = None,
+    effects_file: EffectsFile = None,
+    trust: Trust = False,
+    as_json: Json = False,
 ) -> None:
-    """Write the hand-eye of a run in the form of another program, with its uncertainty and its frames."""
+    """Write what a run found for other programs, or a compensated copy of a robot program."""
+    if (to is None) == (program is None):
+        raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
-    if to not in FORMATS:
-        raise InputError(f"--to {to}: to fix: one of {', '.join(FORMATS)}")
-    eye = hand_eye_of(run, parent, child)
-    # ROS 1 knows launch files in XML only.
-    old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
-    text = ros_launch(eye) if old else FORMATS[to](eye)
+    if program is not None:
+        arm = arm_of(run, effects_file, trust)
+        export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
+    elif to in ARM_FORMATS:
+        _text(ARM_FORMATS[to](arm_of(run, effects_file, trust)), to, output)
+    elif to in FORMATS:
+        eye = hand_eye_of(run, parent, child)
+        # ROS 1 knows launch files in XML only.
+        old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
+        _text(ros_launch(eye) if old else FORMATS[to](eye), to, output)
+    else:
+        raise InputError(f"--to {to}: to fix: one of {_KINDS}")
+
+
+def _text(text: str, to: str, output: Path | None) -> None:
     if output is None:
         results().write(text)
         return
     with whole(output) as file:
         file.write_text(text, encoding="utf-8")
-    print(f"{eye.name} as {to} to {output}", file=sys.stderr)
+    print(f"{to} to {output}", file=sys.stderr)

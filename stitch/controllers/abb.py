@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, quaternion_w_first
+from stitch.controllers.taught import Taught, Written, line_of, quaternion_w_first
 from stitch.errors import InputError
 from stitch.reading.csv_number import number
 
@@ -16,6 +16,11 @@ _DECLARED = re.compile(r"\b(robtarget|jointtarget)\s+(\w+)\s*(?:\{\s*\d+\s*\})?\
 _MOVE = re.compile(r"\bMove(L|J|AbsJ)\s+(\[[^;]*?\]\s*\])\s*(?:\\|,)", re.I)
 _TARGET = re.compile(r"\[((?:[^\[\]]*\[[^\[\]]*\]){2,4})[^\[\]]*\]")
 _LIST = re.compile(r"\[([^\[\]]*)\]")
+# What stands between commas, without the space around it.
+_CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
+
+# What stands for an external axis that there is not: 9E9.
+_NONE = 8e9
 
 
 def read(file: Path, text: str) -> list[Taught]:
@@ -46,18 +51,32 @@ def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool)
         raise InputError(f"{file} line {line}: {name} is not written as [[…],[…],…]; write its numbers out")
     names = [name] if len(matches) == 1 else [f"{name}_{k + 1}" for k in range(len(matches))]
     return [
-        (at + m.start(), _point(file, line_of(text, at + m.start()), label, m[1], joint))
+        (at + m.start(), _point(file, line_of(text, at + m.start()), label, m[1], at + m.start(1), joint=joint))
         for m, label in zip(matches, names, strict=True)
     ]
 
 
-def _point(file: Path, line: int, name: str, body: str, joint: bool) -> Taught:
-    lists = [[number(file, line, name, cell) for cell in part.split(",")] for part in _LIST.findall(body)]
+def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bool) -> Taught:
+    """A point from its lists, which stand at `begin`."""
+    lists = [
+        [
+            Written(
+                number(file, line, name, cell[0]),
+                (begin + part.start(1) + cell.start(), begin + part.start(1) + cell.end()),
+            )
+            for cell in _CELL.finditer(part[1])
+        ]
+        for part in _LIST.finditer(body)
+    ]
+    values, spans = [[w.value for w in own] for own in lists], [tuple(w.span for w in own) for own in lists]
     if joint and len(lists[0]) == 6:
-        return Taught(name, line, None, np.radians(lists[0]))
+        return Taught(name, line, None, np.radians(values[0]), joints_at=spans[0])
     if not joint and len(lists[0]) == 3 and len(lists[1]) == 4:
         try:
-            return Taught(name, line, quaternion_w_first(np.array(lists[0] + lists[1])), None)
+            T_frame_tool = quaternion_w_first(np.array(values[0] + values[1]))
         except ValueError as error:
             raise InputError(f"{file} line {line}: {name}: {error}") from None
+        axes = [f"eax_{letter} {x:g}" for letter, x in zip("abcdef", values[-1], strict=False) if x and x < _NONE]
+        moved_by = ", ".join(axes) if len(values) == 4 else ""
+        return Taught(name, line, T_frame_tool, None, pose_at=spans[0] + spans[1], moved_by=moved_by)
     raise InputError(f"{file} line {line}: {name} is neither [[x,y,z],[q1,q2,q3,q4],…] nor [[j1 … j6],…]")

@@ -7,7 +7,7 @@ DH joint 3 of most published tables is J2 + J3.
 import re
 from pathlib import Path
 
-from stitch.controllers.taught import Taught, fixed_xyz, line_of, pose_or_joints
+from stitch.controllers.taught import Taught, Written, fixed_xyz, line_of, taught
 from stitch.errors import InputError
 from stitch.reading.csv_number import number
 
@@ -18,7 +18,7 @@ _POINT = re.compile(r"P\[(\d+)(?:\s*:\s*\"([^\"]*)\")?\]\s*\{(.*?)\}\s*;", re.S)
 _GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d+\s*:|\Z)", re.S)
 _FRAME = re.compile(r"UF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 # Numbers, or the stars of a point that was never taught.
-_FIELD = re.compile(r"\b([XYZWPR]|J\d)\s*=\s*([-+.\deE*]+)")
+_FIELD = re.compile(r"\b([XYZWPR]|[JE]\d)\s*=\s*([-+.\deE*]+)")
 
 
 def read(file: Path, text: str) -> list[Taught]:
@@ -39,13 +39,17 @@ def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
     group = _GROUP.search(body)
     if group is None:
         raise InputError(f"{file} line {line}: P[{index}] has no GP1; the arm's own group is read")
+    begin = match.start(3) + group.start(1)
     fields = {
-        key: number(file, line, f"P[{index}] {key}", value, "teach the point or remove it")
-        for key, value in _FIELD.findall(group[1])
+        m[1]: Written(
+            number(file, line, f"P[{index}] {m[1]}", m[2], "teach the point or remove it"),
+            (begin + m.start(2), begin + m.end(2)),
+        )
+        for m in _FIELD.finditer(group[1])
     }
     taught_in = _FRAME.search(group[1])
     frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
-    T_frame_tool, joints = pose_or_joints(fields, "XYZWPR", fixed_xyz, joint="J")
-    if T_frame_tool is None and joints is None:
+    point = taught(name, line, fields, "XYZWPR", fixed_xyz, joint="J", frame=frame)
+    if point is None:
         raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; teach it again")
-    return Taught(name, line, T_frame_tool, joints, frame)
+    return point

@@ -1,30 +1,19 @@
 """A controller's or tracker's file -> the text of views.csv, frames.csv or points.csv."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-
-import numpy as np
 
 from stitch import frames
-from stitch.controllers import abb, fanuc, kuka, tracker_csv, universal
+from stitch.controllers import tracker_csv, universal
 from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique, view_rows
+from stitch.controllers.program import PROGRAMS, given, require_one_frame
 from stitch.controllers.taught import Taught
 from stitch.controllers.tracker_csv import Measured
 from stitch.errors import InputError, NoResultError
-from stitch.frames import Array
-from stitch.reading.csv_number import is_number
 
-_READERS: dict[str, ModuleType] = {
-    ".ls": fanuc,
-    ".dat": kuka,
-    ".src": kuka,
-    ".mod": abb,
-    ".script": universal,
-    ".csv": universal,
-}
+_READERS = PROGRAMS | {".csv": universal}
 # Programs are in mm; views.csv is in the session's length_unit.
 _SCALE = {"mm": 1.0, "m": 1e-3}
 
@@ -68,37 +57,18 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
     warnings = _check_frames(file, points, frame, tool)
-    T_base_frame, T_flange_tool = _given(reader.pose, "frame", frame), _given(reader.pose, "tool", tool)
+    T_base_frame, T_flange_tool = given(reader.pose, "frame", frame), given(reader.pose, "tool", tool)
     rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _SCALE[unit])
     return Imported("views.csv", csv_text(rows), len(points), reader.CONVENTION, warnings)
 
 
-def _given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
-    if value is None:
-        return np.eye(4)
-    count = 7 if pose is abb.pose else 6
-    cells = value.split(",")
-    if len(cells) != count or not all(is_number(cell) for cell in cells):
-        raise InputError(f"--{name} {value}: write {count} numbers with commas, as the controller shows the pose")
-    try:
-        return pose(np.array([float(cell) for cell in cells]))
-    except ValueError as error:
-        raise InputError(f"--{name} {value}: {error}") from None
-
-
 def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool: str | None) -> tuple[str, ...]:
     """Points of one frame and tool, or a refusal; a warning where poses need them and none was given."""
-    posed = [point for point in points if point.T_frame_tool is not None]
-    if not posed:
+    taught_in = require_one_frame(file, points)
+    if taught_in is None:
         return ()
-    other = next((point for point in posed if point.frame != posed[0].frame), None)
-    if other is not None:
-        raise InputError(
-            f"{file} line {other.line}: {other.name} is taught in {other.frame}, {posed[0].name} in {posed[0].frame}; "
-            "import points of one frame and tool at a time"
-        )
-    if (frame is None or tool is None) and posed[0].frame != "UF 0, UT 0":
-        known = f" ({posed[0].frame})" if posed[0].frame else ""
+    if (frame is None or tool is None) and taught_in != "UF 0, UT 0":
+        known = f" ({taught_in})" if taught_in else ""
         return (
             f"poses are those of the tool in the frame in which they were taught{known}; give --frame and --tool "
             "unless both were zero, else they are not the flange in the base",

@@ -4,9 +4,10 @@ A .src gives the points in the order of its motions; names in it are looked up i
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
-from stitch.controllers.taught import Taught, line_of, pose_or_joints, without_comments, zyx
+from stitch.controllers.taught import Taught, Written, line_of, program_text, taught, without_comments, zyx
 from stitch.errors import InputError
 from stitch.reading.csv_number import number
 
@@ -18,7 +19,7 @@ _DECLARED = re.compile(
     re.M | re.I | re.S,
 )
 _MOTION = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+(?:(\w+)|\{(.*?)\})", re.M | re.I)
-_FIELD = re.compile(r"\b([XYZABC]|A\d)\s+([^,}\s]+)", re.I)
+_FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
 
 def read(file: Path, text: str) -> list[Taught]:
@@ -32,13 +33,14 @@ def read(file: Path, text: str) -> list[Taught]:
     known = _declared(file, text)
     data = next((p for p in (file.with_suffix(".dat"), file.with_suffix(".DAT")) if p.is_file()), None)
     if data is not None:
-        known |= _declared(data, data.read_text(encoding="utf-8", errors="replace"))
+        told = _declared(data, program_text(data))
+        known |= {name: replace(point, file=data) for name, point in told.items()}
     return [_moved_to(file, text, match, known) for match in _MOTION.finditer(without_comments(text, ";"))]
 
 
 def _declared(file: Path, text: str) -> dict[str, Taught]:
     clean = without_comments(text, ";")
-    found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2])) for m in _DECLARED.finditer(clean)]
+    found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2], m.start(2))) for m in _DECLARED.finditer(clean)]
     return {name.upper(): point for name, point in found}
 
 
@@ -47,15 +49,21 @@ def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taug
     if "_REL" in match[0].upper():
         raise InputError(f"{file} line {line}: a relative motion has no pose of its own; give the point as E6POS")
     if match[2]:
-        return _point(file, f"line{line}", line, match[2])
+        return _point(file, f"line{line}", line, match[2], match.start(2))
     if match[1].upper() not in known:
         raise InputError(f"{file} line {line}: {match[1]} is declared nowhere; put {file.stem}.dat beside the .src")
     return known[match[1].upper()]
 
 
-def _point(file: Path, name: str, line: int, body: str) -> Taught:
-    fields = {key.upper(): number(file, line, f"{name} {key}", value) for key, value in _FIELD.findall(body)}
-    T_frame_tool, joints = pose_or_joints(fields, "XYZABC", zyx, joint="A")
-    if T_frame_tool is None and joints is None:
+def _point(file: Path, name: str, line: int, body: str, begin: int) -> Taught:
+    """A point from the fields between its braces, which stand at `begin`."""
+    fields = {
+        m[1].upper(): Written(
+            number(file, line, f"{name} {m[1].upper()}", m[2]), (begin + m.start(2), begin + m.end(2))
+        )
+        for m in _FIELD.finditer(body)
+    }
+    point = taught(name, line, fields, "XYZABC", zyx, joint="A")
+    if point is None:
         raise InputError(f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; write all of them")
-    return Taught(name, line, T_frame_tool, joints)
+    return point

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,6 +12,15 @@ from stitch import frames
 from stitch.frames import Array
 
 _FEWEST_JOINTS = 4
+Span = tuple[int, int]  # begin and end in a text
+
+
+@dataclass(frozen=True)
+class Written:
+    """A number as a program has it, and where."""
+
+    value: float
+    span: Span
 
 
 @dataclass(frozen=True)
@@ -22,6 +32,10 @@ class Taught:
     T_frame_tool: Array | None  # (4, 4) of the tool in the frame in which it was taught
     joints: Array | None  # (n,) rad
     frame: str = ""  # frame and tool in force, in the controller's words; empty where the file does not say
+    pose_at: tuple[Span, ...] = ()  # where the pose's numbers stand, in the controller's order
+    joints_at: tuple[Span, ...] = ()  # where the joint angles stand
+    file: Path | None = None  # in which they stand, where it is not the program itself
+    moved_by: str = ""  # an external axis that is not at zero
 
 
 def fixed_xyz(numbers: Array) -> Array:
@@ -61,17 +75,46 @@ def rotation_vector(numbers: Array) -> Array:
     return frames.make(Rotation.from_rotvec(numbers[3:6]).as_matrix(), numbers[:3] * 1000)
 
 
-def pose_or_joints(
-    fields: Mapping[str, float], axes: str, pose: Callable[[Array], Array], *, joint: str
-) -> tuple[Array | None, Array | None]:
-    """Pose (4, 4) from the fields named by `axes`, else joint angles (n,) rad from fields joint1, joint2, …
+def taught(
+    name: str,
+    line: int,
+    fields: Mapping[str, Written],
+    axes: str,
+    pose: Callable[[Array], Array],
+    *,
+    joint: str,
+    frame: str = "",
+) -> Taught | None:
+    """A point with the pose from the fields named by `axes`, else the joint angles from fields joint1, joint2, …
 
-    Both are None where neither is complete.
+    Args:
+        pose: of the numbers of these fields.
+        frame: in force when the point was taught.
+
+    Returns:
+        None where neither is complete.
     """
+    moved_by = ", ".join(f"{key} {w.value:g}" for key, w in fields.items() if key.startswith("E") and w.value)
     if all(axis in fields for axis in axes):
-        return pose(np.array([fields[axis] for axis in axes])), None
-    joints = [fields[f"{joint}{i}"] for i in range(1, 10) if f"{joint}{i}" in fields]
-    return None, np.radians(joints) if len(joints) >= _FEWEST_JOINTS else None
+        own = [fields[axis] for axis in axes]
+        T_frame_tool = pose(np.array([number.value for number in own]))
+        spans = tuple(number.span for number in own)
+        return Taught(name, line, T_frame_tool, None, frame, pose_at=spans, moved_by=moved_by)
+    own = [fields[f"{joint}{i}"] for i in range(1, 10) if f"{joint}{i}" in fields]
+    if len(own) < _FEWEST_JOINTS:
+        return None
+    joints = np.radians([number.value for number in own])
+    return Taught(name, line, None, joints, frame, joints_at=tuple(number.span for number in own))
+
+
+def program_text(file: Path) -> str:
+    """A program's text from which its bytes come back as they are: with its ends of lines, in whatever encoding."""
+    return file.read_bytes().decode("utf-8", errors="surrogateescape")
+
+
+def program_bytes(text: str) -> bytes:
+    """The way back."""
+    return text.encode("utf-8", errors="surrogateescape")
 
 
 def without_comments(text: str, mark: str) -> str:

@@ -6,6 +6,7 @@ waypoint as NAME_p (pose) and NAME_q (joints), which become one point. Poses are
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
 pose = rotation_vector
 
 _LIST = r"(p?)\[([^\[\]]*)\]"
+# What stands between commas, without the space around it.
+_CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 _NAMED = re.compile(rf"\b(\w+)\s*=\s*{_LIST}")
 _MOVE = re.compile(rf"\bmove[jlpc]\s*\(\s*{_LIST}")
 _POSE = tuple([f"{kind}_TCP_pose_{i}" for i in range(6)] for kind in ("actual", "target"))
@@ -36,11 +39,12 @@ def read(file: Path, text: str) -> list[Taught]:
 
 def _script(file: Path, text: str) -> list[Taught]:
     clean = without_comments(text, "#")
-    found = [(m.start(), m[1], m[2], m[3]) for m in _NAMED.finditer(clean)]
-    found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m[2]) for m in _MOVE.finditer(clean)]
+    found = [(m.start(), m[1], m[2], m.span(3)) for m in _NAMED.finditer(clean)]
+    found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m.span(2)) for m in _MOVE.finditer(clean)]
     points: dict[str, Taught] = {}
-    for position, name, kind, body in sorted(found):
-        cells = body.split(",")
+    for position, name, kind, (begin, end) in sorted(found):
+        spans = tuple((begin + m.start(), begin + m.end()) for m in _CELL.finditer(clean[begin:end]))
+        cells = [clean[slice(*span)] for span in spans]
         if len(cells) != 6:
             continue  # A list of something else: a payload, a vector, an I/O pattern.
         line = line_of(text, position)
@@ -51,8 +55,10 @@ def _script(file: Path, text: str) -> list[Taught]:
         values = np.array([float(cell) for cell in cells])
         base = re.sub(r"_[pq]$", "", name)
         before = points.get(base, Taught(base, line, None, None))
-        pose = rotation_vector(values) if kind else before.T_frame_tool
-        points[base] = Taught(base, before.line, pose, before.joints if kind else values)
+        if kind:
+            points[base] = replace(before, T_frame_tool=rotation_vector(values), pose_at=spans)
+        else:
+            points[base] = replace(before, joints=values, joints_at=spans)
     return list(points.values())
 
 

@@ -23,8 +23,11 @@ from stitch.units import METRES
 _FEWEST = 3
 
 
-def load_session(path: Path | str) -> Session:
+def load_session(path: Path | str, scans: bool = True) -> Session:
     """Read and check a session folder.
+
+    Args:
+        scans: False reads neither clouds nor labelled points, for questions about the arm alone.
 
     Raises:
         InputError: anything missing, contradictory or implausible; names file, line or view, and the mend.
@@ -37,8 +40,8 @@ def load_session(path: Path | str) -> Session:
     robot = session_toml.robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot)
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
-    sightings = _sightings(path, [row.name for row in rows])
-    views = _views(path, rows, METRES[cloud_unit] / METRES[unit], sightings)
+    sightings = _sightings(path, [row.name for row in rows]) if scans else {}
+    views = _views(path, rows, METRES[cloud_unit] / METRES[unit] if scans else None, sightings)
     cad, cad_unit = session_toml.cad(file, document.get("part", {}))
     session = Session(
         path=path,
@@ -54,7 +57,8 @@ def load_session(path: Path | str) -> Session:
         nominal=_nominal(path, sightings),
         repeatability=session_toml.repeatability(file, document.get("robot")),
     )
-    check_scale(session, cloud_unit)
+    if scans:
+        check_scale(session, cloud_unit)
     return session
 
 
@@ -89,11 +93,14 @@ def _nominal(path: Path, sightings: dict[str, Sighting]) -> Nominal | None:
     return read_targets(file, sorted({name for s in sightings.values() for name in s.targets}))
 
 
-def _views(path: Path, rows: list[Row], scale: float, sightings: dict[str, Sighting]) -> tuple[View, ...]:
+def _views(path: Path, rows: list[Row], scale: float | None, sightings: dict[str, Sighting]) -> tuple[View, ...]:
+    """The rows with what was seen; without a scale for the clouds, nothing is."""
     views = []
     for row in rows:
         cloud = None
-        if row.cloud:
+        if scale is None:
+            pass
+        elif row.cloud:
             cloud = _cloud(path, row, scale)
         elif not sightings:
             raise InputError(

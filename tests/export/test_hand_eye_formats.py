@@ -153,7 +153,7 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--to", "lego"], "--to lego: to fix: one of ros, urdf"),
+        (["--to", "lego"], "--to lego: to fix: one of hand-eye: ros, urdf"),
         (["--to", "ros", "--parent", "my flange"], "--parent 'my flange': to fix"),
         (["--to", "ros", "-o", "taken.yaml"], "taken.yaml: exists already"),
     ],

@@ -1,0 +1,118 @@
+"""A robot program with the places of its numbers, and the frame and tool in which it was taught."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from stitch.controllers import abb, fanuc, kuka, universal
+from stitch.controllers.taught import Taught, program_text
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.reading.csv_number import is_number
+
+PROGRAMS: dict[str, ModuleType] = {
+    ".ls": fanuc,
+    ".dat": kuka,
+    ".src": kuka,
+    ".mod": abb,
+    ".script": universal,
+}
+_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal: "ur"}
+
+
+@dataclass(frozen=True)
+class Program:
+    """One program as it stands in its files."""
+
+    file: Path
+    controller: str  # kuka | fanuc | abb | ur
+    points: tuple[Taught, ...]  # in the order of the file, each once
+    texts: dict[Path, str]  # of the files that hold the points' numbers, byte for byte
+    T_base_frame: Array  # (4, 4) mm
+    T_flange_tool: Array  # (4, 4) mm
+
+
+def read_program(file: Path, frame: str | None = None, tool: str | None = None) -> Program:
+    """Read a program whose points are to be moved.
+
+    Args:
+        frame: T_base_frame in which the points were taught, numbers as the controller shows them.
+        tool: T_flange_tool in force when they were taught, likewise.
+
+    Raises:
+        InputError: unknown or broken file, points of different frames, poses of an unknown frame or tool, an external
+            axis that carries the arm.
+        NoResultError: no points in the file.
+    """
+    reader = PROGRAMS.get(file.suffix.lower())
+    if reader is None:
+        raise InputError(f"{file}: unknown kind {file.suffix!r} of program; known are {', '.join(PROGRAMS)}")
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; to fix: name a program of the controller")
+    text = program_text(file)
+    every: list[Taught] = reader.read(file, text)
+    points = tuple({(p.file, p.pose_at, p.joints_at): p for p in every}.values())
+    if not points:
+        raise NoResultError(f"{file}: no taught points found; export the program with its positions")
+    taught_in = require_one_frame(file, points)
+    if taught_in is not None and taught_in != "UF 0, UT 0":
+        # A script of a UR has its poses in the base.
+        lacking = [f"--{name}" for name, value in (("frame", frame), ("tool", tool)) if value is None]
+        if reader is universal and "--frame" in lacking:
+            lacking.remove("--frame")
+        if lacking:
+            known = f" ({taught_in})" if taught_in else ""
+            raise InputError(
+                f"{file}: its poses are those of a tool in a frame{known} that the file does not hold; to fix: state "
+                f"{' and '.join(lacking)} as the controller shows them, zeros where none is in force"
+            )
+    moved = next((p for p in points if p.moved_by and p.T_frame_tool is not None), None)
+    if moved is not None:
+        raise InputError(
+            f"{file} line {moved.line}: {moved.name} has {moved.moved_by}; where an external axis carries the arm its "
+            "joint angles cannot be told; to fix: give joint targets"
+        )
+    files = dict.fromkeys(p.file for p in points if p.file is not None)
+    texts = {file: text} | {path: program_text(path) for path in files}
+    return Program(
+        file, _NAMES[reader], points, texts, given(reader.pose, "frame", frame), given(reader.pose, "tool", tool)
+    )
+
+
+def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
+    """(4, 4) mm of the numbers that a person states as the controller shows them; the unit matrix without any.
+
+    Raises:
+        InputError: too few numbers, or a quaternion that is none.
+    """
+    if value is None:
+        return np.eye(4)
+    count = 7 if pose is abb.pose else 6
+    cells = value.split(",")
+    if len(cells) != count or not all(is_number(cell) for cell in cells):
+        raise InputError(f"--{name} {value}: write {count} numbers with commas, as the controller shows the pose")
+    try:
+        return pose(np.array([float(cell) for cell in cells]))
+    except ValueError as error:
+        raise InputError(f"--{name} {value}: {error}") from None
+
+
+def require_one_frame(file: Path, points: Sequence[Taught]) -> str | None:
+    """Frame and tool of all poses as the file calls them, "" where it does not say; None without poses.
+
+    Raises:
+        InputError: points of different frames or tools.
+    """
+    posed = [point for point in points if point.T_frame_tool is not None]
+    if not posed:
+        return None
+    other = next((point for point in posed if point.frame != posed[0].frame), None)
+    if other is not None:
+        raise InputError(
+            f"{file} line {other.line}: {other.name} is taught in {other.frame}, {posed[0].name} in {posed[0].frame}; "
+            "import points of one frame and tool at a time"
+        )
+    return posed[0].frame

@@ -1,0 +1,102 @@
+"""The arm of a run as its model has it: where the flange truly goes for commanded joint angles."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stitch.effects.in_session import known, lacking
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.measurement import robot as kinematics
+from stitch.measurement.capture import place
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.robot import Robot
+from stitch.measurement.torques import torques_of
+from stitch.measurement.views import Views, views_of
+from stitch.model.bound import bound, in_unit
+from stitch.model.forward import perturbed_frames
+from stitch.model.term import Term
+from stitch.reading.session_folder import load_session
+from stitch.stored.run_documents import read_result
+from stitch.stored.trusted_model import trusted_model
+
+ARM = ("robot", "links")
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """Nominal arm and effects of a model; lengths in length_unit."""
+
+    session: str
+    robot: Robot
+    terms: tuple[Term, ...]  # effects of the arm
+    length_unit: str
+    joints: Array  # (V, n) rad, where the model was fitted
+    elsewhere: tuple[str, ...] = ()  # effects of the model that are not the arm's
+
+    def at_rest(self) -> tuple["ArmModel", tuple[str, ...]]:
+        """The arm with what joint angles alone decide, and the names of effects that hang on time, speed or heat."""
+        still = _measurement(self, self.joints[:1], self.joints[:1], np.zeros_like(self.joints[:1]))
+        here = tuple(term for term in self.terms if not lacking(still, term.effect))
+        return replace(self, terms=here), tuple(term.name for term in self.terms if term not in here)
+
+    def true_flange(self, joints: Array, previous: Array, approach: Array) -> Array:
+        """(K, 4, 4) T_base_flange of commanded joint angles (K, n) in rad.
+
+        Args:
+            previous: (K, n) of the targets before.
+            approach: (K, n) −1, 0, +1, how each joint comes.
+        """
+        left, _ = perturbed_frames(_measurement(self, joints, previous, approach), self.terms)
+        return left
+
+
+def arm_of(folder: Path, effects_file: Path | None = None, trust: bool = False) -> ArmModel:
+    """The arm of a run folder; of its session robot and joint angles are read, no scans.
+
+    Args:
+        trust: run the Python file of effects that the model names.
+
+    Raises:
+        InputError: no run, its session has gone or has no robot with joint angles, or an effect that does not fit it.
+    """
+    file, _ = trusted_model(folder, effects_file, trust)
+    path = Path(read_result(folder)["session"])
+    if not path.is_dir():
+        raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
+    session = load_session(path, scans=False)
+    views = views_of(session)
+    if session.robot is None or not views.joints.shape[1]:
+        raise InputError(f"{path}: no joint angles or no [robot]; where the arm goes needs both")
+    T_base_flange = np.array([view.T_base_flange for view in session.views])
+    measurement = _bare(session.name, session.robot, T_base_flange, views, session.length_unit)
+    own = {name: values for name, values in file.effects.items() if known(name).place in ARM}
+    terms = bound(in_unit(replace(file, effects=own), session.length_unit), measurement).terms
+    elsewhere = tuple(name for name in file.effects if name not in own)
+    return ArmModel(session.name, session.robot, terms, session.length_unit, views.joints, elsewhere)
+
+
+def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array) -> Measurement:
+    """Targets of a program as views: at rest, at no stated time and temperature."""
+    count = len(joints)
+    views = Views(
+        count=count,
+        time=np.zeros(count),
+        joints=joints,
+        previous=previous,
+        approach=approach,
+        velocity=None,
+        torques=torques_of(arm.robot, joints),
+        covariates={},
+        standoff=1.0,
+        first={},
+        number=np.arange(count),
+    )
+    return _bare(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
+
+
+def _bare(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:
+    """A measurement of the arm alone; what carries the scanner does not matter."""
+    capture = place(name, (), T_base_flange, "eye_in_hand")
+    return Measurement(capture, T_base_flange, False, robot, views, (), length_unit)
