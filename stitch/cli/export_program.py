@@ -21,6 +21,8 @@ from stitch.writing.json_file import to_json
 
 _J3 = ("own", "j2+j3")
 _SHOWN = 40
+# Below this (mm) nothing remains: no arm knows a nanometre.
+_NOTHING = 1e-6
 
 
 def export_program(
@@ -123,8 +125,8 @@ def _show(copy: CompensatedProgram, places: list[Path]) -> None:
     far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
     effects = ", ".join(term.name for term in copy.arm.terms)
     terminal.print(
-        f"Undone: {effects}. {far['target']} moves farthest, by {far['moved_mm']:.3f} mm; under the model at most "
-        f"{left * 1e3:.2g} µm remain.",
+        f"Undone: {effects}. {far['target']} moves farthest, by {far['moved_mm']:.3f} mm; under the model "
+        f"{f'up to {left * 1e3:.2g} µm remain' if left > _NOTHING else 'nothing remains'}.",
         soft_wrap=True,
     )
     for note in copy.notes:

@@ -12,12 +12,14 @@ from stitch.cli.streams import results
 from stitch.errors import InputError
 from stitch.export.arm_formats import ARM_FORMATS
 from stitch.export.arm_model import arm_of
+from stitch.export.cloud_formats import CLOUD_FORMATS, coloured_cloud
 from stitch.export.compensated_program import LIMIT_MM
 from stitch.export.hand_eye import hand_eye_of
 from stitch.export.hand_eye_formats import FORMATS, ros_launch
 from stitch.system.whole_file import whole
+from stitch.units import MICROMETRES
 
-_KINDS = f"hand-eye: {', '.join(FORMATS)}; arm: {', '.join(ARM_FORMATS)}"
+_KINDS = f"hand-eye: {', '.join(FORMATS)}; arm: {', '.join(ARM_FORMATS)}; cloud: {', '.join(CLOUD_FORMATS)}"
 
 
 def export_run(
@@ -68,6 +70,8 @@ def export_run(
         # ROS 1 knows launch files in XML only.
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
         _text(ros_launch(eye) if old else FORMATS[to](eye), to, output)
+    elif to in CLOUD_FORMATS:
+        _cloud(run, to, output)
     else:
         raise InputError(f"--to {to}: to fix: one of {_KINDS}")
 
@@ -79,3 +83,16 @@ def _text(text: str, to: str, output: Path | None) -> None:
     with whole(output) as file:
         file.write_text(text, encoding="utf-8")
     print(f"{to} to {output}", file=sys.stderr)
+
+
+def _cloud(run: Path, to: str, output: Path | None) -> None:
+    if output is None or output.suffix.lower() != f".{to}":
+        raise InputError(f"--to {to}: where to? to fix: name the file with -o NAME.{to}")
+    write, lost = CLOUD_FORMATS[to]
+    cloud = coloured_cloud(run)
+    with whole(output) as file:
+        write(cloud, file)
+    span = cloud.span * MICROMETRES[cloud.length_unit]
+    told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
+    told += [f"{to} does not hold {lost}"] if lost else []
+    print("; ".join(told), file=sys.stderr)

@@ -85,7 +85,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         residual_rms=_number(document["residual_rms"]),
         heldout_rms=_number(document["heldout_rms"]),
         noise_floor=_number(document["noise_floor"]),
-        fused=_fused(folder / "stitched.ply"),
+        fused=fused_cloud(folder / "stitched.ply"),
         repeatability=Repeatability(_number(scatter["rotation"]), _number(scatter["translation"]), float("nan")),
         overlaps=overlaps,
         registered=registered,
@@ -122,7 +122,8 @@ def _targets(folder: Path, state: State) -> TargetFit:
     return replace(found, heldout=heldout)
 
 
-def _fused(path: Path) -> FusedCloud:
+def fused_cloud(path: Path) -> FusedCloud:
+    """stitched.ply read again; reference frame, length_unit."""
     require_room(path)
     vertex = PlyData.read(str(path))["vertex"]
     columns: Array = np.column_stack([vertex[name] for name in ("x", "y", "z", "nx", "ny", "nz", "residual")])
