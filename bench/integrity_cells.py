@@ -1,0 +1,132 @@
+"""Cells in memory with and without one mistake, and what linkage, data snooping and the deep check say of them."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from integrity_faults import Fault, displaced, faults, in_base_frame
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import simulated, with_part
+from data_synth.scene import load_scene
+from data_synth.simulate import Measured
+from stitch.errors import StitchError
+from stitch.integrity.arm_limits import judged_by_size
+from stitch.integrity.deep_check import deep_check
+from stitch.integrity.reliability import blunder_sizes, normal_blocks
+from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.usual_effects import usual_twists
+from stitch.measurement.capture import Capture, capture
+from stitch.measurement.measurement import measurement_of
+from stitch.measurement.session import Session
+from stitch.model.model import Model
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.stages.correct import close_in
+
+PARTS: dict[str, dict[str, Any]] = {
+    "blade": {},
+    "curved_drill_plate": {"length": 150.0, "width": 120.0, "pitch": 36.0, "radius": 150.0},
+    "sphere_plate": {},
+}
+MOUNTS = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
+VIEWS, RAYS = 14, 120
+# Effects that a model may lack while a session is good: they must not cost it a view.
+_HIDDEN: tuple[dict[str, float], ...] = (
+    {},
+    {},
+    {"joint_compliance": 2.0},
+    {"scanner_thermal_scale": 0.5},
+    {"joint_offset": 2.0},
+    {"backlash": 3.0},
+    {"link_geometry": 2.0, "gear_eccentricity": 2.0},
+)
+_START_GATE = 6.0  # mm: the hand-eye starts near its end
+
+
+def measured(part: str, mount: str, seed: int, hidden: dict[str, float] | None = None) -> Measured:
+    """One cell."""
+    scene = load_scene(MOUNTS[mount])
+    scene = replace(scene, scanner=replace(scene.scanner, columns=RAYS, rows=RAYS))
+    if part != "blade":
+        scene = with_part(scene, part, **PARTS[part])
+    return simulated(scene, hidden or {}, seed, VIEWS)
+
+
+def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray, Snooping]:
+    """What a run would see: hand-eye corrected, views freed, tests."""
+    own = capture(session)
+    T_mount, overlaps, _ = close_in([own], T_mount, [_START_GATE])
+    freed = free_poses(own, own.poses(T_mount), overlaps[0].gate)
+    usual = partial(usual_twists, measurement_of(session, own), Model(T_mount))
+    return own, T_mount, judged_by_size(session, snoop(own, T_mount, overlaps[0].gate, freed, usual))
+
+
+def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
+    """A session without a mistake: what is left out wrongly."""
+    hidden = _HIDDEN[seed % len(_HIDDEN)]
+    m = measured(part, mount, seed, hidden)
+    start = time.perf_counter()
+    _, _, found = snooped(session_of(m), m.T_mount)
+    block = None if found.block is None else found.block.start
+    yield {
+        "case": f"good {'+'.join(hidden)}", "left_out": list(found.left_out), "block": block,
+        "suspected": [m.view for m in found.suspected],
+        "groups": len(found.disconnected), "seconds": time.perf_counter() - start,
+    }  # fmt: skip
+
+
+def sizes(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
+    """One view off by a multiple of its minimal detectable and identifiable blunder, in a random direction."""
+    m = measured(part, mount, seed)
+    session, rng = session_of(m), np.random.default_rng([seed, 7])
+    _, T_mount, clean = snooped(session, m.T_mount)
+    normal = normal_blocks(clean.model, clean.found)
+    v = int(rng.integers(VIEWS))
+    flange = rng.standard_normal(6) * [1, 1, 1, clean.model.lever, clean.model.lever, clean.model.lever]
+    # A right twist of the flange, as a left twist of the view about the centre: A·exp(ξ) or, inverted, exp(−ξ)·A⁻¹.
+    sign = -1.0 if mount == "eye_to_hand" else 1.0
+    detectable, identifiable = blunder_sizes(normal, v, (sign * clean.model.carried[v] @ flange)[None])
+    for times, unit, size in [(k, "detectable", detectable[0]) for k in (1, 2, 10)] + [
+        (2, "identifiable", identifiable[0])
+    ]:
+        if not np.isfinite(size):
+            yield {"case": f"{times} x {unit}", "skipped": "the others do not hold this direction"}
+            continue
+        _, _, found = snooped(displaced({v: times * size * flange})(session), T_mount)
+        named = (*found.left_out, *(m.view for m in found.suspected))
+        yield {"case": f"{times} x {unit}", "detected": bool(named), "named": named == (v,),
+               "left_out": found.left_out == (v,),
+               "size_mm": float(times * size * np.linalg.norm(flange[3:]))}  # fmt: skip
+
+
+def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, int]) -> Iterator[dict[str, Any]]:
+    """The mistakes of the table in one session; with share (k, n) every n-th of them, from k on."""
+    m = measured(part, mount, seed)
+    session = session_of(m)
+    own = capture(session)
+    table = {"nothing": Fault(lambda s: s, ())}
+    table |= faults(VIEWS, np.random.default_rng([seed, 8])) | {
+        "clouds in base frame": in_base_frame(own.poses(m.T_mount))
+    }
+    for number, (case, fault) in enumerate(table.items()):
+        if case not in done and (number + share[0]) % share[1] == 0:
+            yield {"case": case} | judged(fault.apply(session), fault)
+
+
+def judged(session: Session, fault: Fault) -> dict[str, Any]:
+    """What the deep check says of a session with a mistake."""
+    start = time.perf_counter()
+    try:
+        found = [(p.kind, list(p.views), p.fix) for p in deep_check(session)]
+    except StitchError as error:
+        found = [("refused", [], str(error))]
+    culprits = {session.views[v].name for v in fault.views}
+    named = any(kind in fault.kinds and (not culprits or culprits & set(views)) for kind, views, _ in found)
+    touched = set().union(*(set(views) for _, views, _ in found)) if found else set()
+    return {
+        "said": found, "silent": not found, "named": named, "culprit": culprits <= touched,
+        "seconds": time.perf_counter() - start,
+    }  # fmt: skip
