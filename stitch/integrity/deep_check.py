@@ -103,11 +103,12 @@ def examined(session: Session, capture: Capture, start: tuple[Array, float]) -> 
 def _undone(session: Session, capture: Capture, found: Sequence[Explained]) -> Problem | None:
     """The mistake without which the surfaces fall together and nothing contradicts any more; None if there is none."""
     fallen = surface_verdict(capture, found)
-    if not fallen or fallen[0].hypothesis.used is not None:
+    if not fallen:
         return None
     best = fallen[0].hypothesis
-    views = zip(session.views, best.T_base_flange, strict=True)
-    right = replace(session, mount=best.mount, views=tuple(replace(v, T_base_flange=T, joints=None) for v, T in views))
+    used = range(len(session.views)) if best.used is None else best.used
+    views = tuple(replace(session.views[v], T_base_flange=best.T_base_flange[v], joints=None) for v in used)
+    right = replace(session, mount=best.mount, views=views)
     try:
         _, snooped = examined(right, thinned(right, _POINTS)[1], (fallen[0].T_mount, _GATE * part_size([capture])))
     except NoResultError:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.blunders import Block, Found, find_blunders
+from stitch.integrity.blunders import Block, Found, find_blunders, off_anyway
 from stitch.integrity.linkage import Linkage, linkage
 from stitch.integrity.placing import judge, place, surface_of
 from stitch.integrity.unlinked_views import needed_closure, placed_views
@@ -110,14 +110,16 @@ def snoop(
             poses[v] = placement.T
         freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
     model = view_model(capture, T_mount, freed)
-    found = find_blunders(model, homeless)
+    off = off_anyway(model, homeless, list(placed))
+    alone = [*homeless, *(b.view for b in off)]
+    found = find_blunders(model, alone)
     standing_out = [
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
-        for b in sorted(found.blunders, key=lambda b: b.view)
+        for b in sorted((*off, *found.blunders), key=lambda b: b.view)
     ]
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
-        again = find_blunders(model.with_usual(usual(freed)), homeless)
+        again = find_blunders(model.with_usual(usual(freed)), alone)
         sure &= {b.view for b in again.blunders} | set(linked.unlinked)
     groups = linkage(freed.overlaps).components
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]

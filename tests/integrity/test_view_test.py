@@ -92,6 +92,25 @@ def test_good_views_stay_and_several_blunders_do_not_hide_each_other():
     assert np.sqrt(found.fit.variances[1]) < 1.5 * SIGMA
 
 
+def test_one_of_six_views_does_not_hide_in_a_scatter_that_it_inflates():
+    """Rotations scatter little, and one view is off by ten times that of the translations."""
+    quiet = np.tile([1e-3, 1e-3, 1e-3, 1, 1, 1], 6)
+    for seed in range(10):
+        model = direct(seed, views=6)
+        z = model.z * quiet + model.views[2] @ np.array([0, 0, 0, 10 * SIGMA, 0, 0])
+        assert [b.view for b in find_blunders(replace(model, z=z)).blunders] == [2]
+
+
+@pytest.mark.slow
+def test_few_views_without_blunders_are_left_alone():
+    """1 % is stated: what 999 of 1,000 repetitions stay below."""
+    quiet, alarms = np.tile([1e-3, 1e-3, 1e-3, 1, 1, 1], 6), 0
+    for seed in range(200):
+        model = direct(1000 + seed, views=6)
+        alarms += bool(find_blunders(replace(model, z=model.z * (quiet if seed % 2 else 1))).blunders)
+    assert alarms <= stats.binom.isf(1e-3, 200, 0.01)
+
+
 @pytest.mark.parametrize("start", [4, 10, 17])
 def test_a_common_step_is_one_block_and_a_drift_is_none(start):
     model = direct(5)
