@@ -16,6 +16,7 @@ from stitch.cli.streams import results_alone
 GROUP = "stitch.commands"
 _OWN = {
     "init": "stitch.cli.init:init",
+    "detect": "stitch.cli.detect:detect",
     "run": "stitch.cli.run:run",
     "check": "stitch.cli.check:check",
     "compare": "stitch.cli.compare:compare_run",

@@ -11,6 +11,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
 from stitch.reading.clouds import CLOUD_SUFFIXES
+from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
 _EITHER = (".txt", ".csv", ".asc")
@@ -91,7 +92,9 @@ def _clouds(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 def _is_cloud(file: Path) -> bool:
     if file.suffix.lower() == ".npy":
-        return _is_cloud_array(file)
+        return _is_cloud_array(file) or is_depth_image(file)
+    if file.suffix.lower() in DEPTH_SUFFIXES:
+        return is_depth_image(file)
     if file.suffix.lower() not in _EITHER:
         return True
     with file.open("rb") as stream:

@@ -13,8 +13,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
-from stitch.intake.yaml_subset import parse_yaml
 from stitch.reading.text_file import read_text, require_file, shortened
+from stitch.reading.yaml_subset import parse_yaml
 
 STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses")

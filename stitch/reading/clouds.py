@@ -10,15 +10,16 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.reading.csv_number import is_number
+from stitch.reading.depth_image import DEPTH_SUFFIXES, read_depth_columns
 from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, read_mesh, read_ptx
-from stitch.reading.organised import is_organised, measured
+from stitch.reading.organised import grid_shape, measured
 from stitch.reading.pcd import read_pcd
 from stitch.reading.text_file import require_file, shortened
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")
 # Kinds that are read, by the ending of the file's name.
-CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz")
+CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz", *DEPTH_SUFFIXES)
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
@@ -30,16 +31,17 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     if not path.exists():
         raise InputError(f"{path}: no such cloud file; correct the column cloud of views.csv")
     require_file(path, "name a file in the column cloud of views.csv")
-    readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": _read_ply, ".pcd": read_pcd}
+    readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": read_ply, ".pcd": read_pcd}
     readers |= dict.fromkeys(_TEXT, _read_text) | dict.fromkeys(MESHES, read_mesh)
     readers |= {".npy": read_array, ".ptx": read_ptx, ".e57": read_e57, ".las": read_las, ".laz": read_las}
+    readers |= dict.fromkeys(DEPTH_SUFFIXES, read_depth_columns)
     kind = path.suffix.lower()
     reader = readers.get(kind)
     if reader is None:
         raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use PLY, PCD, XYZ or CSV")
     try:
         columns = reader(path)
-        if kind in (".ply", ".pcd") and is_organised(path):
+        if kind in (".ply", ".pcd") and grid_shape(path):
             columns = measured(columns)
     except InputError:
         raise
@@ -74,7 +76,8 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
     return Cloud(points[seen] * scale, normals, scalars)
 
 
-def _read_ply(path: Path) -> dict[str, Array]:
+def read_ply(path: Path) -> dict[str, Array]:
+    """Columns of the vertices of a PLY, as stored."""
     from plyfile import PlyData
 
     require_room(path)

@@ -4,14 +4,14 @@ A mesh counts by its vertices, with the normals of its faces. Of a file with sev
 stay in the scanner's own frame.
 """
 
-import importlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.depth_image import is_depth_image, read_depth_columns
+from stitch.reading.extras import package
 from stitch.reading.organised import measured
 
 MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
@@ -39,7 +39,9 @@ def read_mesh(path: Path) -> dict[str, Array]:
 
 
 def read_array(path: Path) -> dict[str, Array]:
-    """NumPy's .npy: (N, 3) or more columns, or an image (H, W, 3) whose empty pixels are NaN."""
+    """NumPy's .npy: (N, 3) or more columns, an image (H, W, 3) whose empty pixels are NaN, or a depth image (H, W)."""
+    if is_depth_image(path):
+        return read_depth_columns(path)
     array = np.load(path, allow_pickle=False)
     if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or array.shape[-1] < 3:
         raise InputError(f"{path}: an array {array.shape} is no cloud; save (N, 3) or (H, W, 3) numbers")
@@ -62,29 +64,15 @@ def read_ptx(path: Path) -> dict[str, Array]:
 
 def read_las(path: Path) -> dict[str, Array]:
     """LAS and LAZ, by laspy."""
-    las = _package("laspy", path).read(path)
+    las = package("laspy", path, "formats").read(path)
     xyz = np.asarray(las.xyz, float)
     return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
 
 
 def read_e57(path: Path) -> dict[str, Array]:
     """The first scan of an E57 in its own frame, by pye57."""
-    scan = _package("pye57", path).E57(str(path)).read_scan(0, ignore_missing_fields=True, transform=False)
+    scan = package("pye57", path, "formats").E57(str(path)).read_scan(0, ignore_missing_fields=True, transform=False)
     columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
     if "intensity" in scan:
         columns["intensity"] = np.asarray(scan["intensity"], float)
     return measured(columns)
-
-
-def _package(name: str, path: Path) -> Any:
-    """A package that only these files need.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise InputError(
-            f"{path}: needs the package {name}; to fix: pip install 'stitch[formats]', or export the scan as PLY"
-        ) from None

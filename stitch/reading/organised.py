@@ -10,16 +10,17 @@ from stitch.frames import Array
 _HEADER_BYTES = 65536
 
 
-def is_organised(path: Path) -> bool:
-    """True for a PCD with rows of pixels, and for a PLY that says num_rows (as range scanners write it)."""
+def grid_shape(path: Path) -> tuple[int, int] | None:
+    """Rows and columns of pixels of a PCD, and of a PLY that says num_rows (as range scanners write it); else None."""
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
+    size: dict[bytes, int] = {}
     for line in head.split(b"DATA" if path.suffix.lower() == ".pcd" else b"end_header", 1)[0].splitlines():
         words = line.split()
-        grid = words[:1] == [b"HEIGHT"] or words[:2] == [b"obj_info", b"num_rows"]
-        if grid and words[-1].isdigit() and int(words[-1]) > 1:
-            return True
-    return False
+        if len(words) > 1 and words[-1].isdigit() and (words[0] in (b"WIDTH", b"HEIGHT") or words[0] == b"obj_info"):
+            size[words[-2]] = int(words[-1])
+    rows = size.get(b"HEIGHT", size.get(b"num_rows", 0))
+    return (rows, size.get(b"WIDTH", size.get(b"num_cols", 0))) if rows > 1 else None
 
 
 def measured(columns: dict[str, Array]) -> dict[str, Array]:

@@ -100,13 +100,13 @@ def _write(folder: Path, session: SessionFiles) -> None:
     for name, cloud in session.clouds.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_ply(folder / name, cloud)
-    _write_table(folder / "views.csv", session.views)
+    write_table(folder / "views.csv", session.views)
     for name, table in (("points.csv", session.points), ("frames.csv", session.frames)):
         if table is not None:
-            _write_table(folder / name, table)
+            write_table(folder / name, table)
     if session.targets:
         xyz = np.array(list(session.targets.values()))
-        _write_table(folder / "targets.csv", {"target": list(session.targets), **dict(zip("xyz", xyz.T, strict=True))})
+        write_table(folder / "targets.csv", {"target": list(session.targets), **dict(zip("xyz", xyz.T, strict=True))})
 
 
 def write_ply(path: Path, cloud: Cloud) -> None:
@@ -120,7 +120,8 @@ def write_ply(path: Path, cloud: Cloud) -> None:
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
 
 
-def _write_table(file: Path, columns: Columns) -> None:
+def write_table(file: Path, columns: Columns) -> None:
+    """Write one table of a session."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)

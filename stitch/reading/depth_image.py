@@ -1,0 +1,112 @@
+"""Depth images (PNG, TIFF, EXR, NPY) with intrinsics as points: distance along the axis, 0 where nothing was seen.
+
+Points keep the file's unit: millimetres where whole numbers are stored, as sensors do, metres in floating point; or
+metres where the intrinsics state `depth_scale`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.reading.extras import package
+from stitch.reading.intrinsics import Intrinsics, intrinsics_beside
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
+# A table of points has fewer columns, an image more.
+_FEWEST_COLUMNS = 17
+# Modes of Pillow with one number a pixel and more than 8 bits.
+_DEEP = ("I;16", "I;16B", "I;16L", "I", "F")
+_CHANNELS = ("Z", "Y", "depth", "Depth", "R", "RGB")
+
+
+def is_depth_image(path: Path) -> bool:
+    """True if the file's head says one number a pixel, of more than 8 bits; colours are none."""
+    from PIL import Image, UnidentifiedImageError
+
+    kind = path.suffix.lower()
+    if kind == ".exr":
+        return True
+    if kind == ".npy":
+        return _is_depth_array(path)
+    try:
+        with Image.open(path) as image:
+            return image.mode in _DEEP
+    except (UnidentifiedImageError, OSError):
+        return False
+
+
+def _is_depth_array(path: Path) -> bool:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError):
+        return False
+    return array.ndim == 2 and array.shape[1] >= _FEWEST_COLUMNS and array.shape[0] > 1 and array.dtype.kind in "fiu"
+
+
+def read_depth(path: Path) -> Array:
+    """(H, W, 3) points, NaN where nothing was measured.
+
+    Raises:
+        InputError: no depth image, no intrinsics, or those of another size of image.
+    """
+    depth = _pixels(path)
+    camera = intrinsics_beside(path)
+    height, width = depth.shape
+    if camera.size is not None and camera.size != (width, height):
+        raise InputError(
+            f"{path}: {width}×{height} pixels, {camera.source.name} is of {camera.size[0]}×{camera.size[1]}; to fix: "
+            "put the intrinsics of this image there"
+        )
+    if not (0 <= camera.cx <= width and 0 <= camera.cy <= height):
+        raise InputError(
+            f"{camera.source}: the axis meets the image at ({camera.cx:g}, {camera.cy:g}), outside its "
+            f"{width}×{height} pixels; to fix: put the intrinsics of this image there"
+        )
+    z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+    if camera.units_per_metre is not None:
+        z = z / camera.units_per_metre
+    return np.asarray(np.dstack([_rays(camera, width, height), np.ones(depth.shape)]) * z[..., None])
+
+
+def read_depth_columns(path: Path) -> dict[str, Array]:
+    """x, y, z of all pixels that measured something."""
+    points = read_depth(path).reshape(-1, 3)
+    return dict(zip("xyz", points[np.isfinite(points[:, 2])].T, strict=True))
+
+
+def _pixels(path: Path) -> Array:
+    """(H, W) as stored."""
+    from PIL import Image
+
+    if path.suffix.lower() == ".npy":
+        return np.asarray(np.load(path, allow_pickle=False), float)
+    if path.suffix.lower() == ".exr":
+        return _exr(path)
+    with Image.open(path) as image:
+        if image.mode not in _DEEP:
+            raise InputError(
+                f"{path}: pixels of mode {image.mode} are a picture, no depth; to fix: store depth with 16 bits or as "
+                "floating point"
+            )
+        return np.asarray(image, float)
+
+
+def _exr(path: Path) -> Array:
+    with package("OpenEXR", path, "formats").File(str(path)) as file:
+        channels = {name: np.asarray(channel.pixels, float) for name, channel in file.channels().items()}
+    name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
+    return channels[name] if channels[name].ndim == 2 else np.asarray(channels[name][..., 0])
+
+
+def _rays(camera: Intrinsics, width: int, height: int) -> Array:
+    """(H, W, 2) x/z and y/z of every pixel."""
+    u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    if not len(camera.distortion):
+        return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=2)
+    cv2 = package("cv2", camera.source, "vision")
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    pixels = np.stack([u, v], axis=2).reshape(-1, 1, 2)
+    rays: Array = cv2.undistortPoints(pixels, K, camera.distortion)
+    return rays.reshape(height, width, 2)

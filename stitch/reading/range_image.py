@@ -1,0 +1,143 @@
+"""Scans as images: organised clouds with brightness or colour, and depth images with the colour image beside them."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.measurement.range_image import RangeImage
+from stitch.reading.clouds import read_ply
+from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_depth
+from stitch.reading.organised import grid_shape
+from stitch.reading.pcd import read_pcd
+from stitch.reading.text_file import shortened
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_COLOUR = re.compile(r"colou?r|rgb|image|gr[ae]y|intensity|texture|left|2d", re.IGNORECASE)
+_RGB = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_GREY = ("intensity", "grey", "gray", "brightness", "reflectance")
+# Share of pixels that may be brighter than the white of an intensity in counts.
+_SATURATED = 0.5
+
+
+def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
+    """A scan as an image; None where its file holds no pixels, or no brightness lies in it or beside it.
+
+    Args:
+        scale: turns the file's unit into the session's.
+
+    Raises:
+        InputError: a file that cannot be read, or a picture of another size than its scan.
+    """
+    try:
+        points, grey = _read(path)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a library raises at bytes that are no scan
+        reason = shortened(" ".join(str(error).split()) or type(error).__name__)
+        raise InputError(f"{path}: cannot be read ({reason}); export it again") from None
+    if points is None:
+        return None
+    if grey is None:
+        beside = picture_beside(path)
+        if beside is None:
+            return None
+        grey = _picture(beside)
+        if grey.shape != points.shape[:2]:
+            sizes = [f"{shape[1]}×{shape[0]}" for shape in (grey.shape, points.shape)]
+            raise InputError(
+                f"{beside}: {sizes[0]} pixels, its scan {path.name} has {sizes[1]}; to fix: export the picture aligned "
+                "to the depth"
+            )
+    seen = np.isfinite(points).all(axis=2) & points.any(axis=2)
+    points = np.where(np.expand_dims(seen, 2), points, np.nan)
+    return RangeImage(points * scale, grey)
+
+
+def _read(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
+    kind = path.suffix.lower()
+    if kind in DEPTH_SUFFIXES or (kind == ".npy" and is_depth_image(path)):
+        return read_depth(path), None
+    if kind == ".npy":
+        return _of_array(path)
+    shape = grid_shape(path) if kind in (".ply", ".pcd") else None
+    if shape is None:
+        return None, None
+    columns = read_pcd(path) if kind == ".pcd" else _full_grid(path, read_ply(path), shape)
+    if len(columns["x"]) != shape[0] * shape[1]:
+        return None, None
+    points = np.stack([np.asarray(columns[axis], float) for axis in "xyz"], axis=1).reshape(*shape, 3)
+    grey = _of_columns(columns)
+    return points, None if grey is None else grey.reshape(shape)
+
+
+def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) -> dict[str, Array]:
+    """The vertices on their grid, where the file lists the measured ones and says which pixel has which."""
+    from plyfile import PlyData
+
+    if len(columns["x"]) == shape[0] * shape[1]:
+        return columns
+    data = PlyData.read(str(path))
+    if "range_grid" not in data:
+        return columns
+    pixels = data["range_grid"].data["vertex_indices"]
+    index = np.array([pixel[0] if len(pixel) else -1 for pixel in pixels])
+    return {
+        name: np.where(index >= 0, np.asarray(column, float)[index], np.nan if name in "xyz" else 0.0)
+        for name, column in columns.items()
+    }
+
+
+def _of_array(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
+    """(H, W, 3) without brightness, (H, W, 4) with it, (H, W, 6) with red, green and blue."""
+    array = np.load(path, allow_pickle=False)
+    if array.ndim != 3 or array.shape[2] < 3:
+        return None, None
+    rest = np.moveaxis(np.asarray(array[..., 3:], float), 2, 0)
+    return np.asarray(array[..., :3], float), None if not len(rest) else _grey(rest[:3] if len(rest) >= 3 else rest[:1])
+
+
+def _of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | None:
+    for names in _RGB:
+        if all(name in columns for name in names):
+            return _grey(np.array([columns[name] for name in names], float))
+    for name in ("rgb", "rgba"):
+        if name in columns:
+            # PCL packs red, green and blue into the bytes of one number.
+            bits = np.ascontiguousarray(columns[name])
+            packed = bits.view(np.uint32) if bits.dtype == np.float32 else bits.astype(np.uint32)
+            return _grey(np.array([(packed >> shift) & 255 for shift in (16, 8, 0)], float))
+    named = next((columns[name] for name in _GREY if name in columns), None)
+    return None if named is None else _grey(np.asarray(named, float)[None])
+
+
+def _grey(channels: Array) -> NDArray[np.uint8]:
+    """Brightness of one channel or of three (c, …); counts beyond 8 bits are scaled to their brightest."""
+    values = np.nan_to_num(channels.mean(axis=0))
+    top = float(np.percentile(values, 100 - _SATURATED)) if values.size else 0.0
+    white = 255.0 if 1.0 < top <= 255.0 else max(top, 1e-12)
+    return np.asarray(np.clip(values * (255.0 / white), 0, 255), np.uint8)
+
+
+def picture_beside(scan: Path) -> Path | None:
+    """The colour or grey image of a scan: named like it with another ending, or by colour and the same number."""
+    numbers = re.findall(r"\d+", scan.stem)
+    folders = [scan.parent, *(f for f in sorted(scan.parent.parent.iterdir()) if f.is_dir() and _COLOUR.search(f.name))]
+    for folder in folders:
+        for file in sorted(folder.iterdir()):
+            if file == scan or file.suffix.lower() not in _PICTURES or is_depth_image(file):
+                continue
+            told = _COLOUR.search(file.stem) or folder != scan.parent
+            if file.stem == scan.stem or (told and numbers and re.findall(r"\d+", file.stem)[-1:] == numbers[-1:]):
+                return file
+    return None
+
+
+def _picture(file: Path) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(file) as image:
+        return np.asarray(image.convert("L"))
