@@ -1,6 +1,7 @@
 """Real scans: five objects, nine views each, no hand-eye given (metres in the clouds, mm in the poses)."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -109,3 +110,15 @@ def test_diagnosis_of_a_real_object_says_that_poses_dominate_and_joints_are_not_
     assert "repeat" in found.sentence
     assert "joint effects" in found.sentence
     assert "joint_compliance" in found.missing
+
+
+def test_the_centre_of_a_sphere_says_nothing_of_how_its_surface_turns(runs, reghec, tmp_path):
+    """The sphere with its own centre as a labelled point: no view is taken for turned, and the hand-eye stays."""
+    folder = shutil.copytree(reghec("sphere"), tmp_path / "sphere")
+    with pytest.raises(SystemExit) as ended:
+        main(["detect", str(folder), "--ball", "any"])
+    assert not ended.value.code
+    with_centre = run(load_session(folder))
+    assert not with_centre.left_out
+    apart = frames.log(frames.inverse(runs["sphere"].model.T_mount) @ with_centre.model.T_mount)
+    assert np.all(np.abs(apart) < 3 * np.sqrt(np.diag(runs["sphere"].model.covariance)))

@@ -17,6 +17,8 @@ from stitch.measurement.session import Session
 _CLEAR = 1.3
 # Fewer views do not show the radius beside the rest.
 _VIEWS_FOR_RADIUS = 6
+# A radius that is off by more, and by more sigmas, is another one; scanners and coatings are off by less.
+_OTHER_RADIUS, _SURE = 0.02, 4.0
 # Column of views.csv: the side of the laser plane, along the arc's normal, on which the centre lies.
 SIDE = "sphere_side"
 
@@ -51,6 +53,8 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
     T = np.array([view.T_base_flange for view in session.views])
     G = T if session.mount == "eye_in_hand" else frames.inverse(T)
     views = tuple(_fitted(session, k, radius) for k in range(len(session.views)))
+    own = [v.measured[-1] for v in views if not v.is_line]
+    _require_radius(session, np.median(own) if own else radius, float(np.std(own)) if own else 0.0)
     require_motion(from_first(G))
     start, how = find_start(G, views, session.scanner.T_mount)
     if start.runner_up < _CLEAR * start.rms:
@@ -61,6 +65,8 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
     fit = fit_sphere(G, views, start.T_mount, radius, radius_free)
     enough = len(views) >= _VIEWS_FOR_RADIUS
     free = fit if radius_free else (fit_sphere(G, views, start.T_mount, radius, True) if enough else None)
+    if free is not None and not radius_free:
+        _require_radius(session, free.radius, float(np.sqrt(free.covariance[9, 9])))
     return SphereCalibration(
         fit=fit,
         free=free,
@@ -74,6 +80,20 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
         runner_up=start.runner_up / max(start.rms, 1e-12),
         nominal=radius,
     )
+
+
+def _require_radius(session: Session, found: float, sigma: float) -> None:
+    """Refuse a radius that the scans contradict: a hand-eye from it would be off by many times the difference.
+
+    Raises:
+        InputError: names the radius found.
+    """
+    stated = session.sphere_radius or found
+    if abs(found - stated) > max(_OTHER_RADIUS * stated, _SURE * sigma):
+        raise InputError(
+            f"{session.path / 'session.toml'}: sphere.radius is {stated:.4g}, the scans show {found:.4g} ± {sigma:.2g} "
+            f"{session.length_unit}; to fix: correct it, or cloud_unit"
+        )
 
 
 def _fitted(session: Session, k: int, radius: float) -> SphereView:

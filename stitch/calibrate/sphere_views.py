@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.calibrate.ball import fit_ball
+from stitch.detection.ball import fit_ball
 from stitch.errors import InputError
 from stitch.frames import Array
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.detection.ball_points import ball_sightings
 from stitch.detection.board import Board
 from stitch.detection.board_points import PlacedBoard, boards_in, judged
 from stitch.errors import InputError, NoResultError
@@ -36,25 +37,31 @@ class TargetsFound:
         return {name: names.count(name) for name in sorted(set(names))}
 
 
-def targets_in(session: Session, boards: Sequence[Board]) -> TargetsFound:
-    """Find boards in all views.
+def targets_in(session: Session, boards: Sequence[Board], balls: Sequence[float] | None = None) -> TargetsFound:
+    """Find boards and balls in all views.
+
+    Args:
+        balls: radii, mm; empty for balls of any radius, None for no balls.
 
     Raises:
-        InputError: no scan is an image, or a board is not what is stated.
+        InputError: no scan is an image, or a board or a ball is not what is stated.
         NoResultError: no view shows any.
     """
-    per_board, notes = [], list[str]()
+    parts, notes = [], list[str]()
     for board in boards:
         found, told = _of_board(session, board)
-        per_board.append(found)
+        if not any(sighting.targets for sighting in found):
+            raise NoResultError(
+                f"{session.path}: no view shows {board.stated}; to try: check the number of squares and the "
+                "dictionary, and that the picture is neither dark nor blurred"
+            )
+        parts.append(found)
         notes += told
-    views = [_together(parts) for parts in zip(*per_board, strict=True)]
-    if not any(sighting.targets for sighting in views):
-        what = ", ".join(board.stated for board in boards)
-        raise NoResultError(
-            f"{session.path}: no view shows {what}; to try: check the number of squares and the dictionary, and that "
-            "the picture is neither dark nor blurred"
-        )
+    if balls is not None:
+        found, told = _of_balls(session, balls)
+        parts.append(found)
+        notes += told
+    views = [_together(of_view) for of_view in zip(*parts, strict=True)]
     return TargetsFound(tuple(view.name for view in session.views), tuple(views), tuple(notes))
 
 
@@ -72,6 +79,17 @@ def _of_board(session: Session, board: Board) -> tuple[list[Sighting], list[str]
             "organised clouds with colour or intensity, or depth images with the picture beside them"
         )
     return judged(seen, own, to_mm)
+
+
+def _of_balls(session: Session, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:
+    to_mm = METRES[session.length_unit] / _MM
+    clouds = [None if view.cloud is None else view.cloud.points for view in session.views]
+    rotations = [view.T_base_flange[:3, :3] for view in session.views]
+    found, told = ball_sightings(clouds, rotations, [radius / to_mm for radius in radii], to_mm)
+    if not any(sighting.targets for sighting in found):
+        why = told[0] if told else "no view shows a ball of which a cap is covered"
+        raise NoResultError(f"{session.path}: {why}; to try: scan closer, or from where more of the balls is seen")
+    return found, told
 
 
 def scan_files(session: Session) -> list[Path | None]:

@@ -51,6 +51,9 @@ def admitted_fit(
         short = next((s for s in own if len(s.views) < 2), None)
         if short is not None:
             raise NoResultError(f"{short.path}: fewer than two views are left that belong together: {taken[0].line()}")
+    else:
+        # The last round has left views out too: what is returned is the fit of those that are left.
+        fitted = fit(own, measured)
     return Admitted(own, measured, fitted, taken)
 
 

@@ -161,6 +161,15 @@ def test_a_free_radius_reveals_a_wrong_one(tmp_path):
     assert any("is not what the session says" in note for note in document_of(result, session)["notes"])
 
 
+@pytest.mark.parametrize(
+    ("kind", "radius"), [("area", 33.0), ("area", 45.0), pytest.param("line", 45.0, marks=pytest.mark.slow)]
+)
+def test_a_wrong_radius_is_refused_with_the_one_found(tmp_path, kind, radius):
+    folder = write_spheres(sphere_cell(4, kind, turns=0.7), tmp_path / "s", radius=radius)
+    with pytest.raises(InputError, match=r"show (30|29\.9\d*) ±|the best has 30"):
+        calibrate_sphere(load_session(folder))
+
+
 def test_refusals_name_the_reason(tmp_path):
     cell = sphere_cell(2, "line")
     with pytest.raises(InputError, match="larger than the sphere's"):

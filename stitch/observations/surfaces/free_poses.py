@@ -22,9 +22,9 @@ _CONVERGED = 1e-2
 # Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
 # little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
 # sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
-# see at all is real, and known by its sigma.
+# see is known by their sigma, as long as the lever is not noise itself: a three-hundredth of the part's.
 _NEAR_NULL = 1e-3
-_NULL = 1e-12
+_NULL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,23 @@ def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
     scale = np.tile([1 / max(g.lever, 1e-300)] * 3 + [1.0] * 3, g.views)
     values, vectors = _strong(_scaled(g, ~g.labelled, scale), _NEAR_NULL)
     if g.labelled.any():
-        values, vectors = _strong((vectors * values) @ vectors.T + _scaled(g, g.labelled, scale), _NULL)
+        targets = _scaled(g, g.labelled, scale)
+        basis = np.hstack([vectors, _seen_by_targets(targets, vectors)])
+        values, within = np.linalg.eigh(basis.T @ ((vectors * values) @ vectors.T + targets) @ basis)
+        vectors = basis @ within
     return values, vectors, scale
+
+
+def _seen_by_targets(H: Array, vectors: Array) -> Array:
+    """(6V, k) orthonormal: what targets see of the directions in which surfaces, `vectors` (6V, n), see nothing.
+
+    A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
+    """
+    unseen = np.linalg.svd(vectors, full_matrices=True)[0][:, vectors.shape[1] :]
+    if not unseen.shape[1]:
+        return unseen
+    values, within = np.linalg.eigh(unseen.T @ H @ unseen)
+    return np.asarray(unseen @ within[:, values > _NULL * np.linalg.eigvalsh(H)[-1]])
 
 
 def visible_step(g: Gram) -> Array:

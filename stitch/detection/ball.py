@@ -38,23 +38,33 @@ def fit_ball(points: Array, size: float, known: bool = False) -> Ball:
     Args:
         size: about the radius; with `known` exactly, and only the centre is sought.
     """
+    centre, found = _ransac(points[:: max(1, len(points) // _POINTS)], size)
+    return refine_ball(points, centre, found, size if known else None)
+
+
+def refine_ball(points: Array, centre: Array, radius: float, known: float | None = None) -> Ball:
+    """Robust fit to points (N, k) from a first centre (k,) and radius; others may be among them.
+
+    Args:
+        known: the radius, where only the centre is sought.
+    """
     thin = points[:: max(1, len(points) // _POINTS)]
-    centre, found = _ransac(thin, size)
-    radius = size if known else None
-    x = centre if known else np.append(centre, found)
-    inside, scale = _distances(np.append(centre, found), thin, None), 0.02 * size
+    x = centre if known is not None else np.append(centre, radius)
+    inside, scale = _distances(np.append(centre, radius), thin, None), 0.02 * (known or radius)
     gate = scale
     for _ in range(4):
         kept = thin[np.abs(inside) < gate]
-        x = least_squares(_distances, x, args=(kept, radius), loss="soft_l1", f_scale=scale, x_scale="jac").x
-        scale = max(1.4826 * float(np.median(np.abs(_distances(x, kept, radius)))), 1e-9 * scale)
-        inside, gate = _distances(x, thin, radius), _GATE * scale
-    off = _distances(x, points, radius)
+        if len(kept) <= len(x):
+            break
+        x = least_squares(_distances, x, args=(kept, known), loss="soft_l1", f_scale=scale, x_scale="jac").x
+        scale = max(1.4826 * float(np.median(np.abs(_distances(x, kept, known)))), 1e-9 * scale)
+        inside, gate = _distances(x, thin, known), _GATE * scale
+    off = _distances(x, points, known)
     k, keep, sigma = points.shape[1], np.abs(off) < gate, scale
     outward = points[keep] - x[:k]
     rows = np.column_stack([outward / np.linalg.norm(outward, axis=1, keepdims=True), np.ones(len(outward))])
     covariance = sigma**2 * np.linalg.pinv(rows.T @ rows)
-    return Ball(x[:k], float(radius or x[k]), sigma, keep, covariance)
+    return Ball(x[:k], float(x[k] if known is None else known), sigma, keep, covariance)
 
 
 def _distances(x: Array, points: Array, radius: float | None) -> Array:
