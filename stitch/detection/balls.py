@@ -2,8 +2,8 @@
 
 Two points of a sphere with their normals give its centre and radius; pairs of one sphere agree, pairs of anything else
 do not (Schnabel, Wahl & Klein 2007 draw them at random; here all neighbourhoods vote). The scan is thinned again and
-again by a factor of two, so that balls of every size are seen with as many points. What is fitted counts as a ball if it
-covers a cap in all directions and everything in that cap lies on it.
+again by a factor of two, so that balls of every size are seen with as many points. What is fitted counts as a ball if
+it covers a cap in all directions and everything in that cap lies on it.
 """
 
 from dataclasses import dataclass
