@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +11,8 @@ import typer
 
 from stitch.cli.streams import emit
 from stitch.errors import InputError
+from stitch.intake.bag_messages import is_bag
+from stitch.intake.bag_session import write_bag_session
 from stitch.intake.first_session import FirstSession, first_session
 from stitch.intake.guesses import Guess
 from stitch.intake.session_draft import require_free, write_draft
@@ -20,7 +23,10 @@ _ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP."),
+    ],
     poses: Annotated[Path | None, typer.Option("--poses", help="File or folder of the poses; default: found.")] = None,
     columns: Annotated[
         str | None, typer.Option("--columns", help="Names of the columns of numbers: rx,ry,rz,x,y,z; - leaves one out.")
@@ -35,13 +41,23 @@ def init(
     inverse: Annotated[
         bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
     ] = None,
+    topic: Annotated[str | None, typer.Option("--topic", help="Of a bag: the topic of the scans.")] = None,
+    named: Annotated[
+        str | None, typer.Option("--frames", metavar="BASE,FLANGE[,SCANNER]", help="Of a bag: frames of tf.")
+    ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER, or BAG-session."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")] = False,
 ) -> None:
     """Make a session of a folder of scans and poses; the scans tell which convention the poses are in."""
+    if is_bag(folder):
+        _of_bag(folder, output or folder.with_name(f"{folder.stem}-session"), topic, named, as_json)
+        return
+    if topic or named:
+        raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
     out = folder if output is None else output
     require_free(out)
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
@@ -49,18 +65,32 @@ def init(
         poses, names, rotation, angle_unit=angles, length_unit=unit, cloud_unit=cloud_unit, mount=mount, inverse=inverse
     )
     first = first_session(folder, stated)
-    _tell(first)
+    _tell(first.guesses)
     if not yes:
         first = _asked(folder, out, first, stated)
     write_draft(out, first)
+    _end(out, len(first.pairing.used), first.guesses, as_json)
+
+
+def _of_bag(bag: Path, out: Path, topic: str | None, named: str | None, as_json: bool) -> None:
+    """A session of a bag: what its messages do not say is not asked, flags state it."""
+    frames = tuple(name.strip() for name in named.split(",")) if named else ()
+    if named and len(frames) not in (2, 3):
+        raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
+    made = write_bag_session(bag, out, topic, frames)
+    _tell(made.guesses)
+    _end(out, made.views, made.guesses, as_json)
+
+
+def _end(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None:
     if as_json:
-        emit(json.dumps(_document(out, first), indent=1))
-    print(f"{out / 'session.toml'} and views.csv: {len(first.pairing.used)} views", file=sys.stderr)
+        emit(json.dumps(_document(out, views, guesses), indent=1))
+    print(f"{out / 'session.toml'} and views.csv: {views} views", file=sys.stderr)
     print(f"next: stitch run {out}", file=sys.stderr)
 
 
-def _tell(first: FirstSession) -> None:
-    for guess in first.guesses:
+def _tell(guesses: Sequence[Guess]) -> None:
+    for guess in guesses:
         print(f"{'' if guess.told else '? '}{guess.line}", file=sys.stderr)
 
 
@@ -83,7 +113,7 @@ def _asked(folder: Path, out: Path, first: FirstSession, stated: Stated) -> Firs
     if any(answers[guess.what] != _own(guess) for guess in untold if guess.what in answers):
         # What was kept counts as stated too: the person has seen it.
         first = first_session(folder, replace(stated, **answers))
-        _tell(first)
+        _tell(first.guesses)
     if not typer.confirm("Write the session?", default=True, err=True):
         raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
     return first
@@ -100,10 +130,10 @@ def _own(guess: Guess) -> str:
     return guess.value.split(",")[0]
 
 
-def _document(out: Path, first: FirstSession) -> dict[str, object]:
+def _document(out: Path, views: int, guesses: Sequence[Guess]) -> dict[str, object]:
     return {
         "session": str(out),
-        "views": len(first.pairing.used),
-        "told": all(guess.told for guess in first.guesses),
-        "guesses": [guess.as_dict() for guess in first.guesses],
+        "views": views,
+        "told": all(guess.told for guess in guesses),
+        "guesses": [guess.as_dict() for guess in guesses],
     }
