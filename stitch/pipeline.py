@@ -131,7 +131,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         begun = Coarse(state.T_mount_coarse, gate, "of the first run", ())
         before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
-        fitted = kind.refit([session], [measurement], model, [state.gate])
+        fitted = kind.refit([session], [measurement], model, [state.gate], recorder)
         end = End(
             begun=begun,
             fitted=fitted,

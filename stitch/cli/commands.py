@@ -23,6 +23,7 @@ _OWN = {
     "diagnose": "stitch.cli.diagnose:diagnose_run",
     "add": "stitch.cli.change:add",
     "drop": "stitch.cli.change:drop",
+    "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",

@@ -2,6 +2,7 @@
 
 import atexit
 from collections.abc import Sequence
+from math import isfinite
 
 from stitch.frames import Array
 from stitch.measurement.session import Session
@@ -31,9 +32,9 @@ class Progress:
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Show where the iteration stands."""
         if self.status:
-            self.status.update(
-                f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms, partners within {gate * self.to_um:.4g} µm"
-            )
+            # Labelled points have their partners by name.
+            within = f", partners within {gate * self.to_um:.4g} µm" if isfinite(gate) else ""
+            self.status.update(f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms{within}")
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
         """A stage has ended."""

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from stitch.cli.options import EffectsFile, Force, Json, Tolerance, Trust, require_tolerance
 from stitch.cli.progress import Progress, Tee
+from stitch.cli.progress_lines import ProgressLines, wanted
 from stitch.cli.streams import emit
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import plain_verdict
@@ -104,8 +105,9 @@ def _folders(scratch: Path, names: list[str]) -> list[Path]:
 
 
 def recorder_for(folder: Path, recording: bool) -> Recorder:
-    """Progress on a terminal, and the recording."""
-    return Tee([Progress(), *(recordings(folder) if recording else [])])
+    """Progress on a terminal or as lines, and the recording."""
+    lines: list[Recorder] = [ProgressLines()] if wanted() else []
+    return Tee([Progress(), *lines, *(recordings(folder) if recording else [])])
 
 
 def recordings(folder: Path) -> list[Recorder]:

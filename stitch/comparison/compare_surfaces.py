@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, edges_of, view_properties
+from stitch.comparison.tables import Comparison, Table, edges_of, values_of_views, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.gram import RMS_GATE
@@ -38,7 +38,13 @@ def compare(state: State) -> Comparison:
     tables = [_labelled(rows, "view", rows.view, names), _pairs(rows, names)]
     tables += [_binned(rows, name, unit, values) for name, unit, values in _properties(state, rows)]
     tables.append(_regions(rows))
-    return Comparison(tuple(t for t in tables if len(t.count)), overlaps.gram.rms, overlaps.gram.scale)
+    return Comparison(
+        tables=tuple(t for t in tables if len(t.count)),
+        rms=overlaps.gram.rms,
+        scale=overlaps.gram.scale,
+        views=tuple(names),
+        of_views=values_of_views(state.measurement.views),
+    )
 
 
 class _Rows:

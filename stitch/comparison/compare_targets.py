@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, edges_of, view_properties
+from stitch.comparison.tables import Comparison, Table, edges_of, values_of_views, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
@@ -41,7 +41,8 @@ def compare_targets(state: State) -> Comparison:
         bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
         tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
-    return Comparison(tuple(tables), rms, rms)
+    names = tuple(view.name for view in state.session.views)
+    return Comparison(tuple(tables), rms, rms, names, values_of_views(state.measurement.views))
 
 
 def _offsets(state: State) -> _Offsets:

@@ -1,6 +1,6 @@
 """Tables of a residual against everything that is known of it, and their document."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -47,6 +47,8 @@ class Comparison:
     tables: tuple[Table, ...]
     rms: float
     scale: float
+    views: tuple[str, ...] = ()  # names, V
+    of_views: dict[str, Array] = field(default_factory=dict)  # property -> (V,) value of each view
 
     def table(self, name: str) -> Table:
         """One table by its name."""
@@ -74,6 +76,11 @@ def view_properties(views: Views) -> list[tuple[str, str, Array]]:
     return out + [(name, "", values) for name, values in views.covariates.items()]
 
 
+def values_of_views(views: Views) -> dict[str, Array]:
+    """Property -> (V,) value of each view; as `view_properties`."""
+    return {name: values for name, _, values in view_properties(views)}
+
+
 def edges_of(values: Array) -> Array:
     """(B + 1,) edges of bins with about equal counts."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
@@ -90,5 +97,9 @@ def comparison_document(found: Comparison) -> dict[str, object]:
             | {key: getattr(t, key).tolist() for key in floats.split()}
             | {key: getattr(t, key).astype(int).tolist() for key in counts.split()}
             for t in found.tables
+        ],
+        "views": [
+            {"view": name, "values": {key: float(values[v]) for key, values in found.of_views.items()}}
+            for v, name in enumerate(found.views)
         ],
     }

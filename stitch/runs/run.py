@@ -54,6 +54,15 @@ class ViewLinks:
 
 
 @dataclass(frozen=True)
+class Note:
+    """What a reviewer remarked on a step."""
+
+    at: str  # ISO 8601
+    by: str  # empty where nobody signed
+    text: str
+
+
+@dataclass(frozen=True)
 class LedgerStep:
     """One change of the model: a line of ledger.json."""
 
@@ -63,6 +72,7 @@ class LedgerStep:
     noise_floor: float
     T_mount: Array  # (4, 4)
     values: dict[str, dict[str, float]] = field(default_factory=dict)  # effect -> parameter -> value
+    notes: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -72,8 +72,13 @@ class Problem(Protocol[StepT]):
         ...
 
 
-def iterate(problem: Problem[StepT], model: Model) -> tuple[StepT, list[float]]:
+def iterate(
+    problem: Problem[StepT], model: Model, watch: Callable[[int, StepT], None] | None = None
+) -> tuple[StepT, list[float]]:
     """The last step from a model that is near, converged or the last allowed, and the rms before every step.
+
+    Args:
+        watch: told of every step, with its number from 0.
 
     Raises:
         NoResultError: no two views overlap.
@@ -87,6 +92,8 @@ def iterate(problem: Problem[StepT], model: Model) -> tuple[StepT, list[float]]:
             choice = linearised.choose(choice)
         step = linearised.solve(choice)
         model = step.model
+        if watch is not None:
+            watch(len(history), step)
         history.append(step.rms)
     return step, history
 

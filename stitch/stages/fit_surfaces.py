@@ -20,6 +20,7 @@ from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collec
 from stitch.observations.surfaces.pose_channel import whitened
 from stitch.observations.surfaces.scanner_field import field_scatters
 from stitch.observations.surfaces.view_responses import view_columns
+from stitch.runs.recorder import Recorder
 from stitch.stages.correction import Correction
 from stitch.stages.fit import WEAK, fitted_parameters, iterate
 from stitch.statistics.parameter_selection import Whitened, omitted_rms
@@ -127,7 +128,9 @@ class _Surfaces:
         return _Linearised(self.measurements, model, captures, freed, columns)
 
 
-def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Sequence[float]) -> Correction:
+def fit_surfaces(
+    measurements: Sequence[Measurement], model: Model, gates: Sequence[float], recorder: Recorder | None = None
+) -> Correction:
     """Hand-eye and effects that all sessions of a rig share.
 
     Args:
@@ -137,7 +140,13 @@ def fit_surfaces(measurements: Sequence[Measurement], model: Model, gates: Seque
     Raises:
         NoResultError: no two views overlap.
     """
-    last, history = iterate(_Surfaces(measurements, gates), model)
+
+    def watch(index: int, step: _Step) -> None:
+        if recorder is not None:
+            poses = step.linearised.captures[0].poses(step.model.T_mount)
+            recorder.iteration("fit", index, poses, step.rms, step.freed[0].overlaps.gate)
+
+    last, history = iterate(_Surfaces(measurements, gates), model, watch)
     last = last.linearised.with_errors(last.choice)
     sigmas = np.full(len(last.fitted), np.nan)
     sigmas[last.fitted] = np.sqrt(np.diag(last.hand_eye.values_covariance))

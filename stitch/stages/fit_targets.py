@@ -13,6 +13,7 @@ from stitch.model.term import split, stacked
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.observations.targets.rows import Rows, effect_columns, mixed_model_of_rows, rows_of
 from stitch.observations.targets.target_fit import TargetFit, rms_of
+from stitch.runs.recorder import Recorder
 from stitch.stages.fit import WEAK, fitted_parameters, iterate
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.folds import grouped_folds, places
@@ -121,14 +122,22 @@ class _Targets:
         return _Linearised(model, landmarks, rows, effect_columns(rows, self.measurement, model), start)
 
 
-def fit_targets(measurement: Measurement, model: Model, landmarks: Landmarks) -> TargetFit:
+def fit_targets(
+    measurement: Measurement, model: Model, landmarks: Landmarks, recorder: Recorder | None = None
+) -> TargetFit:
     """Hand-eye, landmarks and effects together, from a start that is near.
 
     Args:
         measurement: with the sightings that count.
         model: effects in use with the values to begin with.
     """
-    last, history = iterate(_Targets(measurement, landmarks), model)
+
+    def watch(index: int, step: _Step) -> None:
+        if recorder is not None:
+            poses = step.linearised.rows.capture.poses(step.model.T_mount)
+            recorder.iteration("fit", index, poses, step.rms, float("nan"))
+
+    last, history = iterate(_Targets(measurement, landmarks), model, watch)
     rows, a = last.linearised.rows, last.linearised.base.shape[2]
     inflation = last.blocks.inflation(places(rows.capture.T_reference_mount, rows.reach), last.covariance)
     covariance = last.covariance * inflation

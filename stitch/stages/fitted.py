@@ -55,7 +55,12 @@ class Course(Protocol):
         ...
 
     def refit(
-        self, sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+        self,
+        sessions: Sequence[Session],
+        measurements: Sequence[Measurement],
+        model: Model,
+        gates: Sequence[float],
+        recorder: Recorder,
     ) -> Fitted:
         """Hand-eye and the effects of a model fitted anew from where it stands."""
         ...

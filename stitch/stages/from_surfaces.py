@@ -78,18 +78,22 @@ def fit(
         weighed = [_weighed(m, own.noise_factor) for m, own in zip(measurements, first.captures, strict=True)]
         # An event or a time constant is one for the whole rig: the first session says where it begins.
         terms = terms_at(weighed[0], Model(first.model.T_mount), gates[0])
-        return fit_surfaces(weighed, Model(first.model.T_mount, tuple(terms)), gates)
+        return fit_surfaces(weighed, Model(first.model.T_mount, tuple(terms)), gates, recorder)
 
     return _fitted(*without_outliers(measurements, once, _targets))
 
 
 def refit(
-    sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+    sessions: Sequence[Session],
+    measurements: Sequence[Measurement],
+    model: Model,
+    gates: Sequence[float],
+    recorder: Recorder,
 ) -> Fitted:
     """Hand-eye and the effects of a model fitted anew, matched anew."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        return fit_surfaces(measurements, model, gates)
+        return fit_surfaces(measurements, model, gates, recorder)
 
     return _fitted(*without_outliers(measurements, once, _targets))
 

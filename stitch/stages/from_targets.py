@@ -58,15 +58,19 @@ def fit(
     recorder: Recorder,
 ) -> Fitted:
     """Hand-eye and targets; then, with effects, all of them."""
-    first = refit(sessions, measurements, Model(begun.T_mount), ())
+    first = refit(sessions, measurements, Model(begun.T_mount), (), recorder)
     if terms_at is None:
         return first
     own, model = first.sessions[0].measurement, Model(first.model.T_mount)
-    return refit(sessions, [own], model.with_terms(terms_at(own, model, begun.gate)), ())
+    return refit(sessions, [own], model.with_terms(terms_at(own, model, begun.gate)), (), recorder)
 
 
 def refit(
-    sessions: Sequence[Session], measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+    sessions: Sequence[Session],
+    measurements: Sequence[Measurement],
+    model: Model,
+    gates: Sequence[float],
+    recorder: Recorder,
 ) -> Fitted:
     """Hand-eye, targets and the effects of a model fitted anew from where it stands."""
     sightings = measurements[0].capture.sightings
@@ -76,7 +80,7 @@ def refit(
     def once(measurement: Measurement, before: TargetFit | None) -> TargetFit:
         begin = model if before is None else before.model
         landmarks = initial_landmarks(corrected(measurement, begin), begin.T_mount, drawing)
-        return fit_targets(measurement, begin, landmarks)
+        return fit_targets(measurement, begin, landmarks, recorder)
 
     return _fitted(measurements, once)
 

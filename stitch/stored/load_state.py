@@ -15,7 +15,7 @@ from stitch.reading.session_folder import load_session
 from stitch.runs.run import LedgerStep, LeftOut, ViewLinks
 from stitch.runs.state import State
 from stitch.stages.reuse import REUSE_GATE, converged_overlaps
-from stitch.stored.run_documents import read_ledger, read_result
+from stitch.stored.run_documents import ledger_steps, read_result
 from stitch.stored.trusted_model import trusted_model
 from stitch.system.threads import library_threads_off
 from stitch.writing.target_rows import as_counted
@@ -83,19 +83,4 @@ def _documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:
         inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
         if inner:
             raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
-    steps = tuple(
-        LedgerStep(
-            effects=tuple(step["effects"]),
-            residual_rms=step["residual_rms"],
-            heldout_rms=_number(step["heldout_rms"]),
-            noise_floor=step["noise_floor"],
-            T_mount=np.array(step["hand_eye"], float),
-            values=step.get("parameters", {}),
-        )
-        for step in read_ledger(folder)
-    )
-    return read_result(folder), steps
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
+    return read_result(folder), ledger_steps(folder)

@@ -4,11 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
 from stitch.errors import InputError
 from stitch.reading.text_file import read_text, shortened
+from stitch.runs.run import LedgerStep, Note
 
 _TEXT = {"type": "string"}
 _NUMBER = {"type": "number"}
@@ -53,7 +55,8 @@ RESULT = _table(
 )
 _STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
 _VALUES = {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _NUMBER}}
-LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES))
+_NOTES = _list(_table({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
+LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES, notes=_NOTES))
 
 
 def read_result(folder: Path) -> dict[str, Any]:
@@ -76,6 +79,26 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
     steps = _checked(folder / "ledger.json", LEDGER)
     assert isinstance(steps, list)
     return steps
+
+
+def ledger_steps(folder: Path) -> tuple[LedgerStep, ...]:
+    """History of the model of a run folder.
+
+    Raises:
+        InputError: as `read_result`.
+    """
+    return tuple(
+        LedgerStep(
+            effects=tuple(step["effects"]),
+            residual_rms=step["residual_rms"],
+            heldout_rms=float("nan") if step["heldout_rms"] is None else step["heldout_rms"],
+            noise_floor=step["noise_floor"],
+            T_mount=np.array(step["hand_eye"], float),
+            values=step.get("parameters", {}),
+            notes=tuple(Note(note["at"], note["by"], note["text"]) for note in step.get("notes", ())),
+        )
+        for step in read_ledger(folder)
+    )
 
 
 def _checked(file: Path, schema: dict[str, Any]) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from stitch.comparison.model_history import model_history
+from stitch.comparison.plain_verdict import plain_verdict
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
 from stitch.runs.run import LeftOut, Run
@@ -85,6 +86,7 @@ def ledger(run: Run) -> list[dict[str, Any]]:
     return [
         {"step": i, "effects": list(s.effects), "parameters": s.values, "hand_eye": s.T_mount.tolist()}
         | {key: getattr(s, key) for key in numbers}
+        | ({"notes": [asdict(note) for note in s.notes]} if s.notes else {})
         for i, s in enumerate(run.ledger)
     ]
 
@@ -97,6 +99,7 @@ def _disagreement(run: Run) -> dict[str, Any] | None:
     return {
         "gate": run.registered.gate,
         "patch_radius": history.patches.radius,
+        "sentence": plain_verdict(history, run.session.length_unit),
         "steps": [
             {"step": s.name, "mean": s.field.mean_abs, "of_noise": s.field.noise, "largest": s.field.quantile()}
             for s in history.steps

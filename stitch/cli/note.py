@@ -1,0 +1,44 @@
+"""`stitch note RUN TEXT`: what a reviewer remarks on a step of the model's history, kept in its ledger."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stitch.cli.options import Json
+from stitch.cli.streams import emit
+from stitch.errors import InputError
+from stitch.stored.run_documents import read_ledger
+from stitch.system.console import console
+from stitch.writing.json_file import to_json, write_json
+from stitch.writing.run_folder import held
+
+_LONGEST = 2000
+
+
+def note(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="What to remark.")],
+    step: Annotated[int | None, typer.Option("--step", help="Step of the ledger; default the last.")] = None,
+    by: Annotated[str, typer.Option("--by", metavar="NAME", help="Who says so.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Write a remark beside a step of the model's history; it stays there when the model changes."""
+    text, by = text.strip(), by.strip()
+    if not text:
+        raise InputError("TEXT: is empty; to fix: say what to remark")
+    if len(text) > _LONGEST:
+        raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
+    with held(run):
+        steps = read_ledger(run)
+        at = len(steps) - 1 if step is None else step
+        if not 0 <= at < len(steps):
+            raise InputError(f"--step {at}: {run}/ledger.json has the steps 0 to {len(steps) - 1}")
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        steps[at].setdefault("notes", []).append({"at": when, "by": by, "text": text})
+        write_json(steps, run / "ledger.json")
+    if as_json:
+        emit(to_json(steps))
+    else:
+        console().print(f"  step {at}, {when}{f', {by}' if by else ''}: {text}", soft_wrap=True)
