@@ -33,6 +33,8 @@ def part_data(surface: PartSurface, camera: Camera, history: ModelHistory, names
     worst = np.argsort(-np.nan_to_num(np.array([_mean_abs(v) for v in own[-2]])), kind="stable")[:_VIEWS]
     return {
         **packed_surface(surface, camera, history.patches.points),
+        "facing": packed_floats(history.patches.normals @ camera.axes.T),
+        "patchRadius": history.patches.radius,
         "steps": [
             {
                 "name": step.name,

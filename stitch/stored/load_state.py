@@ -12,10 +12,10 @@ from stitch.model.bound import bound
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.thinning import thinned
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import LedgerStep, LeftOut, ViewLinks
+from stitch.runs.run import LeftOut, ViewLinks
 from stitch.runs.state import State
 from stitch.stages.reuse import REUSE_GATE, converged_overlaps
-from stitch.stored.run_documents import ledger_steps, read_result
+from stitch.stored.run_documents import read_documents
 from stitch.stored.trusted_model import trusted_model
 from stitch.system.threads import library_threads_off
 from stitch.writing.target_rows import as_counted
@@ -31,7 +31,7 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         InputError: not a run of one session, its session has gone, an effect is not known, or the model names a file
             of effects that nobody has allowed.
     """
-    document, steps = _documents(folder)
+    document, steps = read_documents(folder)
     file, effects = trusted_model(folder, effects_file, trust)
     path = Path(document["session"])
     if not path.is_dir():
@@ -74,13 +74,3 @@ def left_out_of(document: dict[str, Any]) -> tuple[tuple[LeftOut, ...], ViewLink
     components = tuple(tuple(part) for part in linkage.get("components", ()))
     weak = tuple((row["view"], row.get("partner", "")) for row in linkage.get("weak", ()))
     return tuple(left_out), ViewLinks(components, weak)
-
-
-def _documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
-    if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
-        inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
-        if inner:
-            raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
-    return read_result(folder), ledger_steps(folder)

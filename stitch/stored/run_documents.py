@@ -59,6 +59,21 @@ _NOTES = _list(_table({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
 LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES, notes=_NOTES))
 
 
+def read_documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:
+    """result.json and the history of the model of a run of one session.
+
+    Raises:
+        InputError: no run folder, one of several sessions, or a damaged file.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
+    if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
+        inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
+        if inner:
+            raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
+    return read_result(folder), ledger_steps(folder)
+
+
 def read_result(folder: Path) -> dict[str, Any]:
     """result.json of a run folder.
 

@@ -1,11 +1,10 @@
 // The part in 3D with the field of disagreement. One file, no library, no network.
-(() => {
-  "use strict";
-  const root = document.getElementById("part"), source = document.getElementById("part-data");
-  if (!root || !source) return;
+"use strict";
+
+// Show a part in the elements of `root`; `more` are the fields of candidate effects, `eye` where it was looked at from.
+function showPart(root, data, more, eye) {
   const canvas = root.querySelector("canvas"), gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
-  if (!gl) return;  // the still picture stays
-  const data = JSON.parse(source.textContent);
+  if (!gl) return null;  // the still picture stays
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const vertices = new Int16Array(bytes(data.vertices)), normals = new Int8Array(bytes(data.normals));
   const triangles = new Uint32Array(bytes(data.triangles)), near = new Uint16Array(bytes(data.near));
@@ -94,12 +93,12 @@
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
   const play = root.querySelector("button[data-play]");
-  let steps = [], shown = -1, yaw = 0, pitch = 0, zoom = 1, panX = 0, panY = 0, wanted = false;
+  let { yaw, pitch, zoom, panX, panY } = eye || { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
+  let steps = [], shown = -1, wanted = false, selection = null;
 
   const candidates = [];
-  const extra = document.getElementById("candidate-data");
-  if (extra) {  // patches of a diagnosis lie elsewhere: each of ours takes the nearest
-    const more = JSON.parse(extra.textContent), axes = data.axes, own = new Float32Array(bytes(data.patches));
+  if (more) {  // patches of a diagnosis lie elsewhere: each of ours takes the nearest
+    const axes = data.axes, own = new Float32Array(bytes(data.patches));
     const other = new Float32Array(bytes(more.patches)), nearest = new Uint16Array(own.length / 3);
     for (let i = 0; i < nearest.length; i++) {
       let best = Infinity;
@@ -119,6 +118,7 @@
         { name: `if ${c.name} were added`, mean: c.mean, noise: more.noise, values: of(c.values) }] });
     }
   }
+  choice.length = 1;
   data.views.forEach((view, i) => choice.add(new Option(`view ${view.name} against the others`, `v${i}`)));
   candidates.forEach((c, i) => choice.add(new Option(`predicted: ${c.name}`, `c${i}`)));
 
@@ -126,18 +126,19 @@
   const full = () => isSigned() ? data.fullSigned : data.full;
   function choose() {
     const i = Number(choice.value.slice(1));
-    if (choice.value.startsWith("c")) steps = candidates[i].steps.map(s => ({ ...s, on: onVertices(s.values) }));
+    if (choice.value === "s") steps = selection.map(s => ({ ...s, on: onVertices(unpack(s.values)) }));
+    else if (choice.value.startsWith("c")) steps = candidates[i].steps.map(s => ({ ...s, on: onVertices(s.values) }));
     else steps = data.steps.map((s, k) => ({ name: s.name, noise: s.noise,
       mean: isSigned() ? data.views[i].means[k] : s.mean,
       on: onVertices(unpack(isSigned() ? data.views[i].steps[k] : s.values)) }));
     slider.max = steps.length - 1;
-    slider.value = Math.min(choice.value.startsWith("c") ? 1 : data.end, steps.length - 1);
+    slider.value = Math.min("cs".includes(choice.value[0]) ? 1 : data.end, steps.length - 1);
     shown = -1; label(); draw();
   }
   function label() {
     const k = Math.round(Number(slider.value)), s = steps[k], signed = isSigned();
     title.textContent = `${s.name}: ${signed ? "this view lies off by" : "the views disagree by"} `
-      + `${digits(s.mean)} µm on average (noise alone ${digits(s.noise)} µm)`;
+      + `${digits(s.mean)} µm on average` + (s.noise === undefined ? "" : ` (noise alone ${digits(s.noise)} µm)`);
     slider.setAttribute("aria-valuetext", title.textContent);
     root.querySelectorAll("[data-steps] button").forEach((b, i) => b.setAttribute("aria-pressed", String(i === k)));
     const colours = data.colours[signed ? "signed" : "field"].map(c => `rgb(${c.join(",")})`).join(",");
@@ -177,10 +178,8 @@
         }
         shown = k;
       }
-      const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
-      gl.uniformMatrix3fv(at("turn"), false, [a, b * d, -b * c, 0, c, d, b, -a * d, a * c]);
-      const reach = 1.9 * zoom, fit = Math.min(w / data.box[0], h / data.box[1]);
-      gl.uniform2f(at("scale"), reach * fit / w, reach * fit / h);
+      gl.uniformMatrix3fv(at("turn"), false, turned());
+      gl.uniform2f(at("scale"), ...scales());
       gl.uniform2f(at("shift"), panX, panY);
       gl.uniform1f(at("dot"), Math.max(1.5, r * zoom * 3));
       gl.uniform1f(at("blend"), t - k); gl.uniform1f(at("full"), full());
@@ -206,8 +205,17 @@
   play.onclick = () => { const last = steps.length - 1; slider.value = Math.min(data.begin, last - 1); glide(last); };
 
   const fingers = new Map();
-  canvas.addEventListener("pointerdown", e => { fingers.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId); });
-  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, e => fingers.delete(e.pointerId));
+  let pressed = null;
+  canvas.addEventListener("pointerdown", e => {
+    fingers.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId);
+    pressed = fingers.size === 1 ? e : null;
+  });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, e => {
+    fingers.delete(e.pointerId);
+    const still = pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 4;
+    if (still && name === "pointerup" && e.button === 0) pick(e);
+    pressed = null;
+  });
   canvas.addEventListener("pointermove", e => {
     const before = fingers.get(e.pointerId);
     if (!before) return;
@@ -234,7 +242,59 @@
     else if (e.key === "Home") { yaw = pitch = panX = panY = 0; zoom = 1; } else return;
     e.preventDefault(); draw();
   });
+  const turned = () => {
+    const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
+    return [a, b * d, -b * c, 0, c, d, b, -a * d, a * c];
+  };
+  function scales() {
+    const w = canvas.clientWidth, h = canvas.clientHeight, fit = Math.min(w / data.box[0], h / data.box[1]);
+    return [1.9 * zoom * fit / w, 1.9 * zoom * fit / h];
+  }
+  function pick(e) {  // the vertex nearest to the eye within a few pixels of the pointer tells which place was meant
+    const box = canvas.getBoundingClientRect(), m = turned(), [sx, sy] = scales();
+    const x = 2 * (e.clientX - box.left) / box.width - 1, y = 1 - 2 * (e.clientY - box.top) / box.height;
+    const near2 = (14 / Math.min(box.width, box.height)) ** 2;
+    let best = -1, depth = -Infinity;
+    for (let i = 0; i < count; i++) {
+      const [p, q, r] = [0, 1, 2].map(k => vertices[3 * i + k] / 32767);
+      const u = (m[0] * p + m[3] * q + m[6] * r) * sx + panX - x, v = (m[1] * p + m[4] * q + m[7] * r) * sy + panY - y;
+      const z = m[2] * p + m[5] * q + m[8] * r;
+      if (u * u + v * v < near2 && z > depth) { best = i; depth = z; }
+    }
+    if (best < 0) return;
+    const flat = [0, 1, 2].map(k => vertices[3 * best + k] / 32767 * data.size + data.centre[k]);
+    const place = [0, 1, 2].map(k => flat.reduce((sum, value, row) => sum + value * data.axes[row][k], 0));
+    root.dispatchEvent(new CustomEvent("pick", { detail: place }));  // reference frame, length_unit
+  }
   new ResizeObserver(draw).observe(canvas);
   root.classList.add("live");
   choose(); names(); label();
+  return {
+    names: () => data.steps.map(s => s.name),
+    glide,
+    eye: () => ({ yaw, pitch, zoom, panX, panY }),
+    jump(to) { cancelAnimationFrame(gliding); slider.value = to; label(); draw(); },
+    stop() { cancelAnimationFrame(gliding); },
+    show(value) {  // "all", "v3", "c0", "s"
+      choice.value = value; choose(); names(); label();
+    },
+    predict(name) {  // from the field as it is to that with a candidate effect
+      const i = candidates.findIndex(c => c.name === name);
+      if (i < 0) return false;
+      this.show(`c${i}`); this.jump(0); glide(1);
+      return true;
+    },
+    choose(name, states) {  // two states {name, mean, values}: of everything, and of what was chosen
+      [...choice.options].filter(o => o.value === "s").forEach(o => o.remove());
+      selection = states;
+      if (states) choice.add(new Option(`chosen: ${name}`, "s"), 1);
+      this.show(states ? "s" : "all");
+    },
+  };
+}
+
+(() => {  // on a page of its own
+  const root = document.getElementById("part"), source = document.getElementById("part-data");
+  const extra = document.getElementById("candidate-data");
+  if (root && source) showPart(root, JSON.parse(source.textContent), extra && JSON.parse(extra.textContent));
 })();

@@ -1,0 +1,147 @@
+"""The field of disagreement of what was chosen in a plot: some views, bins of a property, a place of the part."""
+
+import base64
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.errors import InputError
+from stitch.frames import Array, Indices, Mask
+from viz.part_data import packed_values
+from viz.review.residual_rows import ResidualRows
+
+# Patches about a correspondence that it counts for, and within how many of their radii.
+_PATCHES = 8
+_REACH = 1.5
+_SAME_SIDE = 0.5
+# Sides of a view on a patch below which it says nothing.
+_ENOUGH = 8.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen; everything where nothing is stated."""
+
+    views: frozenset[str] = frozenset()
+    bins: dict[str, tuple[int, int]] = field(default_factory=dict)  # property -> first and last bin of its table
+    place: tuple[float, float, float] | None = None  # reference frame
+    within: float = 0.0  # length_unit
+
+
+@dataclass(frozen=True)
+class PatchWeights:
+    """How every side counts for the patches of the part; K patches, weights (N, k), 0 where none is near."""
+
+    patch: Indices  # (N, k)
+    weight: Array  # (N, k)
+    count: int
+    radius: float
+
+
+def patch_weights(rows: ResidualRows, part: str) -> PatchWeights:
+    """Weights for the patches of a viewer's data (JSON).
+
+    Raises:
+        InputError: data of a page that an older version wrote.
+    """
+    data = json.loads(part)
+    if "facing" not in data:
+        raise InputError("report.html: was written by an older version; to fix: `stitch report RUN --no-diagnosis`")
+    axes, radius = np.array(data["axes"]), float(data["patchRadius"])
+    points = (_floats(data["patches"]) * data["size"] + np.array(data["centre"])) @ axes
+    normals = _floats(data["facing"]) @ axes
+    half = len(rows.view) // 2  # both sides share the place
+    near = min(_PATCHES, len(points))
+    distance, index = KDTree(np.ascontiguousarray(points)).query(
+        np.ascontiguousarray(rows.place[:half]), k=near, distance_upper_bound=_REACH * radius
+    )
+    distance, index = distance.reshape(half, near), index.reshape(half, near)
+    found = np.isfinite(distance)
+    index = np.where(found, index, 0).astype(np.int32)
+    found &= np.einsum("nki,ni->nk", normals[index], rows.normal[:half]) > _SAME_SIDE
+    weight = np.where(found, np.exp(-((distance / radius) ** 2) / 2), 0.0).astype(np.float32)
+    return PatchWeights(index, weight, len(points), radius)
+
+
+def chosen_field(
+    rows: ResidualRows, weights: PatchWeights, choice: Choice, comparison: dict[str, Any] | None, um: float
+) -> dict[str, Any]:
+    """The field and the numbers of a choice, beside those of everything; plain data, errors in µm.
+
+    Args:
+        comparison: compare.json, whose tables have the bins.
+
+    Raises:
+        InputError: a view, a property or a bin that the run does not have.
+    """
+    inside = _chosen(rows, choice, comparison)
+    every = np.ones(len(rows.view), bool)
+    out = {name: _of(rows, weights, mask, um) for name, mask in (("all", every), ("chosen", inside))}
+    return out | {"within": choice.within}
+
+
+def _of(rows: ResidualRows, weights: PatchWeights, mask: Mask, um: float) -> dict[str, Any]:
+    overall, e = _overall(rows, weights, mask) * um, rows.residual[mask] * um
+    seen = overall[np.isfinite(overall)]
+    return {
+        "views": len(np.unique(rows.view[mask])),
+        "correspondences": round(len(e) / rows.share),
+        "rms": float(np.sqrt(np.mean(e**2))) if len(e) else None,
+        "signed": float(e.mean()) if len(e) else None,
+        "mean": float(seen.mean()) if len(seen) else None,
+        "values": packed_values(overall),
+    }
+
+
+def _overall(rows: ResidualRows, weights: PatchWeights, mask: Mask) -> Array:
+    """(K,) mean over the chosen views of |their mean distance| at a patch; NaN where none of them tells."""
+    half, K = len(rows.view) // 2, weights.count
+    picked = np.flatnonzero(mask)
+    own = picked % half if half else picked
+    key = (rows.view[picked, None] * K + weights.patch[own]).ravel()
+    weight = weights.weight[own]
+    shape = (len(rows.views), K)
+    total = np.bincount(key, weight.ravel(), shape[0] * K).reshape(shape)
+    sums = np.bincount(key, (weight * rows.residual[picked, None]).ravel(), shape[0] * K).reshape(shape)
+    told = total > _ENOUGH
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means = np.where(told, np.abs(sums / total), 0.0).sum(axis=0) / told.sum(axis=0)
+    return np.asarray(np.where(told.any(axis=0), means, np.nan))
+
+
+def _chosen(rows: ResidualRows, choice: Choice, comparison: dict[str, Any] | None) -> Mask:
+    """(N,) sides that meet all that was stated."""
+    mask = np.ones(len(rows.view), bool)
+    if choice.views:
+        if unknown := sorted(choice.views - set(rows.views)):
+            raise InputError(f"{unknown[0]}: no such view in this run")
+        mask &= np.isin(rows.view, [rows.views.index(name) for name in choice.views])
+    for name, (first, last) in choice.bins.items():
+        mask &= _in_bins(rows, name, first, last, comparison or {})
+    if choice.place is not None:
+        mask &= np.linalg.norm(rows.place - np.array(choice.place), axis=1) < choice.within
+    return mask
+
+
+def _in_bins(rows: ResidualRows, name: str, first: int, last: int, comparison: dict[str, Any]) -> Mask:
+    """Sides whose value lies in the bins `first` … `last` of a table: low ≤ value < high, the last bin to its end."""
+    table = next((t for t in comparison.get("tables", []) if t["name"] == name and not t["label"]), None)
+    if table is None or not 0 <= first <= last < len(table["low"]):
+        raise InputError(f"{name}: no such property or bin in compare.json; run `stitch compare` again")
+    values = rows.properties.get(name)
+    if values is None:
+        known = {row["view"]: row["values"].get(name) for row in comparison.get("views", [])}
+        of_view = np.array([np.nan if known.get(v) is None else known[v] for v in rows.views], float)
+        values = of_view[rows.view]
+    open_end = last < len(table["low"]) - 1
+    low, high = table["low"][first], table["high"][last]
+    # Few points lie beyond the ends of the table: its bins were made of a sample.
+    above = values >= low if first else np.isfinite(values)
+    return np.asarray(above & (values < high) if open_end else above)
+
+
+def _floats(text: str) -> Array:
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 3).astype(float)

@@ -1,0 +1,156 @@
+"""What one `stitch review` knows: the run folder as it stands, what was trusted, which commands it may run."""
+
+import re
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stitch.errors import InputError
+from stitch.model.model_toml import read_model
+from stitch.system.whole_file import whole
+from stitch.units import MICROMETRES
+from viz.review.chosen_field import Choice, PatchWeights, chosen_field, patch_weights
+from viz.review.residual_rows import ResidualRows, read_rows
+from viz.review.run_snapshot import Snapshot, read_snapshot, version_of
+
+# A person's own file in the run folder, which no command takes away.
+OWN_EFFECTS = "review_effects.py"
+_NAME = re.compile(r"[A-Za-z_]\w{0,80}")
+_LONGEST_NOTE, _LONGEST_NAME = 2000, 80
+
+
+@dataclass
+class RunReview:
+    """A run folder under review; what is asked from several threads is computed once."""
+
+    run: Path
+    effects_file: Path | None = None  # of the user's own, trusted by naming it
+    trust: bool = False  # the file that the model names
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _last: Snapshot | None = None
+    _rows: tuple[str, ResidualRows | None, PatchWeights | None] | None = None
+
+    @property
+    def version(self) -> str:
+        """Changes with any file of the run that is shown."""
+        return version_of(self.run)
+
+    @property
+    def model(self) -> str:
+        """Changes with the model of the run."""
+        return version_of(self.run, ("result.json",))
+
+    def snapshot(self) -> Snapshot:
+        """The run as it stands.
+
+        Raises:
+            InputError: no run folder any more, or a damaged file in it.
+        """
+        with self._lock:
+            if self._last is None or self._last.version != self.version:
+                self._last = read_snapshot(self.run)
+            return self._last
+
+    def state(self) -> dict[str, Any]:
+        """The snapshot's, with what was trusted; a folder that cannot be read says why."""
+        try:
+            state = self.snapshot().state
+        except InputError as error:
+            return {"problem": str(error), "version": self.version, "run": str(self.run)}
+        return state | {"problem": None, "trust": self._asked_for_trust(), "own": self.own_effects()}
+
+    def own_effects(self) -> str:
+        """Text of the file of own effects in the run folder; empty where there is none."""
+        try:
+            return (self.run / OWN_EFFECTS).read_text(encoding="utf-8")
+        except (OSError, ValueError):
+            return ""
+
+    def keep_own_effects(self, text: str) -> Path:
+        """Write the text as the run folder's own effects, and trust it."""
+        path = self.run / OWN_EFFECTS
+        with whole(path) as file:
+            file.write_text(text, encoding="utf-8")
+        self.effects_file = path
+        return path
+
+    def chosen(self, choice: Choice) -> dict[str, Any]:
+        """Field and numbers of a choice.
+
+        Raises:
+            InputError: the run has no such view, property or bin, or no field.
+        """
+        found = self.snapshot()
+        with self._lock:
+            if self._rows is None or self._rows[0] != found.model:
+                rows = read_rows(self.run, found.result)
+                usable = rows is not None and found.part is not None
+                weights = patch_weights(rows, found.part) if usable and rows and found.part else None
+                self._rows = (found.model, rows, weights)
+            _, rows, weights = self._rows
+        if rows is None or weights is None:
+            raise InputError(f"{self.run}: has no surfaces to show a part of")
+        if choice.place is not None and not choice.within:
+            choice = Choice(choice.views, choice.bins, choice.place, within=2 * weights.radius)
+        um = MICROMETRES[found.result["length_unit"]]
+        return chosen_field(rows, weights, choice, found.comparison, um) | {"model": found.model}
+
+    def arguments(self, kind: str, asked: dict[str, Any]) -> list[str]:
+        """The command of what a page asked for.
+
+        Raises:
+            InputError: something that no command is made of.
+        """
+        run = str(self.run)
+        match kind:
+            case "compare" | "diagnose":
+                return [kind, run, *self._trusted()]
+            case "report":
+                return [kind, run, "--no-diagnosis", *self._trusted()]
+            case "add" | "drop":
+                quiet = [] if (self.run / "recording.rrd").is_file() else ["--no-recording"]
+                return [kind, run, *_names(asked.get("effects")), *quiet, *self._trusted()]
+            case "undo" | "redo":
+                change = self.snapshot().state["history"][kind]
+                if change is None:
+                    raise InputError(f"there is nothing to {kind}")
+                return self.arguments(change["command"], change)
+            case "note":
+                by = _text(asked.get("by", ""), _LONGEST_NAME)
+                return ["note", run, *(["--by", by] if by else []), "--", _text(asked.get("text"), _LONGEST_NOTE)]
+            case "effects":
+                return ["effects", "--effects-file", str(self.run / OWN_EFFECTS)]
+        raise InputError("no such command here")
+
+    def _trusted(self) -> list[str]:
+        if self.effects_file is not None:
+            return ["--effects-file", str(self.effects_file)]
+        return ["--trust"] if self.trust else []
+
+    def _asked_for_trust(self) -> dict[str, str] | None:
+        """The file of effects that the model names, where nobody has allowed it yet."""
+        if self.effects_file is not None or self.trust:
+            return None
+        named = read_model(self.run).effects_file
+        if named is None:
+            return None
+        try:
+            text = Path(named).read_text(encoding="utf-8")
+        except (OSError, ValueError):
+            text = "(cannot be read)"
+        return {"file": named, "text": text}
+
+
+def _names(effects: object) -> list[str]:
+    """Names of effects, which no option of a command can be."""
+    named = isinstance(effects, list) and effects and all(isinstance(e, str) and _NAME.fullmatch(e) for e in effects)
+    if not named or not isinstance(effects, list):
+        raise InputError("effects: to fix: a list of their names")
+    return effects
+
+
+def _text(text: object, longest: int) -> str:
+    if not isinstance(text, str) or len(text) > longest or "\0" in text:
+        raise InputError(f"to fix: a text of at most {longest} characters")
+    return text.strip()

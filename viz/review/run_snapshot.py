@@ -1,0 +1,162 @@
+"""What a run folder says at one moment, as the browser shows it: its documents, and the data of the part's viewer."""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stitch.comparison.model_history import change_of
+from stitch.errors import InputError
+from stitch.reading.text_file import shortened
+from stitch.runs.run import LedgerStep
+from stitch.stored.run_documents import read_documents
+from stitch.units import MICROMETRES, rounded
+from viz.review.told_candidates import told_diagnosis
+from viz.review.undo_history import undo_history
+
+# What the page shows comes from these; a change of one is a change of the run.
+_FILES = ("result.json", "ledger.json", "compare.json", "diagnosis.json", "report.html", "residuals.parquet")
+_TRIES = 3
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A run folder as it stood; all of it of one model."""
+
+    version: str
+    model: str  # changes with the model alone, not with a remark
+    state: dict[str, Any]  # plain data for the browser, lengths of the error in µm
+    part: str | None  # JSON of the viewer's data, as report.html holds it
+    predicted: str | None  # JSON of the fields of candidate effects
+    result: dict[str, Any]  # result.json
+    comparison: dict[str, Any] | None  # compare.json
+
+
+def read_snapshot(run: Path) -> Snapshot:
+    """Read a run folder; one that is rewritten meanwhile is read again.
+
+    Raises:
+        InputError: no run folder, or a damaged file in it.
+    """
+    for _ in range(_TRIES):
+        before = version_of(run)
+        try:
+            found = _read(run, before)
+        except InputError:
+            if version_of(run) == before:
+                raise
+            continue
+        if version_of(run) == before:
+            return found
+    raise InputError(f"{run}: is rewritten again and again; to fix: wait until what writes there has ended")
+
+
+def version_of(run: Path, files: tuple[str, ...] = _FILES) -> str:
+    """Changes when a file of the run does."""
+    marks = []
+    for name in files:
+        try:
+            found = (run / name).stat()
+            marks.append(f"{found.st_ino:x}.{found.st_mtime_ns:x}.{found.st_size:x}")
+        except OSError:
+            marks.append("-")
+    return "_".join(marks)
+
+
+def _read(run: Path, version: str) -> Snapshot:
+    result, ledger = read_documents(run)
+    um = MICROMETRES[result["length_unit"]]
+    comparison, diagnosis = (_json(run / f"{name}.json") for name in ("compare", "diagnosis"))
+    page = _text(run / "report.html")
+    part, predicted = (_script(page, name) for name in ("part-data", "candidate-data"))
+    steps = (result.get("disagreement") or {}).get("steps", [])
+    model = version_of(run, ("result.json",))
+    state = {
+        "version": version,
+        "model": model,
+        "run": str(run),
+        "session": result["session"],
+        "name": result.get("name", Path(result["session"]).name),
+        "sentence": (result.get("disagreement") or {}).get("sentence") or result["verdict"],
+        "evidence": result["verdict"],
+        "residual": result["residual_rms"] * um,
+        "heldout": None if result["heldout_rms"] is None else result["heldout_rms"] * um,
+        "floor": result["noise_floor"] * um,
+        "steps": [{"step": s["step"], "mean": s["mean"] * um, "noise": s["of_noise"] * um} for s in steps],
+        "ledger": [_step(ledger, i, um) for i in range(len(ledger))],
+        "effects": _effects(result),
+        "diagnosis": None if diagnosis is None else told_diagnosis(diagnosis, um),
+        "comparison": None if comparison is None else _tables(comparison, um),
+        "history": undo_history([step.effects for step in ledger]),
+        "part": part is not None,
+        "outdated": part is not None and "patchRadius" not in part,
+        "recording": (run / "recording.rrd").is_file(),
+        "notes": [*result["notes"], *(f"Not observable from these motions: {x}." for x in result["unobservable"])],
+    }
+    return Snapshot(version, model, state, part, predicted, result=result, comparison=comparison)
+
+
+def _step(ledger: tuple[LedgerStep, ...], i: int, um: float) -> dict[str, Any]:
+    step = ledger[i]
+    return {
+        "step": i,
+        "change": change_of(ledger, i),
+        "effects": list(step.effects),
+        "residual": step.residual_rms * um,
+        "heldout": step.heldout_rms * um if step.heldout_rms == step.heldout_rms else None,
+        "floor": step.noise_floor * um,
+        "notes": [{"at": note.at, "by": note.by, "text": note.text} for note in step.notes],
+    }
+
+
+def _effects(result: dict[str, Any]) -> list[dict[str, str]]:
+    """Fitted parameters of the effects in use."""
+    return [
+        {
+            "effect": effect,
+            "parameter": name,
+            "value": rounded(p["value"], p["sigma"]),
+            "sigma": f"{p['sigma']:.1g}",
+            "unit": p.get("unit", ""),
+        }
+        for effect, own in result["effects"].items()
+        for name, p in own.items()
+        if p.get("sigma") is not None
+    ]
+
+
+def _tables(comparison: dict[str, Any], um: float) -> list[dict[str, Any]]:
+    """Tables of compare.json with errors in µm; pairs are too many to choose from."""
+
+    def scaled(values: list[float | None]) -> list[float | None]:
+        return [None if x is None else x * um for x in values]
+
+    return [
+        table | {key: scaled(table[key]) for key in ("mean", "mean_sigma", "rms", "rms_sigma")}
+        for table in comparison.get("tables", [])
+        if table["name"] != "pair"
+    ]
+
+
+def _json(path: Path) -> dict[str, Any] | None:
+    text = _text(path)
+    if not text:
+        return None
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: damaged ({shortened(str(error))}); run its command again") from None
+    return found if isinstance(found, dict) else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _script(page: str, name: str) -> str | None:
+    found = re.search(rf'<script type="application/json" id="{name}">(.*?)</script>', page, re.S)
+    return found[1] if found else None

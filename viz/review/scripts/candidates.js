@@ -1,0 +1,75 @@
+// What is missing: candidate effects with what they should leave, and the button that adds one.
+import { at, element, um } from "./elements.js";
+import { predict } from "./scene.js";
+
+const FIRST = 4;
+const TITLES = {
+  adequate: "Nothing is missing", missing_effect: "An effect is missing",
+  cannot_tell: "Something is missing; these views cannot tell what", unknown_effect: "Something unknown is missing",
+};
+let all = false;
+
+// `ask` sends a command; `busy` while one that changes the run is under way.
+export function showCandidates(state, ask, busy) {
+  const root = at("missing"), found = state.diagnosis;
+  if (!found) {
+    const button = element("button", { type: "button", class: "main", id: "diagnose", disabled: busy, onclick: () => ask({ kind: "diagnose" }) }, "Find what is missing");
+    root.replaceChildren(element("p", { class: "soft" }, "Every effect of the library is tried on what the poses leave, and validated on views left out."),
+      button, element("code", { class: "command" }, `stitch diagnose ${state.run}`));
+    return;
+  }
+  const rows = all ? found.candidates : found.candidates.slice(0, FIRST);
+  const most = Math.max(state.residual, ...rows.map(c => c.heldout_if_added ?? 0));
+  root.replaceChildren(
+    element("h3", {}, TITLES[found.verdict]), element("p", {}, found.sentence), legend(),
+    element("div", { class: "scroll" }, element("table", { class: "candidate" },
+      element("thead", {}, element("tr", {}, ...["candidate effect", "rms if added (µm)", "posterior", ""].map(h => element("th", { scope: "col" }, h || element("span", { "aria-label": "add" }))))),
+      element("tbody", {}, row("as it is", state.residual, state.heldout, most, state.floor), ...rows.flatMap(c => candidate(c, found, state, most, ask, busy))))),
+    found.candidates.length > FIRST && element("button", { type: "button", "aria-expanded": String(all), onclick: () => { all = !all; showCandidates(state, ask, busy); } },
+      all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`),
+    limits(found));
+}
+
+export const legend = () => element("p", { class: "legend" },
+  element("span", {}, element("i", { class: "fit-key", style: { background: "var(--accent)" } }), "in the fit"),
+  element("span", {}, element("i", { style: { background: "var(--good)" } }), "on views left out"),
+  element("span", {}, "┆ noise floor"));
+
+// Two bars on one scale, with the noise floor.
+export function bars(fit, out, most, floor) {
+  const width = x => `${Math.min(100, 100 * (x ?? 0) / most)}%`;
+  return element("div", { class: "track" }, element("span", { class: "fit", style: { width: width(fit) } }),
+    element("span", { class: "out", style: { width: width(out) } }), element("span", { class: "floor", style: { left: width(floor) } }));
+}
+
+const numbers = (fit, out) => `${um(fit)}, ${um(out)} on views left out`;
+
+function row(name, fit, out, most, floor) {
+  return element("tr", {}, element("td", {}, name),
+    element("td", { class: "bars", "aria-label": numbers(fit, out) }, bars(fit, out, most, floor)), element("td", {}), element("td", {}));
+}
+
+function candidate(c, found, state, most, ask, busy) {
+  const named = found.named.includes(c.effect);
+  const add = element("button", { type: "button", class: named ? "main" : "", disabled: busy, "aria-label": `Add ${c.effect}`,
+    title: `stitch add ${state.run} ${c.effect}`, onclick: () => ask({ kind: "add", effects: [c.effect] }) }, "Add");
+  const look = element("button", { type: "button", "aria-label": `Show the part as ${c.effect} should leave it`,
+    onclick: () => { if (!predict(c.effect)) look.replaceWith(element("span", { class: "soft" }, "no picture")); } }, "Show");
+  return [
+    element("tr", { class: named ? "best" : "" }, element("td", {}, c.effect + (c.own ? " (your own)" : "")),
+      element("td", { class: "bars", "aria-label": numbers(c.rms_if_added, c.heldout_if_added) },
+        c.rms_if_added == null ? "–" : bars(c.rms_if_added, c.heldout_if_added, most, state.floor)),
+      element("td", {}, c.posterior.toFixed(2)), element("td", {}, look, " ", add)),
+    element("tr", {}, element("td", { class: "wide", colspan: "4" },
+      [numbers(c.rms_if_added, c.heldout_if_added), c.amounts, `p = ${c.p}`, c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
+  ];
+}
+
+function limits(found) {
+  const told = [];
+  if (found.follows.length) told.push(`What is left follows ${found.follows.slice(0, 3).map(f => `${f.covariate} (p = ${f.p})`).join(", ")}.`);
+  if (found.unseen.length) told.push(`These views cannot show: ${found.unseen.join(", ")}.`);
+  for (const u of found.untested) told.push(`Not tested without ${u.needs.join(", ")}: ${u.effect}.`);
+  for (const n of found.next) told.push(`Next: ${n.do} (separates ${n.separates.join(" and ")}).`);
+  return told.length ? element("details", {}, element("summary", {}, "What could not have been seen, and what to measure next"), ...told.map(t => element("p", {}, t))) : null;
+}

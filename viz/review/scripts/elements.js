@@ -1,0 +1,20 @@
+// Elements and numbers: small words that every other script uses.
+
+// An element with attributes and children; "on…" are listeners, "style" an object.
+export function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name === "style") Object.assign(made.style, value);
+    else if (value === true) made.setAttribute(name, "");
+    else if (value !== false && value != null) made.setAttribute(name, value);
+  }
+  made.append(...children.filter(child => child != null && child !== false));
+  return made;
+}
+
+export const at = id => document.getElementById(id);
+
+// Three digits, as the page of a run has them.
+export const digits = x => x == null ? "–" : x === 0 ? "0" : Number(x.toPrecision(3)).toString().replace("-", "−");
+export const um = x => x == null ? "–" : `${digits(x)} µm`;

@@ -1,0 +1,142 @@
+// Where it fails: a small plot for each property. What is chosen in one changes part and numbers.
+import { at, digits, element, um } from "./elements.js";
+import { showChoice } from "./scene.js";
+import { send } from "./server.js";
+
+const FIRST = 5, VIEWS = "view", PLACES = "place on the part";
+let choice = empty(), state = null, all = false, asked = 0;
+
+function empty() { return { views: [], bins: {}, place: null, within: 0, name: "" }; }
+
+// Draw the plots of a state; a choice of another model is forgotten.
+export function showPlots(next) {
+  const same = state && state.model === next.model && state.comparison;
+  state = next;
+  if (!same) { choice = empty(); numbers(null); }
+  draw();
+}
+
+export function choosePlace(place, within = 0, name = "a place of the part") {
+  choice.place = place; choice.within = within; choice.name = place ? name : "";
+  draw(); ask();
+}
+
+function draw() {
+  const root = at("plots");
+  if (!state.comparison) {
+    root.replaceChildren(element("p", { class: "soft" }, "The residual is being compared with everything known of it …"));
+    return;
+  }
+  const follows = state.diagnosis ? state.diagnosis.follows.map(f => f.covariate.replace(/_deg$/, "")) : [];
+  const rank = table => follows.includes(table.name) ? follows.indexOf(table.name) - 100 : -table.clearest;
+  const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));
+  const shown = all ? properties : properties.slice(0, FIRST);
+  const focus = document.activeElement && document.activeElement.dataset.key;
+  root.replaceChildren(views(), ...shown.map(table => plot(table, follows)), places(),
+    properties.length > FIRST && element("button", { type: "button", onclick: () => { all = !all; draw(); }, "aria-expanded": String(all) },
+      all ? "Fewer properties" : `${properties.length - FIRST} further properties`));
+  if (focus) root.querySelector(`[data-key="${CSS.escape(focus)}"]`)?.focus();
+}
+
+function views() {
+  const table = state.comparison.find(t => t.name === VIEWS);
+  if (!table) return "";
+  const most = Math.max(...table.rms.map(x => x ?? 0), 1e-9);
+  return card("Views", "rms of each against the others (µm)", "wide", table.label.map((name, i) => bar({
+    key: `view ${name}`, height: (table.rms[i] ?? 0) / most, from: 0, pressed: choice.views.includes(name),
+    label: `view ${name}: rms ${um(table.rms[i])}`,
+    toggle: range => {
+      const before = choice.views, last = table.label.indexOf(before[before.length - 1]);
+      const span = range && last >= 0 ? table.label.slice(Math.min(i, last), Math.max(i, last) + 1) : [name];
+      choice.views = before.includes(name) ? before.filter(v => v !== name) : [...new Set([...before, ...span])];
+    },
+  })), table.label[0], table.label[table.label.length - 1]);
+}
+
+function plot(table, follows) {
+  const spread = table.mean_sigma.map(x => 2 * (x ?? 0));
+  const most = Math.max(...table.mean.map((x, i) => Math.abs(x ?? 0) + spread[i]), 1e-9);
+  const unit = table.unit ? ` ${table.unit}` : "", chosen = choice.bins[table.name];
+  const told = follows.includes(table.name) ? "what is unexplained follows it; " : "";
+  return card(`${table.name}${table.unit ? ` (${table.unit})` : ""}`, `${told}signed mean ± 2σ, within ±${um(most)}`, "", table.mean.map((mean, i) => bar({
+    key: `${table.name} ${i}`, height: (mean ?? 0) / most / 2, from: 0.5, spread: spread[i] / most / 2,
+    pressed: Boolean(chosen && chosen[0] <= i && i <= chosen[1]),
+    label: `${table.name} from ${digits(table.low[i])} to ${digits(table.high[i])}${unit}: mean ${um(mean)} ± ${um(table.mean_sigma[i])}, rms ${um(table.rms[i])}, ${table.views[i]} views`,
+    toggle: range => {
+      if (range && chosen) choice.bins[table.name] = [Math.min(i, chosen[0]), Math.max(i, chosen[1])];
+      else if (chosen && chosen[0] === i && chosen[1] === i) delete choice.bins[table.name];
+      else choice.bins[table.name] = [i, i];
+    },
+  })), digits(table.low[0]), digits(table.high[table.high.length - 1]), true);
+}
+
+function card(title, words, kind, bars, low, high, zero = false) {
+  return element("div", { class: `plot ${kind}`, role: "group", "aria-label": title },
+    element("h3", {}, title), element("p", { class: "soft" }, words),
+    element("div", { class: "bins" }, ...bars, zero && element("div", { class: "zero", style: { top: "50%" } })),
+    element("div", { class: "ends" }, element("span", {}, low), element("span", {}, high)));
+}
+
+function bar({ key, height, from, spread = 0, pressed, label, toggle }) {
+  const share = x => `${100 * x}%`, low = Math.min(height, 0), size = Math.abs(height);
+  return element("button", {
+    type: "button", "data-key": key, "aria-pressed": String(pressed), "aria-label": label, title: label,
+    onclick: event => { toggle(event.shiftKey); draw(); ask(); },
+  }, element("i", { style: { bottom: share(from + low), height: share(size) } }),
+  spread > 0 && element("u", { style: { bottom: share(Math.max(0, from + height - spread)), height: share(Math.min(1, 2 * spread)) } }));
+}
+
+function places() {
+  const table = state.comparison.find(t => t.name === PLACES);
+  if (!table || !state.part) return "";
+  const fair = table.count.map((n, i) => [n, i]).filter(([n]) => n > 50).map(([, i]) => i);
+  const worst = fair.sort((a, b) => table.rms[b] - table.rms[a]).slice(0, 4);
+  return element("div", { class: "plot", role: "group", "aria-label": "Places of the part" },
+    element("h3", {}, "Places of the part"), element("p", { class: "soft" }, "where it is worst; reference frame"),
+    element("div", { class: "places" }, ...worst.map(i => {
+      const place = table.label[i].replace(/[()]/g, "").split(",").map(Number);
+      const pressed = Boolean(choice.place) && place.every((x, k) => x === choice.place[k]);
+      return element("button", { type: "button", "data-key": `place ${i}`, "aria-pressed": String(pressed),
+        onclick: () => pressed ? choosePlace(null) : choosePlace(place, 0, `the place ${table.label[i]}`) },
+      `${table.label[i]}: ${um(table.rms[i])}`);
+    })));
+}
+
+function words() {
+  const out = Object.entries(choice.bins).map(([name, [first, last]]) => {
+    const table = state.comparison.find(t => t.name === name);
+    return `${name} ${digits(table.low[first])} … ${digits(table.high[last])} ${table.unit}`.trim();
+  });
+  if (choice.views.length) out.push(choice.views.length > 3 ? `${choice.views.length} views` : choice.views.join(", "));
+  if (choice.place) out.push(choice.name);
+  return out.join(" · ");
+}
+
+// Ask for the field of the choice; an answer that comes after a later question is not shown.
+async function ask() {
+  const mine = ++asked, name = words();
+  if (!name) { showChoice("", null); numbers(null); return; }
+  try {
+    const { views, bins, place, within } = choice;
+    const told = await send("chosen", { views, bins, place, within });
+    if (mine !== asked) return;
+    if (told.model !== state.model) return;
+    showChoice(name, told); numbers(name, told);
+  } catch (error) {
+    if (mine === asked) numbers(name, null, error.message);
+  }
+}
+
+function numbers(name, told, problem) {
+  const root = at("chosen");
+  if (!name) { root.replaceChildren(element("p", { class: "soft" }, "Nothing is chosen: all views and all places count.")); return; }
+  const clear = element("button", { type: "button", onclick: () => { choice = empty(); draw(); ask(); } }, "Show all again");
+  if (problem || !told.chosen.correspondences) {
+    root.replaceChildren(clear, element("p", {}, `Chosen: ${name}`), element("p", {}, problem || "No correspondence lies there."));
+    return;
+  }
+  const { chosen, all } = told;
+  root.replaceChildren(clear, element("p", {}, element("b", {}, `Chosen: ${name}`)),
+    element("p", {}, `${chosen.views} of ${all.views} views, ${chosen.correspondences.toLocaleString("en")} residuals: rms ${um(chosen.rms)} (all: ${um(all.rms)}), `
+      + `on average over the part ${um(chosen.mean)} (all: ${um(all.mean)}), signed mean ${um(chosen.signed)}.`));
+}

@@ -1,0 +1,84 @@
+// The review: reads the run as it stands, and draws it anew whenever it changes, whoever changed it.
+import { showCandidates } from "./candidates.js";
+import { at } from "./elements.js";
+import { showLedger } from "./ledger.js";
+import { heardOwn, showOwn } from "./own_effect.js";
+import { choosePlace, showPlots } from "./plots.js";
+import { onPick, show, showNumbers } from "./scene.js";
+import { listen, read, send } from "./server.js";
+import * as work from "./work.js";
+
+let state = null, version = null, reading = false, again = false;
+
+async function refresh() {
+  if (reading) { again = true; return; }
+  reading = true;
+  try {
+    const next = await read("state");
+    version = next.version;
+    problem(next.problem);
+    if (!next.problem) { state = next; await draw(); prepare(); }
+  } catch (error) {
+    problem(error.message);
+  } finally {
+    reading = false;
+    if (again) { again = false; refresh(); }
+  }
+}
+
+async function draw() {
+  at("name").textContent = `Review of ${state.name}`;
+  at("sentence").textContent = state.sentence;
+  at("evidence").textContent = state.evidence === state.sentence ? "" : state.evidence;
+  await show(state);
+  showNumbers(state);
+  showPlots(state);
+  showOwn(state);
+  controls();
+}
+
+function controls() {
+  if (!state) return;
+  const busy = work.busy() || Boolean(state.trust);
+  showCandidates(state, ask, busy);
+  showLedger(state, ask, busy);
+}
+
+// What a run folder lacks for its plots is made by a command, once for a model.
+const prepared = new Set();
+function prepare() {
+  if (state.trust || prepared.has(state.model)) return;
+  prepared.add(state.model);
+  if (state.outdated) ask({ kind: "report" });
+  if (!state.comparison) ask({ kind: "compare" });
+}
+
+async function ask(command) {
+  try {
+    await send("jobs", { ...command, model: state.model });
+    problem(null);
+  } catch (error) {
+    problem(error.message);
+  }
+}
+
+function problem(text) {
+  at("problem").hidden = !text;
+  at("problem").textContent = text || "";
+}
+
+listen(event => {
+  if (event.type === "changed" && event.version !== version) refresh();
+  if (event.type === "job") {
+    const before = work.heard(event.job);
+    heardOwn(event.job);
+    if (before !== event.job.state) controls();
+  }
+}, () => problem("The server does not answer; is `stitch review` still running? This page asks again by itself."));
+
+onPick(place => choosePlace(place));
+at("note-form").addEventListener("submit", async event => {
+  event.preventDefault();
+  await ask({ kind: "note", text: at("note").value, by: at("by").value });
+  at("note").value = "";
+});

@@ -1,0 +1,57 @@
+// The part: its viewer made anew for every model, with the eye where it was, fading from the old field to the new.
+import { at, element, um } from "./elements.js";
+import { read } from "./server.js";
+
+const root = at("scene");
+let viewer = null, model = null, diagnosed = null;
+
+// Show the part of a state; true if it was made anew. `fade`: from the model before to the present one.
+export async function show(state) {
+  if (!state.part) { root.classList.remove("live"); model = null; return false; }
+  const mark = state.diagnosis ? state.diagnosis.sentence : null;
+  if (state.model === model && mark === diagnosed) return false;
+  const told = await read("part");
+  const changed = model !== null && told.model !== model, eye = viewer && viewer.eye();
+  if (viewer) viewer.stop();
+  const old = root.querySelector("canvas"), fresh = old.cloneNode(false);
+  const context = viewer && old.getContext("webgl2"), focused = document.activeElement === old;
+  old.replaceWith(fresh);
+  if (context) context.getExtension("WEBGL_lose_context")?.loseContext();
+  if (focused) fresh.focus();
+  viewer = window.showPart(root, told.part, told.predicted, eye);
+  at("no-part").hidden = viewer !== null;
+  model = told.model; diagnosed = mark;
+  if (!viewer) return true;
+  const last = Math.max(viewer.names().length - 2, 0);  // the present model; register comes after it
+  viewer.jump(changed ? Math.max(last - 1, 0) : last);
+  if (changed) viewer.glide(last);
+  return true;
+}
+
+export const predict = name => viewer !== null && viewer.predict(name);
+export const onPick = heard => root.addEventListener("pick", event => heard(event.detail));
+
+// The field of a choice beside that of everything; null takes it away.
+export function showChoice(name, told) {
+  if (!viewer) return;
+  viewer.choose(name, told && [
+    { name: "everything", mean: told.all.mean, values: told.all.values },
+    { name: "chosen", mean: told.chosen.mean ?? 0, values: told.chosen.values },
+  ]);
+}
+
+// The three numbers of a model, and how far they fell by its last step.
+export function showNumbers(state) {
+  const before = state.ledger.length > 1 ? state.ledger[state.ledger.length - 2] : null;
+  const tile = (value, words, old) => element("div", { class: "tile" },
+    element("b", {}, um(value)), element("small", {}, words), old != null && value != null && fell(value, old));
+  at("tiles").replaceChildren(
+    tile(state.residual, "rms between views, in the fit", before && before.residual),
+    tile(state.heldout, "rms on views left out", before && before.heldout),
+    tile(state.floor, "noise floor of the sensor"));
+}
+
+function fell(value, old) {
+  const share = Math.round(100 * (value / old - 1));
+  return element("span", { class: share < 0 ? "fell" : "soft" }, `${share < 0 ? "−" : "+"}${Math.abs(share)} % from ${um(old)}`);
+}
