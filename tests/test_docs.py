@@ -18,7 +18,16 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FOLDERS = ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
 # Files of somebody's own, of sessions and of run folders.
-OTHERS = {"mine.py", "session.toml", "model.toml", "robot.toml", "my-cell.toml", "job.toml", "stand.toml"}
+OTHERS = {
+    "mine.py",
+    "review_effects.py",
+    "session.toml",
+    "model.toml",
+    "robot.toml",
+    "my-cell.toml",
+    "job.toml",
+    "stand.toml",
+}
 # Words that the glossary replaces.
 PRIVATE = re.compile(r"\bsuspects?\b|look-?alikes?|\bmend(s|ed)?\b|\bgross errors?\b", re.IGNORECASE)
 

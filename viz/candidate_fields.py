@@ -9,7 +9,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.predicted_distances import predicted_distances
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.units import MICROMETRES
-from viz.part_data import packed_floats, packed_values
+from viz.packed_numbers import packed_floats, packed_values
 
 # Best candidate effects whose field a page holds.
 _SHOWN = 3

@@ -1,9 +1,7 @@
 """A diagnosis as native views in the recording of its run: the tab "What is missing"."""
 
 import os
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
+from viz.rerun_program import rerun_program
 from viz.rrd_file import RecordingFile, id_of
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
@@ -71,8 +70,3 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
     moved = np.linalg.norm(found.linear.displaced(), axis=1) * um
     rec.log("diagnosis/displaced", rr.BarChart(moved, color=COLOURS_OF_FEW[0]), static=True)
-
-
-def rerun_program() -> str:
-    """The program that came with the library."""
-    return shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"

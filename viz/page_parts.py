@@ -1,22 +1,9 @@
-"""Parts of a page: templates filled in, figures as data addresses that need nothing beside the page."""
+"""Figures of a page as data addresses, which need nothing beside it."""
 
 import base64
 import io
-import json
 
-from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
-
-
-def render(template: str, **content: object) -> str:
-    """A template of `viz/templates` filled in; text is escaped."""
-    environment = Environment(loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True)
-    return environment.get_template(template).render(**content)
-
-
-def script_json(data: object) -> str:
-    """Plain data as JSON that may stand inside a script element."""
-    return json.dumps(data).replace("<", "\\u003c")
 
 
 def svg(figure: Figure) -> str:

@@ -1,23 +1,21 @@
 """What the viewer of the page needs, packed: the surface once, the field of every step of the model's history."""
 
-import base64
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from numpy.typing import NDArray
 
 from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.colours import FIELD, SIGNED
+from viz.packed_numbers import packed, packed_floats, packed_values
 from viz.part_camera import Camera
 from viz.part_surface import PartSurface
 
 # Views whose own field a page holds.
 _VIEWS = 24
-_UNKNOWN = -32768
 _STOPS = 17
 
 
@@ -63,29 +61,17 @@ def packed_surface(surface: PartSurface, camera: Camera, patches: Array) -> dict
     low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
     centre = (flat.max(axis=0) + low) / 2
     return {
-        "vertices": _base64(np.round((flat - centre) / size * 32767).astype("<i2")),
-        "normals": _base64(np.round(surface.normals @ camera.axes.T * 127).astype("i1")),
-        "triangles": _base64(surface.triangles.astype("<u4")),
-        "near": _base64(surface.patch.astype("<u2")),
-        "weight": _base64(np.round(surface.weight * 255).astype("u1")),
+        "vertices": packed(np.round((flat - centre) / size * 32767).astype("<i2")),
+        "normals": packed(np.round(surface.normals @ camera.axes.T * 127).astype("i1")),
+        "triangles": packed(surface.triangles.astype("<u4")),
+        "near": packed(surface.patch.astype("<u2")),
+        "weight": packed(np.round(surface.weight * 255).astype("u1")),
         "patches": packed_floats((patches @ camera.axes.T - centre) / size),
         "axes": camera.axes.tolist(),
         "centre": centre.tolist(),
         "size": size,
         "box": (np.ptp(flat, axis=0) / size).tolist(),
     }
-
-
-def packed_values(values: Array) -> dict[str, Any]:
-    """16 bits a value and the size of one count; what nobody knows is the smallest number."""
-    known = np.isfinite(values)
-    count = float(np.abs(values[known]).max(initial=0.0)) / 32000 or 1.0
-    return {"count": count, "data": _base64(np.where(known, np.nan_to_num(values) / count, _UNKNOWN).astype("<i2"))}
-
-
-def packed_floats(numbers: Array) -> str:
-    """32 bits a number."""
-    return _base64(numbers.astype("<f4"))
 
 
 def _mean_abs(values: Array) -> float:
@@ -96,7 +82,3 @@ def _mean_abs(values: Array) -> float:
 def _stops(name: str) -> list[list[int]]:
     """RGB of a colour map at equal steps."""
     return [[round(255 * c) for c in colormaps[name](x)[:3]] for x in np.linspace(0, 1, _STOPS)]
-
-
-def _base64(numbers: NDArray[Any]) -> str:
-    return base64.b64encode(np.ascontiguousarray(numbers).tobytes()).decode()

@@ -10,9 +10,10 @@ from stitch.runs.run import Run
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
+from viz.filled_templates import render, script_json
 from viz.history_figures import waterfall
 from viz.identity import identity
-from viz.page_parts import png, render, script_json, svg
+from viz.page_parts import png, svg
 from viz.page_tables import effect_rows, hand_eye_rows, matrix, target_rows, view_rows
 from viz.part_camera import camera_for
 from viz.part_data import part_data

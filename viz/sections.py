@@ -18,7 +18,8 @@ from viz import diagnosis_figures as draw
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
 from viz.comparison_figures import comparison
 from viz.diagnosis_recording import add_diagnosis
-from viz.page_parts import render, script_json, svg_address, svg_text
+from viz.filled_templates import render, script_json
+from viz.page_parts import svg_address, svg_text
 
 # Candidate effects in the table of the page.
 _SHOWN = 8

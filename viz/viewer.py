@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stitch.errors import InputError, NoResultError
-from viz.diagnosis_recording import rerun_program
+from viz.rerun_program import rerun_program
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]) -> None:

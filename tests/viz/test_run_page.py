@@ -11,7 +11,7 @@ from markupsafe import escape
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import judged, plain_verdict
 from stitch.writing.result_document import result_document
-from viz.page_parts import render
+from viz.filled_templates import render
 from viz.run_page import write_report
 
 LARGEST = 8_000_000  # bytes that can be mailed

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from viz.page_parts import png, render, svg
+from viz.filled_templates import render
+from viz.page_parts import png, svg
 
 # Beyond so many marks a drawing of lines is larger than one of pixels.
 _PIXELS = 130

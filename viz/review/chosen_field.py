@@ -10,7 +10,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.frames import Array, Indices, Mask
-from viz.part_data import packed_values
+from viz.packed_numbers import packed_values
 from viz.review.residual_rows import ResidualRows
 
 # Patches about a correspondence that it counts for, and within how many of their radii.

@@ -38,7 +38,7 @@ def review(
     found = RunReview(run.resolve(), None if effects_file is None else effects_file.resolve(), trust)
     config = uvicorn.Config(
         review_app(found, token, nonce),
-        log_level="warning",
+        log_level="critical",
         access_log=False,
         server_header=False,
         timeout_graceful_shutdown=_GRACE,
@@ -59,6 +59,7 @@ def _socket(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((_HERE, port))
+        listening.listen()  # a browser that comes before the server has begun waits
     except OSError as error:
         listening.close()
         raise InputError(f"--port {port}: {error.strerror}; to fix: name another, or leave it out") from None

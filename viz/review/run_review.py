@@ -2,6 +2,7 @@
 
 import re
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,11 @@ class RunReview:
             file.write_text(text, encoding="utf-8")
         self.effects_file = path
         return path
+
+    def warm(self) -> None:
+        """Read the residuals before somebody chooses among them."""
+        with suppress(InputError):
+            self.chosen(Choice())
 
     def chosen(self, choice: Choice) -> dict[str, Any]:
         """Field and numbers of a choice.

@@ -91,6 +91,7 @@ def _read(run: Path, version: str) -> Snapshot:
         "history": undo_history([step.effects for step in ledger]),
         "part": part is not None,
         "outdated": part is not None and "patchRadius" not in part,
+        "pictured": re.findall(r'"name": "(\w+)"', predicted or ""),
         "recording": (run / "recording.rrd").is_file(),
         "notes": [*result["notes"], *(f"Not observable from these motions: {x}." for x in result["unobservable"])],
     }

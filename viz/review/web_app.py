@@ -2,12 +2,14 @@
 
 import asyncio
 import json
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
@@ -15,11 +17,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from stitch.errors import StitchError
-from viz.page_parts import render
+from viz.filled_templates import render
 from viz.review.chosen_field import Choice
 from viz.review.guard import Guard
 from viz.review.jobs import Busy, Job, Jobs
 from viz.review.news import News
+from viz.review.rerun_viewer import NAMES, RerunViewer
 from viz.review.run_review import RunReview
 
 _SCRIPTS = Path(__file__).parent / "scripts"
@@ -45,6 +48,7 @@ def review_app(review: RunReview, token: str, nonce: str) -> ASGIApp:
             for task in tasks:
                 with suppress(asyncio.CancelledError):
                     await task
+            pages.viewer.close()
 
     routes = [
         Route("/", pages.page),
@@ -57,9 +61,10 @@ def review_app(review: RunReview, token: str, nonce: str) -> ASGIApp:
         Route("/trust", pages.trust, methods=["POST"]),
         Route("/stop", pages.stop, methods=["POST"]),
         Route("/scripts/part_viewer.js", lambda _: FileResponse(_VIEWER)),
+        Route("/rerun/{name}", pages.rerun),
         Mount("/scripts", StaticFiles(directory=_SCRIPTS)),
     ]
-    return Guard(Starlette(routes=routes, lifespan=lifespan), token, nonce)
+    return Guard(Starlette(routes=routes, lifespan=lifespan, exception_handlers={Exception: _fault}), token, nonce)
 
 
 async def _watch(review: RunReview, news: News) -> None:
@@ -77,6 +82,7 @@ class _Pages:
 
     def __init__(self, review: RunReview, jobs: Jobs, news: News, nonce: str) -> None:
         self.review, self.jobs, self.news, self.nonce = review, jobs, news, nonce
+        self.viewer = RerunViewer()
 
     def page(self, request: Request) -> Response:
         return HTMLResponse(render("review.html.j2", nonce=self.nonce, run=self.review.run.name))
@@ -92,7 +98,8 @@ class _Pages:
             return _refused(error)
         held = {"part": found.part or "null", "predicted": found.predicted or "null"}  # JSON already
         text = f'{{"model": {json.dumps(found.model)}, "part": {held["part"]}, "predicted": {held["predicted"]}}}'
-        return Response(text, media_type="application/json")
+        warm = BackgroundTask(self.review.warm)
+        return Response(text, media_type="application/json", background=warm)
 
     async def chosen(self, request: Request) -> Response:
         try:
@@ -161,6 +168,18 @@ class _Pages:
         self.jobs.stop()
         return JSONResponse({})
 
+    def rerun(self, request: Request) -> Response:
+        """The Rerun viewer, and the recording that it shows."""
+        name = request.path_params["name"]
+        if name == "recording.rrd" and (self.review.run / name).is_file():
+            return FileResponse(self.review.run / name)
+        if name not in NAMES:
+            return _wrong("not found", 404)
+        try:
+            return FileResponse(self.viewer.file(name))
+        except StitchError as error:
+            return _refused(error)
+
     def _submitted(self, kind: str, arguments: list[str], model: str | None = None) -> dict[str, Any]:
         """One that waits or runs already is not asked for twice."""
         same: Job | None = next(
@@ -179,6 +198,13 @@ async def _object(request: Request) -> dict[str, Any] | None:
 
 def _wrong(text: str, status: int = 400) -> Response:
     return JSONResponse({"problem": text}, status_code=status)
+
+
+async def _fault(_: Request, error: Exception) -> Response:
+    """A fault of the program: one line for the page and the terminal."""
+    text = f"unexpected {type(error).__name__}: {error}; a fault of stitch"
+    print(f"stitch: {text}", file=sys.stderr, flush=True)
+    return _wrong(text, 500)
 
 
 def _refused(error: Exception) -> Response:

@@ -97,7 +97,10 @@ function showPart(root, data, more, eye) {
   let steps = [], shown = -1, wanted = false, selection = null;
 
   const candidates = [];
-  if (more) {  // patches of a diagnosis lie elsewhere: each of ours takes the nearest
+  function learn(more) {  // patches of a diagnosis lie elsewhere: each of ours takes the nearest
+    const before = choice.value;
+    candidates.length = 0;
+    [...choice.options].filter(o => o.value.startsWith("c")).forEach(o => o.remove());
     const axes = data.axes, own = new Float32Array(bytes(data.patches));
     const other = new Float32Array(bytes(more.patches)), nearest = new Uint16Array(own.length / 3);
     for (let i = 0; i < nearest.length; i++) {
@@ -117,10 +120,12 @@ function showPart(root, data, more, eye) {
         { name: "as it is", mean: more.mean, noise: more.noise, values: of(more.values) },
         { name: `if ${c.name} were added`, mean: c.mean, noise: more.noise, values: of(c.values) }] });
     }
+    candidates.forEach((c, i) => choice.add(new Option(`predicted: ${c.name}`, `c${i}`)));
+    if (choice.value !== before) { choose(); names(); label(); }  // what was shown is not there any more
   }
   choice.length = 1;
   data.views.forEach((view, i) => choice.add(new Option(`view ${view.name} against the others`, `v${i}`)));
-  candidates.forEach((c, i) => choice.add(new Option(`predicted: ${c.name}`, `c${i}`)));
+  if (more) learn(more);
 
   const isSigned = () => choice.value.startsWith("v");
   const full = () => isSigned() ? data.fullSigned : data.full;
@@ -272,6 +277,7 @@ function showPart(root, data, more, eye) {
   return {
     names: () => data.steps.map(s => s.name),
     glide,
+    learn,
     eye: () => ({ yaw, pitch, zoom, panX, panY }),
     jump(to) { cancelAnimationFrame(gliding); slider.value = to; label(); draw(); },
     stop() { cancelAnimationFrame(gliding); },

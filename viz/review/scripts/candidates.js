@@ -20,14 +20,15 @@ export function showCandidates(state, ask, busy) {
   }
   const rows = all ? found.candidates : found.candidates.slice(0, FIRST);
   const most = Math.max(state.residual, ...rows.map(c => c.heldout_if_added ?? 0));
-  root.replaceChildren(
-    element("h3", {}, TITLES[found.verdict]), element("p", {}, found.sentence), legend(),
-    element("div", { class: "scroll" }, element("table", { class: "candidate" },
+  const table = [legend(), element("div", { class: "scroll" }, element("table", { class: "candidate" },
       element("thead", {}, element("tr", {}, ...["candidate effect", "rms if added (µm)", "posterior", ""].map(h => element("th", { scope: "col" }, h || element("span", { "aria-label": "add" }))))),
       element("tbody", {}, row("as it is", state.residual, state.heldout, most, state.floor), ...rows.flatMap(c => candidate(c, found, state, most, ask, busy))))),
-    found.candidates.length > FIRST && element("button", { type: "button", "aria-expanded": String(all), onclick: () => { all = !all; showCandidates(state, ask, busy); } },
-      all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`),
-    limits(found));
+  found.candidates.length > FIRST && element("button", { type: "button", "aria-expanded": String(all), onclick: () => { all = !all; showCandidates(state, ask, busy); } },
+      all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`)].filter(Boolean);
+  const open = all || root.querySelector("#tried[open]") !== null;
+  root.replaceChildren(element("h3", {}, TITLES[found.verdict]), element("p", {}, found.sentence),
+    ...(found.verdict === "adequate" ? [element("details", { id: "tried", open }, element("summary", {}, "Candidate effects that were tried"), ...table)] : table),
+    ...[limits(found)].filter(Boolean));
 }
 
 export const legend = () => element("p", { class: "legend" },
@@ -53,13 +54,13 @@ function candidate(c, found, state, most, ask, busy) {
   const named = found.named.includes(c.effect);
   const add = element("button", { type: "button", class: named ? "main" : "", disabled: busy, "aria-label": `Add ${c.effect}`,
     title: `stitch add ${state.run} ${c.effect}`, onclick: () => ask({ kind: "add", effects: [c.effect] }) }, "Add");
-  const look = element("button", { type: "button", "aria-label": `Show the part as ${c.effect} should leave it`,
-    onclick: () => { if (!predict(c.effect)) look.replaceWith(element("span", { class: "soft" }, "no picture")); } }, "Show");
+  const look = state.pictured.includes(c.effect) && element("button", { type: "button", "aria-label": `Show the part as ${c.effect} should leave it`,
+    onclick: () => predict(c.effect) }, "Show");
   return [
     element("tr", { class: named ? "best" : "" }, element("td", {}, c.effect + (c.own ? " (your own)" : "")),
       element("td", { class: "bars", "aria-label": numbers(c.rms_if_added, c.heldout_if_added) },
         c.rms_if_added == null ? "–" : bars(c.rms_if_added, c.heldout_if_added, most, state.floor)),
-      element("td", {}, c.posterior.toFixed(2)), element("td", {}, look, " ", add)),
+      element("td", {}, c.posterior.toFixed(2)), element("td", {}, look || "", " ", add)),
     element("tr", {}, element("td", { class: "wide", colspan: "4" },
       [numbers(c.rms_if_added, c.heldout_if_added), c.amounts, `p = ${c.p}`, c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
   ];

@@ -116,6 +116,7 @@ function words() {
 async function ask() {
   const mine = ++asked, name = words();
   if (!name) { showChoice("", null); numbers(null); return; }
+  at("chosen").setAttribute("aria-busy", "true");
   try {
     const { views, bins, place, within } = choice;
     const told = await send("chosen", { views, bins, place, within });
@@ -129,6 +130,7 @@ async function ask() {
 
 function numbers(name, told, problem) {
   const root = at("chosen");
+  root.removeAttribute("aria-busy");
   if (!name) { root.replaceChildren(element("p", { class: "soft" }, "Nothing is chosen: all views and all places count.")); return; }
   const clear = element("button", { type: "button", onclick: () => { choice = empty(); draw(); ask(); } }, "Show all again");
   if (problem || !told.chosen.correspondences) {

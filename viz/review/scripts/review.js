@@ -4,6 +4,7 @@ import { at } from "./elements.js";
 import { showLedger } from "./ledger.js";
 import { heardOwn, showOwn } from "./own_effect.js";
 import { choosePlace, showPlots } from "./plots.js";
+import { showRecording } from "./recording.js";
 import { onPick, show, showNumbers } from "./scene.js";
 import { listen, read, send } from "./server.js";
 import * as work from "./work.js";
@@ -34,6 +35,7 @@ async function draw() {
   showNumbers(state);
   showPlots(state);
   showOwn(state);
+  showRecording(state);
   controls();
 }
 
@@ -67,14 +69,18 @@ function problem(text) {
   at("problem").textContent = text || "";
 }
 
+let silent = false;
+function lost(text) { silent = true; problem(text); }
+
 listen(event => {
+  if (silent) { silent = false; problem(null); }
   if (event.type === "changed" && event.version !== version) refresh();
   if (event.type === "job") {
     const before = work.heard(event.job);
     heardOwn(event.job);
     if (before !== event.job.state) controls();
   }
-}, () => problem("The server does not answer; is `stitch review` still running? This page asks again by itself."));
+}, () => lost("The server does not answer; is `stitch review` still running? This page asks again by itself."));
 
 onPick(place => choosePlace(place));
 at("note-form").addEventListener("submit", async event => {

@@ -8,9 +8,14 @@ let viewer = null, model = null, diagnosed = null;
 // Show the part of a state; true if it was made anew. `fade`: from the model before to the present one.
 export async function show(state) {
   if (!state.part) { root.classList.remove("live"); model = null; return false; }
-  const mark = state.diagnosis ? state.diagnosis.sentence : null;
+  const mark = state.pictured.join() + (state.diagnosis ? state.diagnosis.sentence : "");
   if (state.model === model && mark === diagnosed) return false;
   const told = await read("part");
+  if (viewer && told.model === model) {
+    diagnosed = mark;
+    if (told.predicted) viewer.learn(told.predicted);
+    return false;
+  }
   const changed = model !== null && told.model !== model, eye = viewer && viewer.eye();
   if (viewer) viewer.stop();
   const old = root.querySelector("canvas"), fresh = old.cloneNode(false);
