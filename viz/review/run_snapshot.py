@@ -2,9 +2,10 @@
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from stitch.comparison.model_history import change_of
 from stitch.errors import InputError
@@ -18,6 +19,7 @@ from viz.review.undo_history import undo_history
 # What the page shows comes from these; a change of one is a change of the run.
 _FILES = ("result.json", "ledger.json", "compare.json", "diagnosis.json", "report.html", "residuals.parquet")
 _TRIES = 3
+_Told = TypeVar("_Told")
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,8 @@ def version_of(run: Path, files: tuple[str, ...] = _FILES) -> str:
 def _read(run: Path, version: str) -> Snapshot:
     result, ledger = read_documents(run)
     um = MICROMETRES[result["length_unit"]]
-    comparison, diagnosis = (_json(run / f"{name}.json") for name in ("compare", "diagnosis"))
+    comparison = _told(run / "compare.json", lambda document: (document, _tables(document, um)))
+    diagnosis = _told(run / "diagnosis.json", lambda document: told_diagnosis(document, um))
     page = _text(run / "report.html")
     part, predicted = (_script(page, name) for name in ("part-data", "candidate-data"))
     steps = (result.get("disagreement") or {}).get("steps", [])
@@ -86,8 +89,8 @@ def _read(run: Path, version: str) -> Snapshot:
         "steps": [{"step": s["step"], "mean": s["mean"] * um, "noise": s["of_noise"] * um} for s in steps],
         "ledger": [_step(ledger, i, um) for i in range(len(ledger))],
         "effects": _effects(result),
-        "diagnosis": None if diagnosis is None else told_diagnosis(diagnosis, um),
-        "comparison": None if comparison is None else _tables(comparison, um),
+        "diagnosis": diagnosis,
+        "comparison": None if comparison is None else comparison[1],
         "history": undo_history([step.effects for step in ledger]),
         "part": part is not None,
         "outdated": part is not None and "patchRadius" not in part,
@@ -95,7 +98,8 @@ def _read(run: Path, version: str) -> Snapshot:
         "recording": (run / "recording.rrd").is_file(),
         "notes": [*result["notes"], *(f"Not observable from these motions: {x}." for x in result["unobservable"])],
     }
-    return Snapshot(version, model, state, part, predicted, result=result, comparison=comparison)
+    document = None if comparison is None else comparison[0]
+    return Snapshot(version, model, state, part, predicted, result=result, comparison=document)
 
 
 def _step(ledger: tuple[LedgerStep, ...], i: int, um: float) -> dict[str, Any]:
@@ -140,15 +144,19 @@ def _tables(comparison: dict[str, Any], um: float) -> list[dict[str, Any]]:
     ]
 
 
-def _json(path: Path) -> dict[str, Any] | None:
+def _told(path: Path, tell: Callable[[dict[str, Any]], _Told]) -> _Told | None:
+    """What a document tells; None where there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
     text = _text(path)
     if not text:
         return None
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: damaged ({shortened(str(error))}); run its command again") from None
-    return found if isinstance(found, dict) else None
+        return tell(json.loads(text))
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: damaged ({shortened(repr(error))}); run its command again") from None
 
 
 def _text(path: Path) -> str:

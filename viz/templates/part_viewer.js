@@ -1,95 +1,11 @@
-// The part in 3D with the field of disagreement. One file, no library, no network.
+// The part in 3D with the field of disagreement: steps of the model, single views, candidate effects. No library, no network.
 "use strict";
 
 // Show a part in the elements of `root`; `more` are the fields of candidate effects, `eye` where it was looked at from.
 function showPart(root, data, more, eye) {
-  const canvas = root.querySelector("canvas"), gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
-  if (!gl) return null;  // the still picture stays
-  const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
-  const vertices = new Int16Array(bytes(data.vertices)), normals = new Int8Array(bytes(data.normals));
-  const triangles = new Uint32Array(bytes(data.triangles)), near = new Uint16Array(bytes(data.near));
-  const weight = new Uint8Array(bytes(data.weight)), count = vertices.length / 3;
-  const unpack = packed => {
-    const raw = new Int16Array(bytes(packed.data)), out = new Float32Array(raw.length);
-    for (let i = 0; i < raw.length; i++) out[i] = raw[i] === -32768 ? NaN : raw[i] * packed.count;
-    return out;
-  };
-  const unknown = -1e9;
-  const onVertices = values => {
-    const out = new Float32Array(count);
-    for (let i = 0; i < count; i++) {
-      let sum = 0, total = 0;
-      for (let k = 3 * i; k < 3 * i + 3; k++) {
-        const v = values[near[k]];
-        if (!Number.isNaN(v)) { sum += weight[k] * v; total += weight[k]; }
-      }
-      out[i] = total ? sum / total : unknown;
-    }
-    return out;
-  };
-
-  const vertexCode = `#version 300 es
-    in vec3 place; in vec3 normal; in float before; in float after;
-    uniform mat3 turn; uniform vec2 scale; uniform vec2 shift; uniform float dot;
-    uniform float blend; uniform float full; uniform float isSigned;
-    out vec3 facing; out float share; out float known;
-    void main() {
-      vec3 p = turn * place;
-      facing = turn * normal;
-      known = min(before, after) < -1e8 ? 0.0 : 1.0;
-      float value = mix(before, after, blend);
-      share = isSigned > 0.5 ? 0.5 + value / (2.0 * full) : value / full;
-      gl_Position = vec4(p.xy * scale + shift, -p.z * 0.5, 1.0);
-      gl_PointSize = dot;
-    }`;
-  const pixelCode = `#version 300 es
-    precision highp float;
-    in vec3 facing; in float share; in float known;
-    uniform sampler2D map; uniform float row;
-    out vec4 colour;
-    void main() {
-      vec3 n = normalize(facing);
-      float light = 0.55 + 0.45 * abs(dot(n, normalize(vec3(-0.25, 0.45, 0.86))));
-      vec3 base = known > 0.5 ? texture(map, vec2(0.03 + 0.94 * clamp(share, 0.0, 1.0), row)).rgb : vec3(0.62);
-      colour = vec4(base * light, 1.0);
-    }`;
-  const compiled = (kind, code) => {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, code); gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    return shader;
-  };
-  const program = gl.createProgram();
-  gl.attachShader(program, compiled(gl.VERTEX_SHADER, vertexCode));
-  gl.attachShader(program, compiled(gl.FRAGMENT_SHADER, pixelCode));
-  gl.linkProgram(program); gl.useProgram(program);
-  const at = name => gl.getUniformLocation(program, name);
-  const attribute = (name, array, size, type, normalised) => {
-    const buffer = gl.createBuffer(), place = gl.getAttribLocation(program, name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.bufferData(gl.ARRAY_BUFFER, array, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(place); gl.vertexAttribPointer(place, size, type, normalised, 0, 0);
-    return buffer;
-  };
-  const padded = (from, Kind) => {  // attributes of three small numbers would not lie on four bytes
-    const out = new Kind(4 * count);
-    for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) out[4 * i + k] = from[3 * i + k];
-    return out;
-  };
-  attribute("place", padded(vertices, Int16Array), 4, gl.SHORT, true);
-  attribute("normal", padded(normals, Int8Array), 4, gl.BYTE, true);
-  const beforeBuffer = attribute("before", new Float32Array(count), 1, gl.FLOAT, false);
-  const afterBuffer = attribute("after", new Float32Array(count), 1, gl.FLOAT, false);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
-  const stops = data.colours.field.length, picture = new Uint8Array(4 * 2 * stops);
-  ["field", "signed"].forEach((name, row) => data.colours[name].forEach((rgb, i) =>
-    picture.set([...rgb, 255], 4 * (row * stops + i))));
-  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, stops, 2, 0, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-  for (const [key, value] of [[gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
-    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE]])
-    gl.texParameteri(gl.TEXTURE_2D, key, value);
-
+  const numbers = partNumbers(data), { bytes, vertices, count, unpack, onVertices } = numbers;
+  const canvas = root.querySelector("canvas"), drawing = partDrawing(canvas, numbers, data.colours);
+  if (!drawing) return null;  // the still picture stays
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
   const play = root.querySelector("button[data-play]");
@@ -170,27 +86,12 @@ function showPart(root, data, more, eye) {
     wanted = true;
     requestAnimationFrame(() => {
       wanted = false;
-      const w = canvas.clientWidth, h = canvas.clientHeight, r = window.devicePixelRatio || 1;
-      if (canvas.width !== Math.round(w * r) || canvas.height !== Math.round(h * r)) {
-        canvas.width = Math.round(w * r); canvas.height = Math.round(h * r);
-      }
-      gl.viewport(0, 0, canvas.width, canvas.height);
-      gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT); gl.enable(gl.DEPTH_TEST);
       const t = Number(slider.value), k = Math.min(Math.floor(t), steps.length - 2);
       if (k !== shown) {
-        for (const [buffer, step] of [[beforeBuffer, steps[k]], [afterBuffer, steps[k + 1]]]) {
-          gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.bufferSubData(gl.ARRAY_BUFFER, 0, step.on);
-        }
+        drawing.write(steps[k].on, steps[k + 1].on);
         shown = k;
       }
-      gl.uniformMatrix3fv(at("turn"), false, turned());
-      gl.uniform2f(at("scale"), ...scales());
-      gl.uniform2f(at("shift"), panX, panY);
-      gl.uniform1f(at("dot"), Math.max(1.5, r * zoom * 3));
-      gl.uniform1f(at("blend"), t - k); gl.uniform1f(at("full"), full());
-      gl.uniform1f(at("isSigned"), isSigned() ? 1 : 0); gl.uniform1f(at("row"), isSigned() ? 0.75 : 0.25);
-      if (triangles.length) gl.drawElements(gl.TRIANGLES, triangles.length, gl.UNSIGNED_INT, 0);
-      else gl.drawArrays(gl.POINTS, 0, count);
+      drawing.paint({ turn: turned(), scale: scales(), shift: [panX, panY], zoom, blend: t - k, full: full(), signed: isSigned() });
     });
   }
   let gliding = 0;

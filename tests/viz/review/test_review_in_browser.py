@@ -1,5 +1,6 @@
 """The whole story in a browser: where it fails, what is missing, add it, the error falls, undo it."""
 
+import itertools
 import json
 import os
 
@@ -68,29 +69,86 @@ def soft_joint(tmp_path_factory, stitch_command):
     return folder / "r"
 
 
-def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint):
+@pytest.fixture(scope="module")
+def address(soft_joint):
     with served(soft_joint) as server:
-        story = Story(browser, server.address)
-        story.says("#tiles", "rms on views left out")
-        title = story.page.locator("#scene [data-title]")
-        everything = title.inner_text()
-        story.page.locator("#plots .plot:not(.wide) .bins button").first.click()
-        story.clicks += 1
-        story.says("#chosen", "residuals: rms")
-        playwright.expect(title).not_to_have_text(everything)
-        story.click("Find what is missing")
-        story.says("#missing", "joint_compliance is missing")
-        story.click("Show the part as joint_compliance should leave it")
-        playwright.expect(title).to_contain_text("if joint_compliance were added")
-        story.click("Add joint_compliance")
-        story.says("#ledger", "+ joint_compliance")
-        story.says("#sentence", "Adding joint_compliance brought the views from")
-        assert story.clicks <= 6
-        ledger = json.loads((soft_joint / "ledger.json").read_text())
-        before, after = (step["heldout_rms"] for step in ledger)
-        assert after < 0.8 * before
-        story.says("#tiles", f"−{round(100 * (1 - after / before))} %")
-        story.says("#undo", "Undo: drop joint_compliance")
-        assert not story.wrong
-        assert all(url.startswith(server.address) for url in story.asked)
-        story.page.close()
+        yield server.address
+
+
+# Every text that is seen, with its contrast to what lies behind it, by the definition of WCAG 2.2; a check by hand of
+# what a colour that is partly clear lies on.
+CONTRASTS = """() => {
+  const paint = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+  const rgba = text => { paint.clearRect(0, 0, 1, 1); paint.fillStyle = text; paint.fillRect(0, 0, 1, 1);
+    return [...paint.getImageData(0, 0, 1, 1).data]; };
+  const light = ([r, g, b]) => [r, g, b].map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = e => { for (let p = e; p; p = p.parentElement) { const c = rgba(getComputedStyle(p).backgroundColor);
+    if (c[3] === 255) return c; } return rgba(getComputedStyle(document.body).backgroundColor); };
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    const e = node.parentElement;
+    if (!node.data.trim() || !e.checkVisibility() || e.closest("script, style, option, :disabled")) continue;
+    const [a, b] = [light(rgba(getComputedStyle(e).color)), light(behind(e))].sort((x, y) => y - x);
+    found.push([(a + 0.05) / (b + 0.05), node.data.trim()]);
+  }
+  return found;
+}"""
+NAMELESS = """() => [...document.querySelectorAll("button, input, select, textarea, canvas, iframe, summary, section")]
+  .filter(e => e.checkVisibility() && !(e.innerText || "").trim() && !e.getAttribute("aria-label") && !e.title
+    && !(e.labels && e.labels.length)).map(e => e.outerHTML.slice(0, 200))"""
+
+
+@pytest.mark.parametrize("colours", ["light", "dark"])
+def test_everybody_can_read_and_reach_it(browser, address, colours):
+    story = Story(browser, address, color_scheme=colours)
+    page = story.page
+    story.says("#plots", "signed mean")
+    for details in page.locator("details > summary").all():
+        details.click()
+    read = page.evaluate(CONTRASTS)
+    assert len(read) > 60
+    assert [pair for pair in read if pair[0] < 4.5] == []
+    assert page.evaluate(NAMELESS) == []
+    assert page.locator("main").count() == page.locator("h1").count() == 1
+    levels = [
+        int(tag[1]) for tag in page.evaluate("() => [...document.querySelectorAll('h1,h2,h3')].map(e => e.tagName)")
+    ]
+    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
+    # By the keyboard alone: a bar is reached and chosen.
+    page.locator("#plots .bins button").first.focus()
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    story.says("#chosen", "residuals: rms")
+    assert page.evaluate("() => document.activeElement.getAttribute('aria-pressed')") == "true"
+    page.set_viewport_size({"width": 390, "height": 800})
+    assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+    assert not story.wrong
+    page.close()
+
+
+def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
+    story = Story(browser, address)
+    story.says("#tiles", "rms on views left out")
+    title = story.page.locator("#scene [data-title]")
+    everything = title.inner_text()
+    story.page.locator("#plots .plot:not(.wide) .bins button").first.click()
+    story.clicks += 1
+    story.says("#chosen", "residuals: rms")
+    playwright.expect(title).not_to_have_text(everything)
+    story.click("Find what is missing")
+    story.says("#missing", "joint_compliance is missing")
+    story.click("Show the part as joint_compliance should leave it")
+    playwright.expect(title).to_contain_text("if joint_compliance were added")
+    story.click("Add joint_compliance")
+    story.says("#ledger", "+ joint_compliance")
+    story.says("#sentence", "Adding joint_compliance brought the views from")
+    assert story.clicks <= 6
+    ledger = json.loads((soft_joint / "ledger.json").read_text())
+    before, after = (step["heldout_rms"] for step in ledger)
+    assert after < 0.8 * before
+    story.says("#tiles", f"−{round(100 * (1 - after / before))} %")
+    story.says("#undo", "Undo: drop joint_compliance")
+    assert not story.wrong
+    assert all(url.startswith(address) for url in story.asked)
+    story.page.close()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -125,14 +126,32 @@ def test_two_pages_hear_the_same_and_a_stale_one_changes_nothing(server, run, st
     assert after["history"]["undo"] == {"command": "drop", "effects": ["range_scale"], "to": []}
     stale = server.post("jobs", {"kind": "add", "effects": ["backlash"], "model": before["model"]})
     assert stale[0] == 409
+    undone = server.post("jobs", {"kind": "undo", "model": after["model"]})[1]
+    assert undone["command"].startswith(f"stitch drop {run} range_scale")
+    assert until(pages[0], ended(undone["number"]))["job"]["state"] == "done"
+    after = server.state()
+    assert [row["change"] for row in after["ledger"]][2:] == ["− range_scale"]
+    assert after["history"] == {
+        "undo": None,
+        "redo": {"command": "add", "effects": ["range_scale"], "to": ["range_scale"]},
+    }
     # Somebody else writes into the folder, by the command line.
     stitch_command("note", run, "seen by hand")
     until(pages[0], lambda e: e["type"] == "changed" and e["version"] != after["version"])
-    assert server.state()["ledger"][1]["notes"][0]["text"] == "seen by hand"
+    assert server.state()["ledger"][2]["notes"][0]["text"] == "seen by hand"
     away = run.rename(run.with_name("away"))
     assert "to fix" in server.state()["problem"] or "no such run folder" in server.state()["problem"]
     away.rename(run)
     assert server.state()["problem"] is None
+
+
+def test_own_python_is_checked_by_a_command_and_its_fault_told_in_a_line(server, run):
+    page, text = server.listen(), "from stitch.effects import effect, number\n\nraise ValueError('not yet')\n"
+    job = server.post("own", {"text": text, "trust": True})[1]
+    end = until(page, ended(job["number"]))["job"]
+    assert end["state"] == "failed"
+    assert re.match(rf"stitch: {run}/review_effects.py line 3: .*not yet", end["lines"][-1])
+    assert server.state()["own"] == text
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds the fit's process by Linux's /proc")

@@ -24,9 +24,11 @@ export function choosePlace(place, within = 0, name = "a place of the part") {
 function draw() {
   const root = at("plots");
   if (!state.comparison) {
+    root.style.minHeight = `${root.offsetHeight}px`;  // what stands below stays where it is
     root.replaceChildren(element("p", { class: "soft" }, "The residual is being compared with everything known of it …"));
     return;
   }
+  root.style.minHeight = "";
   const follows = state.diagnosis ? state.diagnosis.follows.map(f => f.covariate.replace(/_deg$/, "")) : [];
   const rank = table => follows.includes(table.name) ? follows.indexOf(table.name) - 100 : -table.clearest;
   const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));

@@ -74,7 +74,7 @@ function lost(text) { silent = true; problem(text); }
 
 listen(event => {
   if (silent) { silent = false; problem(null); }
-  if (event.type === "changed" && event.version !== version) refresh();
+  if (event.type === "trusted" || event.type === "changed" && event.version !== version) refresh();
   if (event.type === "job") {
     const before = work.heard(event.job);
     heardOwn(event.job);
