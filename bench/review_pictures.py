@@ -137,7 +137,7 @@ def after(camera: Camera) -> None:
     page.locator("#own").fill(OWN)
     page.locator("#own-trust").check()
     camera.click("Check")
-    camera.says("#own-told", "It can be used")
+    camera.says("#own-told", "It is an effect")
     camera.shoot("7-own", "#own-told")
     camera.click("Try it: diagnose with it")
     camera.says("#own-told", "Tried")

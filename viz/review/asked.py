@@ -1,6 +1,7 @@
 """What a page may ask for: commands of stitch, consent to Python that somebody wrote, an end of what runs."""
 
 import asyncio
+from collections.abc import Callable
 from typing import Any
 
 from starlette.requests import Request
@@ -36,6 +37,8 @@ class Asked:
             return wrong("a command is {kind, model, …}")
         kind, model = str(asked.get("kind")), asked.get("model")
         changes = kind in _CHANGES
+        if kind == "own":
+            return wrong("own effects need consent", 403)
         if changes and model != self.review.model:
             return wrong("the run has changed since this page read it; look at it again", 409)
         try:
@@ -54,10 +57,10 @@ class Asked:
             return wrong("own effects are {text, trust}")
         if asked.get("trust") is not True:
             return wrong("this Python is run with your rights; it needs your consent", 403)
-        kind = "diagnose" if asked.get("diagnose") is True else "effects"
         try:
             await asyncio.to_thread(self.review.keep_own_effects, text)
-            return told(self._submitted(kind, self.review.arguments(kind, {})))
+            words = self.review.arguments("own", asked)
+            return told(self._submitted(words[0], words, done=self.review.use_own_effects))
         except (StitchError, OSError) as error:
             return refused(error)
         except Busy:
@@ -75,9 +78,11 @@ class Asked:
         self.jobs.stop()
         return told({})
 
-    def _submitted(self, kind: str, arguments: list[str], model: str | None = None) -> dict[str, Any]:
+    def _submitted(
+        self, kind: str, arguments: list[str], model: str | None = None, done: Callable[[], None] | None = None
+    ) -> dict[str, Any]:
         """One that waits or runs already is not asked for twice."""
         same: Job | None = next(
             (j for j in self.jobs.all if j.state in ("waiting", "running") and j.arguments == arguments), None
         )
-        return (same or self.jobs.submit(kind, arguments, model)).told
+        return (same or self.jobs.submit(kind, arguments, model, done)).told

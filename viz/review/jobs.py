@@ -9,6 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +27,7 @@ class Job:
     kind: str  # compare | diagnose | add | drop | note | report | effects
     arguments: list[str]
     model: str | None = None  # of the run it was asked for; None where any will do
+    done: Callable[[], None] | None = None  # called where it has ended well
     state: str = "waiting"  # waiting | running | done | failed | stopped
     begun: float = 0.0
     seconds: float = 0.0
@@ -59,11 +61,18 @@ class Jobs:
         self._news = asyncio.Event()
         self._number = 0
 
-    def submit(self, kind: str, arguments: Sequence[str], model: str | None = None) -> Job:
+    def submit(
+        self,
+        kind: str,
+        arguments: Sequence[str],
+        model: str | None = None,
+        done: Callable[[], None] | None = None,
+    ) -> Job:
         """Append a command.
 
         Args:
             model: version of the model it is meant for: it does not run once the run has another.
+            done: called where it ends well.
 
         Raises:
             Busy: too many wait.
@@ -71,7 +80,7 @@ class Jobs:
         if sum(job.state == "waiting" for job in self.all) >= _WAITING:
             raise Busy
         self._number += 1
-        job = Job(self._number, kind, list(arguments), model)
+        job = Job(self._number, kind, list(arguments), model, done)
         self.all.append(job)
         self._news.set()
         self._say(job)
@@ -85,7 +94,8 @@ class Jobs:
                 job.state = "stopped"
                 if not running:
                     self._say(job)
-        self._signal(signal.SIGINT)
+        if self._process is not None:
+            _interrupt(self._process)
 
     async def work(self) -> None:
         """Run commands as they come, until cancelled."""
@@ -102,7 +112,11 @@ class Jobs:
                 else:
                     await self._run(job)
         finally:
-            self._signal(signal.SIGKILL)
+            if (process := self._process) is not None:
+                _interrupt(process)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(process.wait(), _PATIENCE)
+                _kill(process)
 
     async def _run(self, job: Job) -> None:
         job.state, job.begun = "running", time.monotonic()
@@ -117,14 +131,20 @@ class Jobs:
             start_new_session=True,
             limit=2**24,
         )
+        if job.state == "stopped":  # while it was being started
+            _interrupt(self._process)
         assert self._process.stdout is not None
         async for line in self._process.stdout:
             self._heard(job, line.decode(errors="replace").rstrip())
         code = await self._process.wait()
         self._process = None
         job.seconds = time.monotonic() - job.begun
-        if job.state == "running":
-            job.state = "done" if code == 0 else "failed"
+        if code == 0:
+            job.state = "done"  # one that was stopped too late has done its work
+            if job.done is not None:
+                job.done()
+        elif job.state == "running":
+            job.state = "failed"
         self._say(job)
 
     def _heard(self, job: Job, line: str) -> None:
@@ -140,15 +160,14 @@ class Jobs:
     def _say(self, job: Job) -> None:
         self.tell({"type": "job", "job": job.told})
 
-    def _signal(self, number: int) -> None:
-        process = self._process
-        if process is None or process.returncode is not None:
-            return
-        process.send_signal(number)
-        if number != signal.SIGKILL:
-            asyncio.get_running_loop().call_later(_PATIENCE, self._kill, process)
 
-    @staticmethod
-    def _kill(process: asyncio.subprocess.Process) -> None:
-        if process.returncode is None:
-            process.kill()
+def _interrupt(process: asyncio.subprocess.Process) -> None:
+    """Ask a process to end and clear up; it has to within a few seconds."""
+    if process.returncode is None:
+        process.send_signal(signal.SIGTERM if os.name == "nt" else signal.SIGINT)
+        asyncio.get_running_loop().call_later(_PATIENCE, _kill, process)
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is None:
+        process.kill()

@@ -69,12 +69,15 @@ class RunReview:
             return ""
 
     def keep_own_effects(self, text: str) -> Path:
-        """Write the text as the run folder's own effects, and trust it."""
+        """Write the text as the run folder's own effects."""
         path = self.run / OWN_EFFECTS
         with whole(path) as file:
             file.write_text(text, encoding="utf-8")
-        self.effects_file = path
         return path
+
+    def use_own_effects(self) -> None:
+        """Every further command knows them; a file that no command could read would end them all."""
+        self.effects_file = self.run / OWN_EFFECTS
 
     def warm(self) -> None:
         """Read the residuals before somebody chooses among them."""
@@ -125,8 +128,9 @@ class RunReview:
             case "note":
                 by = _text(asked.get("by", ""), _LONGEST_NAME)
                 return ["note", run, *(["--by", by] if by else []), "--", _text(asked.get("text"), _LONGEST_NOTE)]
-            case "effects":
-                return ["effects", "--effects-file", str(self.run / OWN_EFFECTS)]
+            case "own":
+                words = ["diagnose", run] if asked.get("diagnose") is True else ["effects"]
+                return [*words, "--effects-file", str(self.run / OWN_EFFECTS)]
         raise InputError("no such command here")
 
     def _trusted(self) -> list[str]:

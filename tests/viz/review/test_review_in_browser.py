@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 
 import pytest
 
@@ -152,3 +153,40 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     assert not story.wrong
     assert all(url.startswith(address) for url in story.asked)
     story.page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["david", "rubik"])
+def test_the_story_on_a_real_object(browser, reghec, name, tmp_path, stitch_command):
+    """Whatever is found there: it can be looked at, asked, changed and undone."""
+    stitch_command("run", reghec(name), "-o", tmp_path / "r")
+    with served(tmp_path / "r") as server:
+        story = Story(browser, server.address)
+        story.says("#plots", "signed mean")
+        story.page.locator("#plots .plot:not(.wide) .bins button").first.click()
+        story.says("#chosen", "residuals: rms")
+        story.click("Find what is missing")
+        story.says("#missing", "candidate effect")
+        tried = story.page.locator("#tried > summary")
+        if tried.count():
+            tried.click()
+        adds = story.page.get_by_role("button", name=re.compile("^Add "))
+        playwright.expect(adds.first).to_be_enabled(timeout=LONG)
+        effect = adds.first.get_attribute("aria-label").removeprefix("Add ")
+        adds.first.click()
+        story.says("#ledger", f"+ {effect}")
+        playwright.expect(story.page.locator("#undo")).to_be_enabled(timeout=LONG)
+        story.page.locator("#undo").click()
+        story.says("#ledger", f"− {effect}")
+        assert [step["effects"] for step in json.loads((tmp_path / "r" / "ledger.json").read_text())] == [
+            [],
+            [effect],
+            [],
+        ]
+        # The recording follows the model, and opens beside the story in the Rerun viewer.
+        story.page.locator("#recording-details > summary").click()
+        frame = story.page.frame_locator("#recording iframe")
+        playwright.expect(frame.locator("#the_canvas_id.visible")).to_be_visible(timeout=LONG)
+        assert not story.wrong
+        assert all(url.startswith((server.address, "blob:", "data:")) for url in story.asked)
+        story.page.close()

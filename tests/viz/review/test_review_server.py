@@ -69,6 +69,7 @@ def test_nothing_beside_its_own_files_can_be_read(server, run):
         ("jobs", {"kind": "note", "text": 5}, 422),
         ("jobs", {"kind": "note", "text": "a\0b"}, 422),
         ("jobs", b"x" * 300_000, 413),
+        ("jobs", {"kind": "own"}, 403),
         ("own", {"text": "import os"}, 403),
         ("own", {"text": "import os", "trust": "yes"}, 403),
         ("own", {"trust": True}, 400),

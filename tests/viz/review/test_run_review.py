@@ -106,9 +106,13 @@ def test_own_effects_stay_in_the_run_folder_and_go_with_every_command(run):
     review = RunReview(run)
     path = review.keep_own_effects("# mine\n")
     assert review.state()["own"] == "# mine\n"
+    assert review.arguments("own", {}) == ["effects", "--effects-file", str(path)]
+    assert review.arguments("own", {"diagnose": True}) == ["diagnose", str(run), "--effects-file", str(path)]
+    # Until a command has read it well, the others do without.
+    assert review.arguments("compare", {}) == ["compare", str(run)]
+    review.use_own_effects()
     assert review.arguments("add", {"effects": ["a", "b"]}) == [
         "add", str(run), "a", "b", "--no-recording", "--effects-file", str(path)]  # fmt: skip
-    assert review.arguments("effects", {}) == ["effects", "--effects-file", str(path)]
     assert review.arguments("note", {"text": "--step 0", "by": ""}) == ["note", str(run), "--", "--step 0"]
     (run / "recording.rrd").touch()
     assert "--no-recording" not in review.arguments("drop", {"effects": ["a"]})

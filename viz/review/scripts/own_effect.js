@@ -28,7 +28,7 @@ export function heardOwn(job) {
   const told = job.lines.filter(line => line.startsWith("stitch: ")).pop();
   at("own-told").className = job.state === "done" ? "" : "failed";
   at("own-told").textContent = job.state !== "done" ? (told || "It did not end well; see the commands below.")
-    : job.kind === "effects" ? "It can be used: its form, its result and its slopes are as they have to be." : "Tried: it stands among the candidate effects above.";
+    : job.kind === "effects" ? "It is an effect: place, parameters and form are as they have to be. What it explains, a try tells." : "Tried: it stands among the candidate effects above.";
   mine = null;
 }
 
