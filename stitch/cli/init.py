@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from stitch.cli.looked_for import BallOption, BoardOption, looked_for
 from stitch.cli.streams import emit
 from stitch.errors import InputError
 from stitch.intake.bag_messages import is_bag
@@ -41,6 +42,8 @@ def init(
     inverse: Annotated[
         bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
     ] = None,
+    board: BoardOption = None,
+    ball: BallOption = None,
     topic: Annotated[str | None, typer.Option("--topic", help="Of a bag: the topic of the scans.")] = None,
     named: Annotated[
         str | None, typer.Option("--frames", metavar="BASE,FLANGE[,SCANNER]", help="Of a bag: frames of tf.")
@@ -59,11 +62,12 @@ def init(
     if topic or named:
         raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
     out = folder if output is None else output
-    require_free(out)
+    require_free(out, bool(board or ball))
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
     stated = Stated(
         poses, names, rotation, angle_unit=angles, length_unit=unit, cloud_unit=cloud_unit, mount=mount, inverse=inverse
     )
+    stated = replace(stated, targets=looked_for(board, ball))
     first = first_session(folder, stated)
     _tell(first.guesses)
     if not yes:

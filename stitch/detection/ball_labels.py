@@ -35,7 +35,7 @@ class ViewBalls:
     centres: Array  # (B, 3) scanner frame
     sigma: Array  # (B,) of a coordinate
     radii: Array  # (B,)
-    R_flange: Array  # (3, 3) R_base_flange
+    R_flange: Array | None  # (3, 3) R_base_flange, where it is known
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ def _motion(arrangement: _Placed, view: ViewBalls, way: Sequence[tuple[int, int]
 
 def _turned_alike(arrangement: _Placed, views: Sequence[ViewBalls], v: int, T: Array) -> bool:
     """Whether the scanner has turned by the flange's angle since each view that is placed."""
+    own = views[v].R_flange
     for w, R in arrangement.views:
-        scanner = _angle(R.T @ T[:3, :3])
-        flange = _angle(views[w].R_flange.T @ views[v].R_flange)
-        if abs(scanner - flange) > _ANGLE:
+        other = views[w].R_flange
+        if own is not None and other is not None and abs(_angle(R.T @ T[:3, :3]) - _angle(other.T @ own)) > _ANGLE:
             return False
     return True
 

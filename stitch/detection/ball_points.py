@@ -29,13 +29,13 @@ class _Seen:
 
 
 def ball_sightings(
-    clouds: Sequence[Array | None], rotations: Sequence[Array], stated: Sequence[float], to_mm: float
+    clouds: Sequence[Array | None], rotations: Sequence[Array | None], stated: Sequence[float], to_mm: float
 ) -> tuple[list[Sighting], list[str]]:
     """Centres of the balls in every view.
 
     Args:
         clouds: (N, 3) a view, scanner frame; None for a view without a scan.
-        rotations: (3, 3) R_base_flange a view.
+        rotations: (3, 3) R_base_flange a view, where it is known.
         stated: radii, in the unit of the clouds; none for balls of any radius.
         to_mm: millimetres per unit, for messages.
 
@@ -121,7 +121,7 @@ def _agreed(
     return out
 
 
-def _view(balls: Sequence[_Seen], R_flange: Array) -> ViewBalls:
+def _view(balls: Sequence[_Seen], R_flange: Array | None) -> ViewBalls:
     """A radius that differs from view to view is an error of the scanner: the centre has one of that size too."""
     sigma = [np.hypot(_sigma_of_centre(s.ball), s.scatter) for s in balls]
     centres = np.array([s.ball.centre for s in balls]).reshape(-1, 3)

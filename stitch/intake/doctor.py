@@ -18,7 +18,7 @@ from stitch.intake.readings import Reading
 from stitch.intake.ways import MM, Way, all_ways
 from stitch.integrity.centroids_meet import centroids_meet
 from stitch.integrity.conventions import contenders, explained_by
-from stitch.integrity.motion_fit import Explained
+from stitch.integrity.motion_fit import FEWEST, Explained
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.integrity.surfaces_meet import CLEARER, Fallen, surfaces_meet
 from stitch.measurement.capture import Capture
@@ -74,6 +74,7 @@ def decide(
     pairs: Sequence[Pairing],
     units: Sequence[str],
     carries: bool | None = None,
+    shown: RelativeScans | None = None,
 ) -> Decided:
     """Try all ways; the motions, and pairings beside the first, only where the surfaces alone do not tell.
 
@@ -82,8 +83,12 @@ def decide(
         motions: gives those between neighbouring scans, mm; dear.
         units: that positions can have of which the file does not say it.
         carries: whether the poses carry the mount's frame (see `Way`); None tries both.
+        shown: motions between views that targets show, mm: where there are enough, they alone decide.
     """
     directions = (True, False) if carries is None else (carries,)
+    if shown is not None and len(shown.pairs) >= FEWEST:
+        paired = _of_right_unit(shown, all_ways(found, pairs, units, directions))
+        return _decided(capture, paired, shown, by_targets=True)
     ways = all_ways(found, pairs[:1], units, directions)
     if len({way.length_unit for way in ways}) > 1:
         ways = _of_right_unit(motions(), ways)
@@ -96,24 +101,26 @@ def decide(
     return every if every.told or every.best.misfit < first.best.misfit else first
 
 
-def _decided(capture: Capture, ways: Sequence[Way], motions: RelativeScans | None) -> Decided:
+def _decided(capture: Capture, ways: Sequence[Way], motions: RelativeScans | None, by_targets: bool = False) -> Decided:
     tried = [way.hypothesis(i) for i, way in enumerate(ways)]
     meets = centroids_meet(tried, np.array([scan.points.mean(axis=0) for scan in capture.scans]))
     closing = {} if motions is None else {int(e.hypothesis.kind): e for e in explained_by(tried, motions, "mm")}
     by_motion = sorted(closing, key=lambda i: closing[i].open)
     by_centroid = sorted(range(len(ways)), key=lambda i: meets[i][0])
-    short = list(dict.fromkeys([*distinct(by_centroid, tried, _SHORT), *distinct(by_motion, tried, _SHORT)]))
+    by_motion = distinct(by_motion, tried, _SHORT)
+    short = by_motion if by_targets else list(dict.fromkeys([*distinct(by_centroid, tried, _SHORT), *by_motion]))
     judged = []
     for i in short:
         closed = closing.get(i)
         starts = [meets[i][1], *([closed.T_mount] if closed is not None and closed.closed >= _CLOSED else [])]
         judged.append(_judged(ways[i], surfaces_meet(capture, tried[i], starts), closed))
-    judged.sort(key=lambda j: j.misfit)
+    if not by_targets:
+        judged.sort(key=lambda j: j.misfit)
     best, runner_up = judged[0], judged[1] if len(judged) > 1 else None
     alone = _alone(list(closing.values()))
     clear = runner_up is None or runner_up.misfit >= CLEARER * best.misfit
-    clear = clear or (alone is not None and ways[alone] is best.way)
-    told = clear and best.meets and len(best.way.pairing.used) > 2
+    single = alone is not None and ways[alone] is best.way
+    told = single if by_targets else (clear or single) and best.meets and len(best.way.pairing.used) > 2
     same = same_stitch(best.way, ways)
     best = replace(best, way=same[0], T_mount=carried_over(best.way, same[0], best.T_mount))
     return Decided(best, runner_up, bool(told), same[1:], *_sides(capture, best))

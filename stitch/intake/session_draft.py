@@ -16,22 +16,27 @@ from stitch.intake.first_session import FirstSession
 from stitch.intake.guesses import Guess
 from stitch.intake.joint_poses import JOINT_ANGLES
 from stitch.intake.plausible_units import POSE_UNITS
+from stitch.intake.targets_in_scans import points_columns
 from stitch.intake.urdf_links import arm_of
+from stitch.intake.ways import MM
 from stitch.reading.session_toml import FORMAT
 from stitch.system.whole_file import whole
 from stitch.units import METRES
-from stitch.writing.session_files import pose_columns
+from stitch.writing.session_files import pose_columns, write_table
 
 _WIDTH = 118
 
 
-def require_free(folder: Path) -> None:
+def require_free(folder: Path, targets: bool = False) -> None:
     """Refuse a folder that holds a session already.
+
+    Args:
+        targets: points.csv will be written too.
 
     Raises:
         InputError: with what to do.
     """
-    for name in ("session.toml", "views.csv"):
+    for name in ("session.toml", "views.csv", *(["points.csv"] if targets else [])):
         if (folder / name).exists() or (folder / name).is_symlink():
             raise InputError(f"{folder / name}: exists already; to fix: remove it, or name another folder with -o")
 
@@ -42,11 +47,22 @@ def write_draft(folder: Path, first: FirstSession) -> None:
     Raises:
         InputError: there is a session already.
     """
-    require_free(folder)
+    require_free(folder, bool(first.sightings))
     folder.mkdir(parents=True, exist_ok=True)
     with whole(folder / "views.csv") as table, whole(folder / "session.toml") as toml:
         table.write_text(views_text(folder, first), encoding="utf-8")
         toml.write_text(toml_text(folder, first), encoding="utf-8")
+        if first.sightings:
+            with whole(folder / "points.csv") as points:
+                write_table(points, _points(first))
+
+
+def _points(first: FirstSession) -> dict[str, list[object]]:
+    """points.csv of the views that have a pose, in the session's length_unit."""
+    used = first.pairing.used
+    names = _views([first.found.clouds[i] for i in used], first.found.folder)
+    scale = MM / METRES[length_unit(first)]
+    return points_columns(names, [first.sightings[i] for i in used], scale)
 
 
 def length_unit(first: FirstSession) -> str:

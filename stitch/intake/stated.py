@@ -1,11 +1,12 @@
 """What a person states about a folder, with flags; None where nothing is stated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.intake.plausible_units import CLOUD_UNITS, POSE_UNITS
 from stitch.intake.readings import conventions
+from stitch.intake.targets_in_scans import LookedFor
 
 _MOUNTS = ("eye_in_hand", "eye_to_hand")
 
@@ -22,6 +23,7 @@ class Stated:
     cloud_unit: str | None = None
     mount: str | None = None
     inverse: bool | None = None  # the table holds T_flange_base
+    targets: LookedFor = field(default_factory=LookedFor)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
         """Refuse words that mean nothing.

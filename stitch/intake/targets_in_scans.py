@@ -1,4 +1,4 @@
-"""Boards and balls in the scans of a session: what each view shows of them, as labelled points."""
+"""Boards and balls in scans: what each view shows of them, as labelled points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from stitch.detection.ball_points import ball_sightings
 from stitch.detection.board import Board
 from stitch.detection.board_points import PlacedBoard, boards_in, judged
 from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
 from stitch.measurement.labelled_points import Sighting
-from stitch.measurement.range_image import RangeImage
 from stitch.measurement.session import Session
 from stitch.reading.extras import package
 from stitch.reading.range_image import read_range_image
@@ -23,86 +23,115 @@ _MM = 1e-3
 
 
 @dataclass(frozen=True)
-class TargetsFound:
-    """By view of the session, in its order."""
+class LookedFor:
+    """What a person says that the scans show."""
 
-    views: tuple[str, ...]
-    sightings: tuple[Sighting, ...]
-    notes: tuple[str, ...]
+    boards: tuple[Board, ...] = ()
+    balls: tuple[float, ...] | None = None  # radii, mm; empty for balls of any radius, None for no balls
 
     @property
-    def seen(self) -> dict[str, int]:
-        """Number of views that show each target."""
-        names = [name for sighting in self.sightings for name in sighting.targets]
-        return {name: names.count(name) for name in sorted(set(names))}
+    def nothing(self) -> bool:
+        """True where nothing is looked for."""
+        return not self.boards and self.balls is None
 
 
-def targets_in(session: Session, boards: Sequence[Board], balls: Sequence[float] | None = None) -> TargetsFound:
-    """Find boards and balls in all views.
+@dataclass(frozen=True)
+class Scans:
+    """The scans of V views."""
 
-    Args:
-        balls: radii, mm; empty for balls of any radius, None for no balls.
+    where: Path  # for messages
+    files: tuple[Path | None, ...]
+    file_unit: float  # of the files, m
+    unit: float  # of the clouds here, and of what is found, m
+    clouds: tuple[Array | None, ...]  # (N, 3), scanner frame
+    rotations: tuple[Array | None, ...]  # (3, 3) R_base_flange where it is known
+
+    @property
+    def to_mm(self) -> float:
+        """Millimetres per unit."""
+        return self.unit / _MM
+
+
+def scans_of(session: Session) -> Scans:
+    """The scans of a session, in its length_unit."""
+    rows = read_views(session.path / "views.csv", session.robot)
+    cloud_unit = document(session.path / "session.toml").get("cloud_unit", session.length_unit)
+    return Scans(
+        where=session.path,
+        files=tuple(session.path / row.cloud if row.cloud else None for row in rows),
+        file_unit=METRES[cloud_unit],
+        unit=METRES[session.length_unit],
+        clouds=tuple(None if view.cloud is None else view.cloud.points for view in session.views),
+        rotations=tuple(view.T_base_flange[:3, :3] for view in session.views),
+    )
+
+
+def targets_in(scans: Scans, wanted: LookedFor) -> tuple[list[Sighting], list[str]]:
+    """Find boards and balls in all views: a sighting a view, and what was left out, in words.
 
     Raises:
         InputError: no scan is an image, or a board or a ball is not what is stated.
-        NoResultError: no view shows any.
+        NoResultError: no view shows one that is looked for.
     """
     parts, notes = [], list[str]()
-    for board in boards:
-        found, told = _of_board(session, board)
-        if not any(sighting.targets for sighting in found):
-            raise NoResultError(
-                f"{session.path}: no view shows {board.stated}; to try: check the number of squares and the "
-                "dictionary, and that the picture is neither dark nor blurred"
-            )
+    for board in wanted.boards:
+        found, told = _of_board(scans, board)
         parts.append(found)
         notes += told
-    if balls is not None:
-        found, told = _of_balls(session, balls)
+    if wanted.balls is not None:
+        found, told = _of_balls(scans, wanted.balls)
         parts.append(found)
         notes += told
-    views = [_together(of_view) for of_view in zip(*parts, strict=True)]
-    return TargetsFound(tuple(view.name for view in session.views), tuple(views), tuple(notes))
+    return [_together(of_view) for of_view in zip(*parts, strict=True)], notes
 
 
-def _of_board(session: Session, board: Board) -> tuple[list[Sighting], list[str]]:
+def _of_board(scans: Scans, board: Board) -> tuple[list[Sighting], list[str]]:
     cv2 = package("cv2", f"--board {board.stated}", "vision")
-    to_mm = METRES[session.length_unit] / _MM
-    own, seen, images = board.scaled(1 / to_mm), list[list[PlacedBoard]](), 0
-    for file in scan_files(session):
-        image = _image(session, file)
+    own, seen, images = board.scaled(1 / scans.to_mm), list[list[PlacedBoard]](), 0
+    for file in scans.files:
+        image = None if file is None else read_range_image(file, scans.file_unit / scans.unit)
         images += image is not None
         seen.append([] if image is None else boards_in(image, own, cv2))
     if not images:
         raise InputError(
-            f"{session.path}: no scan is an image with brightness, so that no board can be seen; to fix: export "
+            f"{scans.where}: no scan is an image with brightness, so that no board can be seen; to fix: export "
             "organised clouds with colour or intensity, or depth images with the picture beside them"
         )
-    return judged(seen, own, to_mm)
+    if not any(seen):
+        raise NoResultError(
+            f"{scans.where}: no view shows {board.stated}; to try: check the number of squares and the dictionary, and "
+            "that the picture is neither dark nor blurred"
+        )
+    return judged(seen, own, scans.to_mm)
 
 
-def _of_balls(session: Session, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:
-    to_mm = METRES[session.length_unit] / _MM
-    clouds = [None if view.cloud is None else view.cloud.points for view in session.views]
-    rotations = [view.T_base_flange[:3, :3] for view in session.views]
-    found, told = ball_sightings(clouds, rotations, [radius / to_mm for radius in radii], to_mm)
+def _of_balls(scans: Scans, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:
+    stated = [radius / scans.to_mm for radius in radii]
+    found, told = ball_sightings(scans.clouds, scans.rotations, stated, scans.to_mm)
     if not any(sighting.targets for sighting in found):
         why = told[0] if told else "no view shows a ball of which a cap is covered"
-        raise NoResultError(f"{session.path}: {why}; to try: scan closer, or from where more of the balls is seen")
+        raise NoResultError(f"{scans.where}: {why}; to try: scan closer, or from where more of the balls is seen")
     return found, told
 
 
-def scan_files(session: Session) -> list[Path | None]:
-    """The file of each view's scan; None where it has none."""
-    rows = read_views(session.path / "views.csv", session.robot)
-    return [session.path / row.cloud if row.cloud else None for row in rows]
+def views_of_targets(sightings: Sequence[Sighting]) -> dict[str, int]:
+    """Number of views that show each target, by name."""
+    names = [name for sighting in sightings for name in sighting.targets]
+    return {name: names.count(name) for name in sorted(set(names))}
 
 
-def _image(session: Session, file: Path | None) -> RangeImage | None:
-    if file is None:
-        return None
-    unit = document(session.path / "session.toml").get("cloud_unit", session.length_unit)
-    return read_range_image(file, METRES[unit] / METRES[session.length_unit])
+def points_columns(views: Sequence[str], sightings: Sequence[Sighting], scale: float = 1.0) -> dict[str, list[object]]:
+    """points.csv.
+
+    Args:
+        scale: from the unit of the sightings to the session's.
+    """
+    rows = [
+        (view, name, *(scale * point).tolist(), float(scale * sigma))
+        for view, s in zip(views, sightings, strict=True)
+        for name, point, sigma in zip(s.targets, s.points, s.sigma, strict=True)
+    ]
+    return dict(zip(("view", "target", *"xyz", "sigma"), map(list, zip(*rows, strict=True)), strict=True))
 
 
 def _together(parts: Sequence[Sighting]) -> Sighting:

@@ -7,7 +7,14 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from data_synth.fixtures.board_scans import Camera, board_print, poses_before, scan_print, write_board_session
+from data_synth.fixtures.board_scans import (
+    Camera,
+    board_print,
+    poses_before,
+    scan_print,
+    write_board_session,
+    write_pcd,
+)
 from stitch import frames
 from stitch.cli.main import main
 from stitch.reading.session_folder import load_session
@@ -100,3 +107,27 @@ def test_what_cannot_be_found_ends_in_one_line(cell, tmp_path, capsys, arguments
 def test_clouds_without_pixels_are_refused(session, capsys):
     code, _, err = ended(capsys, "detect", session, "--board", BOARD)
     assert code == 2 and "no scan is an image with brightness" in err
+
+
+def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path, capsys):
+    """A plane slides on itself under any reading; its corners do not."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    print_ = board_print(cv2.aruco.CharucoBoard((8, 6), 12.0, 9.0, dictionary), 8, 6, 12.0)
+    inner = np.array([[c * 12.0, r * 12.0] for r in range(1, 6) for c in range(1, 8)])
+    poses = poses_before(200, 6, np.array([48.0, 36.0]), seed=4, tilt=0.5)
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    small = Camera(240, 180, 300.0)
+    for i, T in enumerate(poses):
+        write_pcd(raw / f"scan{i}.pcd", scan_print(print_, T, inner, seed=i, camera=small))
+    T_base_flange = T_BASE_BOARD @ frames.inverse(poses) @ frames.inverse(T_FLANGE_SCANNER)
+    angles = Rotation.from_matrix(T_base_flange[:, :3, :3]).as_euler("ZYX", degrees=True)
+    rows = np.hstack([T_base_flange[:, :3, 3], angles])
+    np.savetxt(raw / "poses.txt", rows, fmt="%.6f", delimiter=",")
+    code, out, err = ended(capsys, "init", raw, "--board", BOARD, "--unit", "mm", "--yes", "--json")
+    assert code == 0, err
+    told = {guess["what"]: guess for guess in json.loads(out)["guesses"]}
+    assert told["rotation"]["told"] and told["rotation"]["value"].startswith("zyx-intrinsic, degrees")
+    assert told["pairing"]["told"] and told["targets"]["value"] == "35 in 6 of 6 clouds"
+    session = load_session(raw)
+    assert session.mount == "eye_in_hand" and scatter_in_base(session) < 0.1

@@ -1,0 +1,46 @@
+"""`--board` and `--ball`: what scans are said to show."""
+
+from typing import Annotated
+
+import typer
+
+from stitch.detection.board import parse_board
+from stitch.errors import InputError
+from stitch.intake.targets_in_scans import LookedFor
+
+BoardOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--board",
+        metavar="BOARD",
+        help="charuco:11x8:20:15:DICT_4X4_50 (squares; sides of square and marker, mm), checkerboard:9x6:25 (squares; "
+        "side), apriltag:36h11:40; may be repeated.",
+    ),
+]
+BallOption = Annotated[
+    list[str] | None, typer.Option("--ball", metavar="RADIUS", help="Radius of balls, mm, or any; may be repeated.")
+]
+# Larger balls fit on no table.
+_LARGEST_MM = 2000.0
+
+
+def looked_for(board: list[str] | None, ball: list[str] | None) -> LookedFor:
+    """What the options say.
+
+    Raises:
+        InputError: no board that is known, or no radius.
+    """
+    return LookedFor(tuple(parse_board(text) for text in board or ()), _radii(ball) if ball else None)
+
+
+def _radii(stated: list[str]) -> tuple[float, ...]:
+    """Radii in mm; none for balls of any radius."""
+    if stated == ["any"]:
+        return ()
+    try:
+        radii = tuple(float(text) for text in stated)
+    except ValueError:
+        radii = (0.0,)
+    if not all(0 < radius < _LARGEST_MM for radius in radii):
+        raise InputError(f"--ball {' --ball '.join(stated)}: to fix: state radii in mm, above 0, or any alone")
+    return radii
