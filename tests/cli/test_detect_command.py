@@ -109,6 +109,7 @@ def test_clouds_without_pixels_are_refused(session, capsys):
     assert code == 2 and "no scan is an image with brightness" in err
 
 
+@pytest.mark.slow
 def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path, capsys):
     """A plane slides on itself under any reading; its corners do not."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

@@ -41,7 +41,7 @@ def test_balls_of_any_radius_have_one_name_in_every_view(scans):
 
 def test_what_is_no_ball_is_none():
     rng = np.random.default_rng(0)
-    u = np.stack(np.meshgrid(np.linspace(-60, 60, 120), np.linspace(-60, 60, 120)), axis=2).reshape(-1, 2)
+    u = np.stack(np.meshgrid(np.linspace(-60, 60, 80), np.linspace(-60, 60, 80)), axis=2).reshape(-1, 2)
     lying = np.column_stack([u, 300 - np.sqrt(np.maximum(70.0**2 - u[:, 0] ** 2, 0))])
     wavy = np.column_stack([u, 300 + 6 * np.sin(u[:, 0] / 9) * np.cos(u[:, 1] / 13)])
     edge = np.column_stack([u, 300 + 0.6 * np.abs(u[:, 0])])
