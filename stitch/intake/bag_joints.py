@@ -1,6 +1,7 @@
 """Joint angles of a bag in the order of the arm, by the URDF that it recorded."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,9 +10,14 @@ from stitch.frames import Array
 from stitch.intake.bag_frames import BagFrames
 from stitch.intake.bag_messages import Recorded
 from stitch.intake.guesses import Guess
+from stitch.intake.transform_tree import TransformTree
+from stitch.intake.urdf_links import ends_of
+from stitch.measurement.robot import forward
+from stitch.reading.urdf import robot_from_urdf
 
 _TURNING = ("revolute", "continuous")
 _STALE = 0.5
+_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def recorded_urdf(
@@ -32,6 +38,38 @@ def recorded_urdf(
     (folder / "robot.urdf").write_text(found.urdf, encoding="utf-8")
     robot = {"urdf": "robot.urdf", "base_link": told.base, "flange_link": told.flange}
     return robot, angles, Guess("joints", ", ".join(names), "the order of the URDF in the bag", True, "session.toml")
+
+
+def tree_of(found: Recorded) -> TransformTree:
+    """What tf recorded; where it recorded no motion of the arm, the motion of the joints by their URDF."""
+    tree = TransformTree(found.edges)
+    if not tree.still or not found.joints or found.urdf is None:
+        return tree
+    for base, flange in _ends(found.urdf):
+        names = chain_joints(found.urdf, base, flange)
+        rows = [(time, [q[name] for name in names]) for time, q in found.joints if all(name in q for name in names)]
+        if names and rows:
+            T = _forward(found.urdf, base, flange, np.array([q for _, q in rows]))
+            moved = [(time, base, flange, pose, False) for (time, _), pose in zip(rows, T, strict=True)]
+            # Links between them, published as fixed, would hold the flange elsewhere.
+            return TransformTree([edge for edge in found.edges if edge[2] != flange] + moved)
+    return tree
+
+
+def _ends(urdf: str) -> list[tuple[str, str]]:
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "robot.urdf"
+        file.write_text(urdf, encoding="utf-8")
+        return ends_of(file)
+
+
+def _forward(urdf: str, base: str, flange: str, joints: Array) -> Array:
+    """T_base_flange (M, 4, 4), m, of joint angles (M, n), rad."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "robot.urdf"
+        file.write_text(urdf, encoding="utf-8")
+        T = forward(robot_from_urdf(file, base, flange, "m", _GRAVITY), joints)
+    return np.asarray(T)
 
 
 def chain_joints(urdf: str, base: str, flange: str) -> list[str]:

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.errors import InputError
-from stitch.frames import Array
-from stitch.intake.transform_tree import TransformTree
+from stitch.intake.transform_tree import Recording
 from stitch.reading.extras import package
 from stitch.reading.text_file import shortened
 
@@ -26,7 +25,7 @@ _DEPTH = ("16UC1", "32FC1", "mono16")
 class Recorded:
     """Everything but the scans themselves; times in s, lengths in m, angles in rad."""
 
-    tree: TransformTree
+    edges: list[Recording]  # of tf
     scans: dict[str, list[float]]  # by topic the time of every cloud or depth image
     frame_of: dict[str, str]  # by topic the frame of its scans
     joints: list[tuple[float, dict[str, float]]] = field(default_factory=list)
@@ -62,15 +61,14 @@ def opened(path: Path) -> Iterator[Any]:
 
 def recorded(path: Path) -> Recorded:
     """Read all but the scans' own data."""
-    edges: list[tuple[float, str, str, Array, bool]] = []
-    out = Recorded(TransformTree([]), {}, {})
+    out = Recorded([], {}, {})
     wanted = {*_TF, _JOINTS, _TEXT, CLOUD, IMAGE, CAMERA}
     with opened(path) as reader:
         for connection, stamp, raw in reader.messages([c for c in reader.connections if c.msgtype in wanted]):
             message = reader.deserialize(raw, connection.msgtype)
             topic, kind = connection.topic, connection.msgtype
             if kind in _TF:
-                edges += [_edge(t, "static" in topic) for t in message.transforms]
+                out.edges += [_edge(t, "static" in topic) for t in message.transforms]
             elif kind == _JOINTS:
                 angles = {n: float(q) for n, q in zip(message.name, message.position, strict=False)}
                 out.joints.append((time_of(message.header, stamp), angles))
@@ -81,7 +79,6 @@ def recorded(path: Path) -> Recorded:
             elif kind == CLOUD or message.encoding in _DEPTH:
                 out.scans.setdefault(topic, []).append(time_of(message.header, stamp))
                 out.frame_of[topic] = _plain(message.header.frame_id)
-    out.tree = TransformTree(edges)
     out.joints.sort(key=lambda item: item[0])
     return out
 
@@ -92,7 +89,7 @@ def time_of(header: Any, recorded_ns: int) -> float:
     return stamp or 1e-9 * recorded_ns
 
 
-def _edge(message: Any, static: bool) -> tuple[float, str, str, Array, bool]:
+def _edge(message: Any, static: bool) -> Recording:
     turn, shift = message.transform.rotation, message.transform.translation
     R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     T = frames.make(R, np.array([shift.x, shift.y, shift.z]))

@@ -12,11 +12,12 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.bag_frames import BagFrames, frames_of
-from stitch.intake.bag_joints import recorded_urdf
+from stitch.intake.bag_joints import recorded_urdf, tree_of
 from stitch.intake.bag_messages import CLOUD, IMAGE, Recorded, opened, recorded
 from stitch.intake.bag_scans import cloud_array, depth_array
 from stitch.intake.bag_stops import AROUND, one_of_each_stop, standing
 from stitch.intake.guesses import Guess
+from stitch.intake.transform_tree import TransformTree
 from stitch.reading.session_toml import FORMAT
 from stitch.writing.session_files import pose_columns, whole_folder, write_table
 
@@ -54,9 +55,10 @@ def write_bag_session(bag: Path, out: Path, topic: str | None = None, named: Seq
     """
     found = recorded(bag)
     topic, of_topic = _topic(bag, found, topic)
-    told = frames_of(found.tree, found.frame_of[topic], named)
-    chosen = _stops(bag, found, topic, told)
-    T_mount = _hand_eye(found, told, chosen.times)
+    tree = tree_of(found)
+    told = frames_of(tree, found.frame_of[topic], named)
+    chosen = _stops(bag, found, topic, tree, told)
+    T_mount = _hand_eye(tree, told, chosen.times)
     guesses = (of_topic, *_of_frames(told, T_mount), chosen.guess)
     with whole_folder(out) as scratch:
         (scratch / "clouds").mkdir()
@@ -86,11 +88,11 @@ def _topic(bag: Path, found: Recorded, stated: str | None) -> tuple[str, Guess]:
     return topic, Guess("topic", topic, reason, True, "--topic")
 
 
-def _stops(bag: Path, found: Recorded, topic: str, told: BagFrames) -> _Chosen:
+def _stops(bag: Path, found: Recorded, topic: str, tree: TransformTree, told: BagFrames) -> _Chosen:
     times = np.array(found.scans[topic])
     order = np.argsort(times, kind="stable")
     ordered = times[order]
-    before, at, after = (found.tree.pose(told.base, told.flange, ordered + by) for by in (-AROUND, 0.0, AROUND))
+    before, at, after = (tree.pose(told.base, told.flange, ordered + by) for by in (-AROUND, 0.0, AROUND))
     views = one_of_each_stop(at, standing(before, at, after))
     if len(views) < _FEWEST:
         raise InputError(
@@ -102,12 +104,12 @@ def _stops(bag: Path, found: Recorded, topic: str, told: BagFrames) -> _Chosen:
     return _Chosen(messages, ordered[views], at[views], guess)
 
 
-def _hand_eye(found: Recorded, told: BagFrames, times: Array) -> Array | None:
+def _hand_eye(tree: TransformTree, told: BagFrames, times: Array) -> Array | None:
     """T_mount (4, 4) mm as tf has it; None where tf says nothing, or that both frames are one."""
     if not told.hand_eye_known:
         return None
     mount = told.flange if told.mount == "eye_in_hand" else told.base
-    T = found.tree.pose(mount, told.scanner, times[:1])[0]
+    T = tree.pose(mount, told.scanner, times[:1])[0]
     if not np.isfinite(T).all() or np.allclose(T, np.eye(4)):
         return None
     return frames.make(T[:3, :3], T[:3, 3] * _MM)

@@ -25,11 +25,15 @@ class _Edge:
     static: bool = False
 
 
+# Time, parent, child, T_parent_child (4, 4), whether published as fixed.
+Recording = tuple[float, str, str, Array, bool]
+
+
 class TransformTree:
     """Child to parent, with every recording of each edge; lengths in m, times in s."""
 
-    def __init__(self, recordings: Iterable[tuple[float, str, str, Array, bool]]) -> None:
-        """Sort recordings (time, parent, child, T_parent_child, whether static) by edge."""
+    def __init__(self, recordings: Iterable[Recording]) -> None:
+        """Sort recordings by edge."""
         self._edges: dict[str, _Edge] = {}
         for time, parent, child, T, static in recordings:
             edge = self._edges.setdefault(child, _Edge(parent))
@@ -42,6 +46,11 @@ class TransformTree:
             order = np.argsort(edge.times, kind="stable")
             edge.times = [edge.times[i] for i in order]
             edge.poses = [edge.poses[i] for i in order]
+
+    @property
+    def still(self) -> bool:
+        """True if no frame moves."""
+        return not any(self.moves(child) for child in self._edges)
 
     @property
     def names(self) -> list[str]:

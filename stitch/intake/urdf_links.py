@@ -21,7 +21,7 @@ def arm_of(urdf: Path, joints: int) -> tuple[Robot, str, str]:
         InputError: unreadable, or no chain of so many joints.
     """
     reasons = [f"{urdf}: not a readable URDF; to fix: export it as plain URDF"]
-    for base, flange in _pairs(urdf):
+    for base, flange in ends_of(urdf):
         try:
             robot = robot_from_urdf(urdf, base, flange, "mm", _GRAVITY)
         except InputError as error:
@@ -33,7 +33,7 @@ def arm_of(urdf: Path, joints: int) -> tuple[Robot, str, str]:
     raise InputError(reasons[-1])
 
 
-def _pairs(urdf: Path) -> list[tuple[str, str]]:
+def ends_of(urdf: Path) -> list[tuple[str, str]]:
     """Root and flange by name, else root and the child of each turning joint, the last first."""
     try:
         root = ElementTree.parse(urdf).getroot()

@@ -70,8 +70,8 @@ def _read(file: Path) -> Intrinsics | None:
     """None for a file that holds no intrinsics."""
     if file.stat().st_size > _LARGEST_MB * 1e6:
         return None
-    told = read_text(file, "name a file of intrinsics", _LARGEST_MB)
     try:
+        told = read_text(file, "name a file of intrinsics", _LARGEST_MB)
         if file.suffix.lower() == ".txt":
             document: Any = {"K": np.array(told.replace(",", " ").split(), float).tolist()}
         elif file.suffix.lower() == ".json":
@@ -79,7 +79,7 @@ def _read(file: Path) -> Intrinsics | None:
         else:
             documents = parse_yaml(file, told)
             document = documents[0] if documents else None
-    except (ValueError, InputError):
+    except (ValueError, RecursionError, InputError):
         return None
     for level in _levels(document):
         found = _of(file, level)

@@ -152,7 +152,7 @@ def surface(time):
     return points
 
 
-def write(path, kind, organised=True, urdf=True, camera_fixed=False, depth=False):
+def write(path, kind, organised=True, urdf=True, camera_fixed=False, depth=False, moving_tf=True):
     """A bag with tf at 25 Hz, joint states at half of it and clouds at 5 Hz, 100 s after the epoch."""
     ros1 = kind == "ros1"
     messages, start = Messages(ros1), 100.0
@@ -196,11 +196,12 @@ def write(path, kind, organised=True, urdf=True, camera_fixed=False, depth=False
             time = tick / 25
             joints = joints_at(time)
             first, second = turned(joints)
-            put(
-                "/tf",
-                start + time,
-                messages.tf(start + time, ("base_link", "link1", first), ("link1", "link2", second)),
-            )
+            if moving_tf:
+                put(
+                    "/tf",
+                    start + time,
+                    messages.tf(start + time, ("base_link", "link1", first), ("link1", "link2", second)),
+                )
             if tick % 2 == 0:
                 put("/joint_states", start + time, messages.joints(start + time, joints))
             if tick % (25 // RATE) == 0:
@@ -246,6 +247,14 @@ def test_a_camera_that_stands_in_the_cell(tmp_path, capsys):
     session = load_session(tmp_path / "b-session")
     assert session.mount == "eye_to_hand" and session.joints is None
     assert session.views[1].T_base_flange[:3, 3] == pytest.approx(1000 * flange(STOPS[1])[:3, 3], abs=1e-4)
+
+
+def test_joint_states_and_urdf_where_tf_of_the_arm_was_not_recorded(tmp_path):
+    write_bag_session(write(tmp_path / "b.bag", "ros1", moving_tf=False), tmp_path / "s")
+    session = load_session(tmp_path / "s")
+    assert session.mount == "eye_in_hand" and len(session.views) == 4
+    for view, joints in zip(session.views, STOPS, strict=True):
+        assert view.T_base_flange[:3, 3] == pytest.approx(1000 * flange(joints)[:3, 3], abs=1e-4)
 
 
 def test_depth_images_of_a_bag(tmp_path):
