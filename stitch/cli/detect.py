@@ -42,7 +42,8 @@ def detect(
     if as_json:
         emit(json.dumps(_document(session, views, found, notes), indent=1))
     showing = sum(bool(s.targets) for s in found)
-    print(f"{file}: {len(views_of_targets(found))} targets in {showing} of {len(views)} views", file=sys.stderr)
+    count = len(views_of_targets(found))
+    print(f"{file}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
     print(f"next: stitch run {session}", file=sys.stderr)
 
 

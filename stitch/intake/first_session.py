@@ -26,7 +26,7 @@ from stitch.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, readings
 from stitch.intake.stated import Stated
 from stitch.intake.target_motions import target_motions
-from stitch.intake.targets_in_scans import Scans, targets_in, views_of_targets
+from stitch.intake.targets_of_folder import targets_of_folder
 from stitch.intake.ways import MM
 from stitch.intake.why import guesses_of
 from stitch.integrity.relative_scans import relative_scans
@@ -75,35 +75,21 @@ def first_session(folder: Path, stated: Stated) -> FirstSession:
     for file, cloud in zip(found.clouds, clouds, strict=True):
         if len(cloud.points) < _FEWEST:
             raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
-    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units([c.points for c in clouds])
+    points = [c.points for c in clouds]
+    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
     pairs = pairings(found.clouds, raw.labels)
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     units = open_units(ways_to_read, stated)
-    seen, of_targets = _targets(found, clouds, CLOUD_UNITS[own_units[0]], stated)
+    seen, of_targets = targets_of_folder(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
     motions = cache(lambda: relative_scans(capture))
     shown = target_motions(seen) if seen else None
     decided = decide(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
     of_joints = decided.best.way.reading.rotation == JOINT_ANGLES
     settled = mounting(decided, stated.mount, stated.inverse, of_joints)
     axis, axis_guess = optical_axis(clouds)
-    told = guesses_of(found, raw, decided, [c.points for c in clouds], own_units, stated)
+    told = guesses_of(found, raw, decided, points, own_units, stated)
     guesses = (*told, settled.guess, axis_guess, *of_targets)
     return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, seen)
-
-
-def _targets(
-    found: Found, clouds: Sequence[Cloud], metres: float, stated: Stated
-) -> tuple[tuple[Sighting, ...], tuple[Guess, ...]]:
-    """What every cloud shows of the targets that are looked for, mm."""
-    if stated.targets.nothing:
-        return (), ()
-    own = tuple(cloud.points * metres / MM for cloud in clouds)
-    scans = Scans(found.folder, found.clouds, metres, MM, own, (None,) * len(own))
-    sightings, notes = targets_in(scans, stated.targets)
-    count = sum(bool(s.targets) for s in sightings)
-    words = f"{len(views_of_targets(sightings))} in {count} of {len(sightings)} clouds"
-    guess = Guess("targets", words, "; ".join(("found where they were looked for", *notes)), True, "--board, --ball")
-    return tuple(sightings), (guess,)
 
 
 def _raw(found: Found) -> RawPoses:

@@ -1,0 +1,30 @@
+"""Boards and balls in the scans of a raw folder, before anybody says how its poses are to be read."""
+
+from collections.abc import Sequence
+
+from stitch.frames import Array
+from stitch.intake.found_files import Found
+from stitch.intake.guesses import Guess
+from stitch.intake.targets_in_scans import LookedFor, Scans, targets_in, views_of_targets
+from stitch.intake.ways import MM
+from stitch.measurement.labelled_points import Sighting
+
+
+def targets_of_folder(
+    found: Found, clouds: Sequence[Array], metres: float, wanted: LookedFor
+) -> tuple[tuple[Sighting, ...], tuple[Guess, ...]]:
+    """What every cloud shows of the targets that are looked for, mm; nothing where none are.
+
+    Args:
+        clouds: (N, 3) of the files, in their own unit.
+        metres: of that unit.
+    """
+    if wanted.nothing:
+        return (), ()
+    own = tuple(cloud * metres / MM for cloud in clouds)
+    scans = Scans(found.folder, found.clouds, metres, MM, own, (None,) * len(own))
+    sightings, notes = targets_in(scans, wanted)
+    count = sum(bool(s.targets) for s in sightings)
+    words = f"{len(views_of_targets(sightings))} in {count} of {len(sightings)} clouds"
+    reason = "; ".join(("found where they were looked for", *notes))
+    return tuple(sightings), (Guess("targets", words, reason, True, "--board, --ball"),)
