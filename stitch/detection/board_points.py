@@ -49,7 +49,12 @@ def boards_in(image: RangeImage, board: Board, cv2: Any) -> list[PlacedBoard]:
         board: in the unit of the scan.
         cv2: the module of OpenCV.
     """
-    placed = [_placed(image, corners, board) for corners in find_corners(image.grey, board, cv2)]
+    found = find_corners(image.grey, board, cv2)
+    if not found and board.kind != "checkerboard":
+        # Rows from below make a mirror image, in which no marker is known.
+        image = RangeImage(image.points[::-1], image.grey[::-1])
+        found = find_corners(image.grey, board, cv2)
+    placed = [_placed(image, corners, board) for corners in found]
     return [p for p in placed if len(p.names) >= _FEWEST]
 
 
@@ -61,11 +66,14 @@ def _placed(image: RangeImage, corners: Corners, board: Board) -> PlacedBoard:
     return PlacedBoard(corners.names, points, sigma, corners.drawing).only(np.isfinite(points[:, 0]))
 
 
-def judged(views: Sequence[Sequence[PlacedBoard]], board: Board, to_mm: float) -> tuple[list[Sighting], list[str]]:
+def judged(
+    views: Sequence[Sequence[PlacedBoard]], board: Board, to_mm: float, label: str
+) -> tuple[list[Sighting], list[str]]:
     """Sightings of all views from what each shows; corners that do not fit the drawing go, sigmas follow the scatter.
 
     Args:
         to_mm: millimetres per unit of the scans, for messages.
+        label: with which the names of its corners begin.
 
     Returns:
         A sighting a view, empty where the board is not seen, and what was left out, in words.
@@ -75,7 +83,7 @@ def judged(views: Sequence[Sequence[PlacedBoard]], board: Board, to_mm: float) -
     """
     seen = [placed for view in views for placed in view]
     if not seen:
-        return [_sighting(board, ()) for _ in views], []
+        return [_sighting(label, ()) for _ in views], []
     _require_size(seen, board, to_mm)
     kept = [[_fitting(placed) for placed in view] for view in views]
     gone = sum(len(p.names) for p in seen) - sum(len(p.names) for view in kept for p in view)
@@ -83,12 +91,12 @@ def judged(views: Sequence[Sequence[PlacedBoard]], board: Board, to_mm: float) -
     freedom = sum(free for _, free in squares)
     factor = max(np.sqrt(sum(total for total, _ in squares) / freedom), _SMALLEST_FACTOR) if freedom else 1.0
     told = [f"{gone} corners of {board.stated} lie off the board's plane or grid and are left out"] if gone else []
-    out = [_sighting(board, [replace(p, sigma=factor * p.sigma) for p in view]) for view in kept]
+    out = [_sighting(label, [replace(p, sigma=factor * p.sigma) for p in view]) for view in kept]
     return out, told
 
 
-def _sighting(board: Board, placed: Sequence[PlacedBoard]) -> Sighting:
-    names = tuple(f"{board.kind}-{name}" for p in placed for name in p.names)
+def _sighting(label: str, placed: Sequence[PlacedBoard]) -> Sighting:
+    names = tuple(f"{label}-{name}" for p in placed for name in p.names)
     points = np.vstack([np.zeros((0, 3)), *(p.points for p in placed)])
     return Sighting(names, points, np.concatenate([np.zeros(0), *(p.sigma for p in placed)]))
 

@@ -74,8 +74,9 @@ def targets_in(scans: Scans, wanted: LookedFor) -> tuple[list[Sighting], list[st
         NoResultError: no view shows one that is looked for.
     """
     parts, notes = [], list[str]()
-    for board in wanted.boards:
-        found, told = _of_board(scans, board)
+    for i, board in enumerate(wanted.boards):
+        alike = sum(other.kind == board.kind for other in wanted.boards[:i])
+        found, told = _of_board(scans, board, f"{board.kind}{alike + 1 if alike else ''}")
         parts.append(found)
         notes += told
     if wanted.balls is not None:
@@ -85,7 +86,7 @@ def targets_in(scans: Scans, wanted: LookedFor) -> tuple[list[Sighting], list[st
     return [_together(of_view) for of_view in zip(*parts, strict=True)], notes
 
 
-def _of_board(scans: Scans, board: Board) -> tuple[list[Sighting], list[str]]:
+def _of_board(scans: Scans, board: Board, label: str) -> tuple[list[Sighting], list[str]]:
     cv2 = package("cv2", f"--board {board.stated}", "vision")
     own, seen, images = board.scaled(1 / scans.to_mm), list[list[PlacedBoard]](), 0
     for file in scans.files:
@@ -102,7 +103,7 @@ def _of_board(scans: Scans, board: Board) -> tuple[list[Sighting], list[str]]:
             f"{scans.where}: no view shows {board.stated}; to try: check the number of squares and the dictionary, and "
             "that the picture is neither dark nor blurred"
         )
-    return judged(seen, own, scans.to_mm)
+    return judged(seen, own, scans.to_mm, label)
 
 
 def _of_balls(scans: Scans, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:

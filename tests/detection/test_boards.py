@@ -1,5 +1,7 @@
 """Boards in simulated scans whose corners are known: names, places, sigmas, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def scans(charuco):
 def sightings(scans, stated):
     board = parse_board(stated)
     views = [boards_in(RangeImage(s.points, s.grey), board, cv2) for s in scans]
-    return judged(views, board, 1.0)[0]
+    return judged(views, board, 1.0, board.kind)[0]
 
 
 def numbers(sighting):
@@ -46,6 +48,13 @@ def test_corners_of_a_charuco_board_lie_where_they_are(scans):
         assert np.sqrt(np.mean(off**2)) < 0.05
         ratios.append(np.mean((off / seen.sigma[:, None]) ** 2))
     assert 0.5 < np.sqrt(np.mean(ratios)) < 1.5
+
+
+def test_rows_from_below_show_the_same_corners(scans):
+    mirrored = replace(scans[0], points=scans[0].points[::-1], grey=scans[0].grey[::-1])
+    upright, seen = (sightings([scan], CHARUCO)[0] for scan in (scans[0], mirrored))
+    assert seen.targets == upright.targets
+    assert np.abs(seen.points - upright.points).max() < 0.01
 
 
 def test_a_checkerboard_turned_by_half_a_turn_keeps_its_names():
