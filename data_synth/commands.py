@@ -27,7 +27,12 @@ def synth(
     views: Annotated[int | None, typer.Option(help="Number of views; default is the scene's.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="PATH", help="Where the truth goes.")] = None,
 ) -> None:
-    """Write a session made by a cell that behaves like a real one, and its truth beside it."""
+    """Write a session made by a cell that behaves like a real one, and its truth beside it.
+
+    \b
+    Examples:
+      stitch synth blade cells/blade --hide backlash=2 --views 8 --seed 3
+    """
     if out.exists():
         raise InputError(f"{out}: exists already; name another folder")
     if views is not None and views < 2:
@@ -84,7 +89,12 @@ def reveal(
     truth: Annotated[Path, typer.Argument(metavar="PATH", help="truth.json of its session.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the judgement as JSON.")] = False,
 ) -> None:
-    """Compare a run and its diagnosis with the truth."""
+    """Compare a run and its diagnosis with the truth.
+
+    \b
+    Examples:
+      stitch reveal runs/blade cells/blade.truth.json
+    """
     judged = judge(run, truth)
     if as_json:
         print(json.dumps(judged, indent=1))

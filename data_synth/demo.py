@@ -20,7 +20,13 @@ def demo(
     folder: Annotated[Path, typer.Argument(help="Where session and run are written.")] = Path("runs/demo"),
     seed: Annotated[int, typer.Option(help="Another seed, another cell and another hidden effect.")] = 0,
 ) -> None:
-    """Scan a blade in a cell with a hidden effect, stitch it, find the effect, add it, and watch the error fall."""
+    """Scan a blade in a cell with a hidden effect, stitch it, find the effect, add it, and watch the error fall.
+
+    \b
+    Examples:
+      stitch demo
+      stitch demo elsewhere --seed 4
+    """
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run import run

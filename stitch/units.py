@@ -1,9 +1,35 @@
-"""Numbers as people read them: in micrometres, with the digits that are known."""
+"""Numbers as people read them: mm from one millimetre on, µm below, mrad, with the digits that are known."""
 
 import numpy as np
 
 METRES = {"mm": 1e-3, "m": 1.0}  # in one length_unit
 MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
+
+
+def length_text(value: float, length_unit: str, digits: int = 3) -> str:
+    """A length for people: 38.1 µm, 1.49 mm; a dash where nothing was measured."""
+    if not np.isfinite(value):
+        return "–"
+    um = float(f"{value * MICROMETRES[length_unit]:.{digits}g}")
+    return f"{_plain(um / 1e3, digits)} mm" if abs(um) >= 1e3 else f"{_plain(um, digits)} µm"
+
+
+def angle_text(value: float, digits: int = 3) -> str:
+    """An angle in rad for people: 0.033 mrad; a dash where nothing was measured."""
+    return f"{_plain(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
+
+
+def known_text(value: float, U: float) -> str:
+    """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
+    if not np.isfinite(U) or U <= 0:
+        return f"{_plain(value, 6)} ± –"
+    told = _plain(U, 2)
+    return f"{value:.{max(1 - int(np.floor(np.log10(U))), 0)}f} ± {told}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """So many digits that count, never an exponent."""
+    return str(np.format_float_positional(value, precision=digits, fractional=False, unique=False, trim="-"))
 
 
 def rounded(value: float, sigma: float) -> str:

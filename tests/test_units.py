@@ -1,6 +1,8 @@
 """Numbers as they are printed."""
 
-from stitch.units import rounded
+import pytest
+
+from stitch.units import angle_text, known_text, length_text, rounded
 
 
 def test_numbers_end_where_their_sigma_begins():
@@ -8,3 +10,38 @@ def test_numbers_end_where_their_sigma_begins():
     assert rounded(-2e-10, 0.03) == "0"
     assert rounded(0.1342, 0.0312) == "0.13"
     assert rounded(1.23456, float("nan")) == "1.235"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "told"),
+    [
+        (0.0381, "mm", "38.1 µm"),
+        (1.4889, "mm", "1.49 mm"),
+        (0.99996, "mm", "1 mm"),
+        (1234.56, "mm", "1235 mm"),
+        (4.2e-5, "m", "42 µm"),
+        (0.02, "m", "20 mm"),
+        (0.0, "mm", "0 µm"),
+        (float("nan"), "mm", "–"),
+    ],
+)
+def test_lengths_are_in_mm_from_one_millimetre_on(value, unit, told):
+    assert length_text(value, unit) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "U", "told"),
+    [
+        (1451.8213, 0.1432, "1451.82 ± 0.14"),
+        (-0.21, 5.61, "-0.2 ± 5.6"),
+        (12.3456, 23.4, "12 ± 23"),
+        (3.14, 0.0, "3.14 ± –"),
+        (3.14, float("nan"), "3.14 ± –"),
+    ],
+)
+def test_values_have_two_digits_of_their_uncertainty(value, U, told):
+    assert known_text(value, U) == told
+
+
+def test_angles_are_in_mrad():
+    assert angle_text(2e-5) == "0.02 mrad" and angle_text(float("nan")) == "–"

@@ -12,7 +12,12 @@ from viz.rerun_program import rerun_program
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]) -> None:
-    """Open the recording of a run in the Rerun viewer."""
+    """Open the recording of a run in the Rerun viewer.
+
+    \b
+    Examples:
+      stitch view runs/blade-17
+    """
     open_recording(run)
 
 

@@ -19,7 +19,7 @@ from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.reading.session_toml import document, name_of
 from stitch.system.console import console
-from stitch.units import MICROMETRES
+from stitch.units import MICROMETRES, length_text
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 
@@ -32,7 +32,12 @@ def batch(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Run many sessions; one that fails does not stop the others."""
+    """Run many sessions; one that fails does not stop the others.
+
+    \b
+    Examples:
+      stitch batch blade-17 blade-18 blade-19 -o runs --workers 2
+    """
     folders = [output / _name(path) for path in sessions]
     if len(set(folders)) < len(folders):
         twice = max(folders, key=folders.count).name
@@ -104,11 +109,12 @@ def _map(
 
 def _show(rows: list[dict[str, Any]]) -> None:
     terminal, table = console(), Table()
-    for heading in ("session", "one hand-eye (µm)", "registered (µm)", "noise (µm)", "seconds"):
+    for heading in ("session", "one hand-eye", "registered", "noise", "seconds"):
         table.add_column(heading, justify="left" if heading == "session" else "right")
     for row in rows:
-        keys = ("residual_um", "registered_um", "noise_floor_um", "seconds")
-        table.add_row(Path(row["session"]).name, *("–" if row["error"] else f"{row[key]:.1f}" for key in keys))
+        keys = ("residual_um", "registered_um", "noise_floor_um")
+        told = ["–"] * 3 if row["error"] else [length_text(row[key] / 1e3, "mm") for key in keys]
+        table.add_row(Path(row["session"]).name, *told, "–" if row["error"] else f"{row['seconds']:.1f}")
     terminal.print(table)
     for row in rows:
         if row["error"]:

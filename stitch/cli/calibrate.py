@@ -46,7 +46,13 @@ def sphere(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the JSON there.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Hand-eye from laser-line or area scans of one sphere of known radius."""
+    """Hand-eye from laser-line or area scans of one sphere of known radius.
+
+    \b
+    Examples:
+      stitch calibrate sphere ball-session
+      stitch calibrate sphere ball-session --radius-free -o hand-eye.json
+    """
     if output is not None and output.exists() and output.suffix != ".json":
         raise InputError(f"{output}: exists and is no JSON file; name another, or remove it")
     loaded = load_session(session)
@@ -72,7 +78,12 @@ def sphere(
 @calibrate.command()
 @results_alone
 def tracker(session: _SESSION, as_json: Json = False) -> None:
-    """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board."""
+    """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board.
+
+    \b
+    Examples:
+      stitch calibrate tracker probe-session --json
+    """
     loaded = load_session(session)
     document = tracker_document(calibrate_tracker(loaded), loaded)
     if as_json:
@@ -99,7 +110,12 @@ def robot(
     at_most: Annotated[int, typer.Option("--at-most", help="Largest number of effects.")] = 8,
     as_json: Json = False,
 ) -> None:
-    """Kinematic calibration: what the arm's nominal model lacks, as model, corrected DH rows and URDF."""
+    """Kinematic calibration: what the arm's nominal model lacks, as model, corrected DH rows and URDF.
+
+    \b
+    Examples:
+      stitch calibrate robot reflector-session -o runs/arm
+    """
     loaded = load_session(session)
     first = run(loaded)
     calibrated(first)

@@ -23,7 +23,7 @@ from stitch.runs.state import State, state_of
 from stitch.stepwise import suggest
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
-from stitch.units import MICROMETRES, rounded
+from stitch.units import length_text, rounded
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.result_document import result_document
@@ -41,7 +41,13 @@ def add(
     recording: _Recording = True,
     as_json: Json = False,
 ) -> None:
-    """Add effects to the model of a run, fit hand-eye and all effects anew, and show what it brought."""
+    """Add effects to the model of a run, fit hand-eye and all effects anew, and show what it brought.
+
+    \b
+    Examples:
+      stitch add runs/blade-17 backlash
+      stitch add runs/blade-17 --suggested
+    """
     if bool(effects) == suggested:
         raise InputError("add what? to fix: name the effects, or let --suggested choose; one of the two")
     with run_folder.held(run):
@@ -83,7 +89,12 @@ def drop(
     recording: _Recording = True,
     as_json: Json = False,
 ) -> None:
-    """Take effects out of the model of a run and fit the rest anew."""
+    """Take effects out of the model of a run and fit the rest anew.
+
+    \b
+    Examples:
+      stitch drop runs/blade-17 backlash
+    """
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
         used = state.model.effects
@@ -111,16 +122,16 @@ def _show(result: Run, as_json: bool) -> None:
 
 def show_ledger(result: Run) -> None:
     """History of the model, fitted parameters, and whether the last effect earned its place."""
-    terminal, to_um = console(), MICROMETRES[result.session.length_unit]
+    terminal, unit = console(), result.session.length_unit
     table = Table(title=f"{result.session.name}: history of the model", title_justify="left")
-    for heading in ("step", "effects", "residual (µm)", "held-out (µm)", "noise floor (µm)"):
+    for heading in ("step", "effects", "residual", "held-out", "noise floor"):
         table.add_column(heading, justify="left" if heading == "effects" else "right")
     for i, s in enumerate(result.ledger):
-        numbers = (f"{x * to_um:.1f}" for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
+        numbers = (length_text(x, unit, 4) for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
         table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
     terminal.print(table)
     if (history := model_history(result)) is not None:
-        terminal.print(plain_verdict(history, result.session.length_unit), soft_wrap=True, style="bold")
+        terminal.print(plain_verdict(history, unit), soft_wrap=True, style="bold")
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
             known_to = f"± {p.sigma:.1g}" if p.fitted else "(explains most)"

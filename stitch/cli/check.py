@@ -26,7 +26,13 @@ def check(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Read sessions completely and say what is wrong; computes nothing unless asked to look deeper."""
+    """Read sessions completely and say what is wrong; computes nothing unless asked to look deeper.
+
+    \b
+    Examples:
+      stitch check blade-17
+      stitch check --deep blade-17 --json
+    """
     if deep:
         _deep(sessions, as_json)
         return

@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from stitch.cli.streams import results_alone
 
@@ -77,3 +77,11 @@ class CommandGroup(TyperGroup):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.commands = Commands()
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Names alone: whoever presses the tab key does not wait for the libraries of all commands."""
+        loaded, self.commands = self.commands, {name: TyperCommand(name) for name in self.commands}
+        try:
+            return super().shell_complete(ctx, incomplete)
+        finally:
+            self.commands = loaded

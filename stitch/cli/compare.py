@@ -16,7 +16,7 @@ from stitch.comparison.tables import Comparison, Table, comparison_document
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
-from stitch.units import MICROMETRES
+from stitch.units import MICROMETRES, length_text
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend, held
 
@@ -30,7 +30,13 @@ def compare_run(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Show the residual by view, pair, target, joint, range, incidence, field, time, covariate and place."""
+    """Show the residual by view, pair, target, joint, range, incidence, field, time, covariate and place.
+
+    \b
+    Examples:
+      stitch compare runs/blade-17
+      stitch compare runs/blade-17 --json
+    """
     with held(run):
         state = load_state(run, effects_file, thin=True, trust=trust)
         found = write_comparison(state, run)
@@ -45,7 +51,7 @@ def show_comparison(found: Comparison, state: State, run: Path) -> None:
     to_um = MICROMETRES[state.session.length_unit]
     terminal = console()
     what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
-    terminal.print(f"{found.rms * to_um:.1f} µm rms {what} under the model.")
+    terminal.print(f"{length_text(found.rms, state.session.length_unit)} rms {what} under the model.")
     for table in found.labelled:
         _worst(terminal, table, to_um)
     for table in found.places[:_SHOWN]:

@@ -15,7 +15,7 @@ from stitch.pipeline import diagnose
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
-from stitch.units import MICROMETRES
+from stitch.units import length_text
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.run_folder import extend, held
@@ -29,7 +29,13 @@ def diagnose_run(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Say which physical effect is missing in the model of a run, or why nobody can tell."""
+    """Say which physical effect is missing in the model of a run, or why nobody can tell.
+
+    \b
+    Examples:
+      stitch diagnose runs/blade-17
+      stitch diagnose runs/blade-17 --effects-file mine.py --json
+    """
     found, document, unit = _diagnosed(run, effects_file, trust)
     if as_json:
         emit(to_json(document))
@@ -43,7 +49,12 @@ def next_measurement(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Say which poses or artefacts would separate what cannot be told apart."""
+    """Say which poses or artefacts would separate what cannot be told apart.
+
+    \b
+    Examples:
+      stitch next runs/blade-17
+    """
     found, document, _ = _diagnosed(run, effects_file, trust)
     if as_json:
         emit(to_json({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}))
@@ -80,13 +91,13 @@ def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, obje
 
 def show(found: Diagnosis, length_unit: str) -> None:
     """Sentence first, then the candidate effects, what the poses follow, what to do next."""
-    terminal, to_um = console(), MICROMETRES[length_unit]
+    terminal = console()
     terminal.print(found.sentence, soft_wrap=True, style="bold")
     table = Table(title="Candidate effects", title_justify="left")
-    for heading in ("effect", "p", "posterior", "rms if added (µm)", "held-out if added (µm)"):
+    for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
     for s in found.candidates[:_SHOWN]:
-        table.add_row(*_row(found, s, to_um))
+        table.add_row(*_row(found, s, length_unit))
     terminal.print(table)
     for s in found.candidates[:3]:
         if s.ranked.score.observable:
@@ -101,17 +112,17 @@ def show(found: Diagnosis, length_unit: str) -> None:
         names = ", ".join(name for name, needs in found.missing.items() if need in needs)
         terminal.print(f"Not tested without {need}: {names}.", soft_wrap=True)
     if found.verdict == "adequate":
-        _show_missed(terminal, found, to_um)
+        _show_missed(terminal, found, length_unit)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
         terminal.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
     for p in found.next[:3]:
         terminal.print(f"Next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
 
 
-def _show_missed(terminal: Console, found: Diagnosis, to_um: float) -> None:
+def _show_missed(terminal: Console, found: Diagnosis, length_unit: str) -> None:
     """What effects too small to be seen could still do to the hand-eye."""
     known = sorted(((s.hand_eye, s.name) for s in found.candidates if s.hand_eye is not None), reverse=True)
-    told = ", ".join(f"{name} {size * to_um:.2g} µm" for size, name in known[:3])
+    told = ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3])
     if told:
         terminal.print(
             "An effect too small to be seen could still displace the hand-eye, at the part by as much as: "
@@ -120,13 +131,13 @@ def _show_missed(terminal: Console, found: Diagnosis, to_um: float) -> None:
         )
 
 
-def _row(found: Diagnosis, s: CandidateEffect, to_um: float) -> list[str]:
+def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
     if not s.ranked.score.observable:
         return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
     if s.cross_validation is not None:
         left = [
-            f"{found.residual_rms * to_um * x**0.5:.1f}"
+            length_text(found.residual_rms * x**0.5, length_unit)
             for x in (s.cross_validation.inside, s.cross_validation.heldout)
         ]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

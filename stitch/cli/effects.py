@@ -21,7 +21,14 @@ def effects(
     effects_file: EffectsFile = None,
     as_json: Json = False,
 ) -> None:
-    """List the physical effects with place, formula, parameters and plausible sizes."""
+    """List the physical effects with place, formula, parameters and plausible sizes.
+
+    \b
+    Examples:
+      stitch effects
+      stitch effects joint_compliance
+      stitch effects --effects-file mine.py --json
+    """
     if effects_file:
         load(effects_file)
     terminal = console(results())

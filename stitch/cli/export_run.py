@@ -55,7 +55,15 @@ def export_run(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Write what a run found for other programs, or a compensated copy of a robot program."""
+    """Write what a run found for other programs, or a compensated copy of a robot program.
+
+    \b
+    Examples:
+      stitch export runs/blade-17 --to ros
+      stitch export runs/blade-17 --to kuka -o scanner.txt
+      stitch export runs/blade-17 --to glb -o blade.glb
+      stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
+    """
     if (to is None) == (program is None):
         raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
     if output is not None and (output.exists() or output.is_symlink()):

@@ -45,7 +45,13 @@ def import_command(
     file_unit: Annotated[str | None, typer.Option("--file-unit", help="Of a table: mm, m, cm or inch.")] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="The table holds T_flange_base.")] = False,
 ) -> None:
-    """Write the points of a robot program, of a tracker or of a table as views.csv (frames.csv, points.csv)."""
+    """Write the points of a robot program, of a tracker or of a table as views.csv (frames.csv, points.csv).
+
+    \b
+    Examples:
+      stitch import scan.ls -o views.csv --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
+      stitch import poses.txt -o views.csv --columns x,y,z,rx,ry,rz --rotation xyz-extrinsic --angles deg
+    """
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()

@@ -55,7 +55,15 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")] = False,
 ) -> None:
-    """Make a session of a folder of scans and poses; the scans tell which convention the poses are in."""
+    """Make a session of a folder of scans and poses; the scans tell which convention the poses are in.
+
+    \b
+    Examples:
+      stitch init scans
+      stitch init scans --poses robot_poses.txt --yes
+      stitch init scans --rotation zyx-intrinsic --angles deg --unit mm --mount eye_in_hand -o session
+      stitch init drive.mcap --topic /points
+    """
     if is_bag(folder):
         _of_bag(folder, output or folder.with_name(f"{folder.stem}-session"), topic, named, as_json)
         return

@@ -5,7 +5,9 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -30,18 +32,31 @@ _FIXES = {
 }
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"stitch {version('stitch')}")
+        raise typer.Exit
+
+
 def build() -> typer.Typer:
     """The application with the commands of every installed package."""
     app = typer.Typer(
         cls=CommandGroup,
         help="Stitch robot scans: find and correct the hand-eye, register, fuse, and say what is left.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
-    app.callback()(lambda: None)
+    app.callback()(_options)
     return app
+
+
+def _options(
+    asked: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """What stands before the commands."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

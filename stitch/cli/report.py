@@ -26,7 +26,13 @@ def report(
     effects_file: EffectsFile = None,
     trust: Trust = False,
 ) -> None:
-    """Write report.html of a run anew, with comparison and diagnosis; nothing is fitted, the model stays as it is."""
+    """Write report.html of a run anew, with comparison and diagnosis; nothing is fitted, the model stays as it is.
+
+    \b
+    Examples:
+      stitch report runs/blade-17 --tolerance 0.1
+      stitch report runs/blade-17 --pdf
+    """
     require_tolerance(tolerance)
     printer = printing_browser() if pdf else None
     with run_folder.held(run):

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from stitch.cli.options import EffectsFile, Force, Json, Tolerance, Trust, require_tolerance
 from stitch.cli.progress import Progress, Tee
 from stitch.cli.progress_lines import ProgressLines, wanted
+from stitch.cli.run_summary import show
 from stitch.cli.streams import emit
-from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import plain_verdict
 from stitch.effects.in_session import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
@@ -22,10 +20,7 @@ from stitch.model.model_toml import write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import Run
 from stitch.stored.trusted_model import trusted_model
-from stitch.system.console import console
-from stitch.units import MICROMETRES
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.mesh import write_mesh
@@ -34,7 +29,10 @@ from stitch.writing.run_contents import FILES
 
 
 def run(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders of one rig.")],
+    sessions: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[SESSION]...", help="Session folders of one rig; default: the one you stand in."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")
     ] = None,
@@ -51,7 +49,16 @@ def run(
     tolerance: Tolerance = None,
     as_json: Json = False,
 ) -> None:
-    """Find and correct the hand-eye, register the views, fuse them."""
+    """Find and correct the hand-eye, register the views, fuse them.
+
+    \b
+    Examples:
+      stitch run blade-17
+      stitch run
+      stitch run blade-17 -o found --effects joint_offset,backlash
+      stitch run monday tuesday -o both
+      stitch run blade-18 --hand-eye found --mesh
+    """
     require_tolerance(tolerance)
     names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
     if effects_file:
@@ -62,9 +69,11 @@ def run(
         raise InputError(
             "--effects and --hand-eye: a model that is used as it is brings its own effects; name one of the two"
         )
+    here = not sessions
+    sessions = sessions or [_here()]
     loaded = [load_session(path) for path in sessions]
     names = _names(loaded)
-    target = output or Path("runs") / (names[0] if len(names) == 1 else "+".join(names))
+    target = output or Path("../runs" if here else "runs") / "+".join(names)
     model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
     with run_folder.new_folder(target, sessions, force) as scratch:
         folders = _folders(scratch, names)
@@ -83,6 +92,13 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
+
+
+def _here() -> Path:
+    """The folder one stands in, if it is a session."""
+    if not Path("session.toml").is_file():
+        raise InputError("run what? this folder has no session.toml; to fix: name a session folder, or go into one")
+    return Path.cwd()
 
 
 def _names(sessions: list[Session]) -> list[str]:
@@ -113,34 +129,3 @@ def recorder_for(folder: Path, recording: bool) -> Recorder:
 def recordings(folder: Path) -> list[Recorder]:
     """What other packages record of a run."""
     return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
-
-
-def show(runs: list[Run], target: Path) -> None:
-    """The stage table, the verdict and the paths, for people."""
-    terminal = console()
-    for result in runs:
-        session: Session = result.session
-        to_um = MICROMETRES[session.length_unit]
-        for note in result.notes[: len(result.left_out)]:
-            terminal.print(note, soft_wrap=True, style="bold")
-        table = Table(title=session.name, title_justify="left")
-        for heading in ("stage", "rms (µm)", "correspondences", "iterations", "seconds"):
-            table.add_column(heading, justify="left" if heading == "stage" else "right")
-        for s in result.stages:
-            table.add_row(
-                s.name, f"{s.rms * to_um:.1f}", f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}"
-            )
-        terminal.print(table)
-        for s in result.stages[1:]:
-            if s.note:
-                terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
-        if (history := model_history(result)) is not None:
-            terminal.print(plain_verdict(history, session.length_unit), soft_wrap=True, style="bold")
-        terminal.print(result.verdict, soft_wrap=True)
-        hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
-        for line in (*hidden, *result.notes[len(result.left_out) :]):
-            terminal.print(line, soft_wrap=True)
-        folder = target if len(runs) == 1 else target / session.name
-        for name in ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"):
-            if (folder / name).exists():
-                terminal.print(f"  {folder / name}", soft_wrap=True)

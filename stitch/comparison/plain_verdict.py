@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch.comparison.disagreement_field import Field
 from stitch.comparison.model_history import ModelHistory
-from stitch.units import MICROMETRES
+from stitch.units import length_text
 
 # Expanded uncertainty: a place is within the tolerance if its distance and two standard errors are (ISO 14253-1).
 _COVERAGE = 2.0
@@ -22,8 +22,9 @@ class Judged(NamedTuple):
 
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:
     """How far the views disagree on the part, what the effects in use brought, what is left in the stitched cloud."""
-    um, models = MICROMETRES[length_unit], history.models
-    before, now, left = (f"{s.field.mean_abs * um:.3g} µm" for s in (models[0], models[-1], history.steps[-1]))
+    models = history.models
+    told = (length_text(s.field.mean_abs, length_unit) for s in (models[0], models[-1], history.steps[-1]))
+    before, now, left = told
     rest = f"with each view moved by its own correction, {left} remain in the stitched cloud."
     changes = [s.name.removeprefix("+ ") for s in models[1:] if s.name.startswith("+ ")]
     if not changes:
@@ -36,10 +37,9 @@ def plain_verdict(history: ModelHistory, length_unit: str) -> str:
 
 def judged(history: ModelHistory, tolerance: float, length_unit: str) -> Judged:
     """Whether 95 % of the part agree within a tolerance (length_unit), in the stitched cloud and under the model."""
-    um = MICROMETRES[length_unit]
     model, cloud = (_reach(s.field) for s in (history.models[-1], history.steps[-1]))
-    allowed = f"{tolerance * um:.4g} µm"
-    told = f"{model * um:.3g} µm under the model, {cloud * um:.3g} µm in the stitched cloud"
+    allowed = length_text(tolerance, length_unit, 4)
+    told = f"{length_text(model, length_unit)} under the model, {length_text(cloud, length_unit)} in the stitched cloud"
     if cloud > tolerance:
         return Judged("bad", f"Not within {allowed}: 95 % of the part agree to {told}.")
     if model > tolerance:

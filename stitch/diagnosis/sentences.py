@@ -4,41 +4,39 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.units import MICROMETRES, rounded
+from stitch.units import angle_text, length_text, rounded
 
 
 def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     """One sentence for each verdict."""
-    to_um = MICROMETRES[length_unit]
-    now, floor = (f"{x * to_um:.3g} µm" for x in (d.residual_rms, d.noise_floor))
-    scatter = f"{d.translation * to_um:.3g} µm and {d.rotation * 1e6:.3g} µrad"
+    now, floor = (length_text(x, length_unit) for x in (d.residual_rms, d.noise_floor))
+    scatter = f"{length_text(d.translation, length_unit)} and {angle_text(d.rotation)}"
     if d.verdict == "adequate":
-        rest = (
-            f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {_judged_by(d, to_um)}"
-        )
+        by = _judged_by(d, length_unit)
+        rest = f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {by}"
         return (
             f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
             f"{rest if _scatters(d) else ''}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
-        return _missing(d, to_um, now, floor, second)
+        return _missing(d, length_unit, now, floor, second)
     if d.verdict == "cannot_tell":
         names = " or ".join(d.effects)
         return f"Something is missing ({now} remain, noise {floor}), but these views cannot tell {names} apart" + (
             f"; {d.next[0].do}." if d.next else "."
         )
-    return _unknown(d, to_um, now, floor, scatter)
+    return _unknown(d, length_unit, now, floor, scatter)
 
 
-def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | None) -> str:
+def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranked | None) -> str:
     name = d.effects[0]
     candidate = next(s for s in d.candidates if s.name == name)
     amounts = amounts_of(candidate.ranked)
     gain = ""
     if candidate.cross_validation is not None:
         inside, heldout = candidate.cross_validation.inside, candidate.cross_validation.heldout
-        left, out = (d.residual_rms * np.sqrt(share) * to_um for share in (inside, heldout))
-        gain = f"; adding it should leave about {left:.3g} µm, {out:.3g} µm on views left out"
+        left, out = (length_text(d.residual_rms * np.sqrt(share), length_unit) for share in (inside, heldout))
+        gain = f"; adding it should leave about {left}, {out} on views left out"
     more = f" {second.name} seems to be there too." if second else ""
     return (
         f"{name} is missing ({amounts}; p = {candidate.ranked.adjusted:.1g}): {now} remain where noise would leave "
@@ -46,7 +44,7 @@ def _missing(d: Diagnosis, to_um: float, now: str, floor: str, second: Ranked | 
     )
 
 
-def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> str:
+def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
@@ -55,7 +53,7 @@ def _unknown(d: Diagnosis, to_um: float, now: str, floor: str, scatter: str) -> 
             f"the poses scatter by {scatter} otherwise" if _scatters(d) else "what was seen does not show the poses"
         )
         return f"{start}{follows}{otherwise}{_notes(d)}{_lack(d)}."
-    than = f"more than {_limits(d, to_um)} as stated" if d.scatter_limit.stated else "which no sound arm does"
+    than = f"more than {_limits(d, length_unit)} as stated" if d.scatter_limit.stated else "which no sound arm does"
     return (
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
         f"the same poses, so that those found on one object correct another{_notes(d)}{_lack(d)}."
@@ -67,15 +65,16 @@ def _scatters(d: Diagnosis) -> bool:
     return d.rotation > 0 or d.translation > 0
 
 
-def _judged_by(d: Diagnosis, to_um: float) -> str:
+def _judged_by(d: Diagnosis, length_unit: str) -> str:
     """What "adequate" is measured against."""
     if d.scatter_limit.stated:
-        return f"within {_limits(d, to_um)} as stated"
-    return f"judged by what is usual for an arm (up to {_limits(d, to_um)}): no repeatability is stated under [robot]"
+        return f"within {_limits(d, length_unit)} as stated"
+    usual = _limits(d, length_unit)
+    return f"judged by what is usual for an arm (up to {usual}): no repeatability is stated under [robot]"
 
 
-def _limits(d: Diagnosis, to_um: float) -> str:
-    return f"{d.scatter_limit.translation * to_um:.3g} µm and {d.scatter_limit.rotation * 1e6:.3g} µrad"
+def _limits(d: Diagnosis, length_unit: str) -> str:
+    return f"{length_text(d.scatter_limit.translation, length_unit)} and {angle_text(d.scatter_limit.rotation)}"
 
 
 def _notes(d: Diagnosis) -> str:

@@ -11,7 +11,7 @@ from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut
 from stitch.stages.coarse import Coarse
-from stitch.units import MICROMETRES
+from stitch.units import angle_text, length_text
 
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
 _NEAR_FLOOR = 1.1
@@ -24,32 +24,31 @@ _LISTED = 12
 
 def surface_sentence(residual: float, registered: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
     """What one hand-eye leaves between the surfaces, what the noise would leave, and where the difference sits."""
-    to_um = MICROMETRES[length_unit]
-    left, noise = (f"{x * to_um:.3g} µm" for x in (residual, floor))
+    left, noise = (length_text(x, length_unit) for x in (residual, floor))
     if residual < _NEAR_FLOOR * floor:
         return f"One hand-eye closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."
     return (
         f"One hand-eye leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
-        f"{_scatter(scatter, registered, to_um)}."
+        f"{_scatter(scatter, registered, length_unit)}."
     )
 
 
 def target_sentence(found: TargetFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
     """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
-    to_um, floor = MICROMETRES[length_unit], found.noise_floor
-    left, out, noise = (f"{x * to_um:.4g} µm" for x in (found.rms, found.heldout_rms, floor))
+    floor = found.noise_floor
+    left, out, noise = (length_text(x, length_unit, 4) for x in (found.rms, found.heldout_rms, floor))
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (
         f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; the "
-        f"sensor's own noise would leave {noise}. The robot's poses {_scatter(scatter, registered, to_um)}."
+        f"sensor's own noise would leave {noise}. The robot's poses {_scatter(scatter, registered, length_unit)}."
     )
 
 
-def _scatter(scatter: Repeatability, registered: float, to_um: float) -> str:
+def _scatter(scatter: Repeatability, registered: float, length_unit: str) -> str:
     return (
-        f"scatter by {scatter.translation * to_um:.3g} µm and {scatter.rotation * 1e3:.2g} mrad; moving each view by "
-        f"its own correction leaves {registered * to_um:.3g} µm"
+        f"scatter by {length_text(scatter.translation, length_unit)} and {angle_text(scatter.rotation, 2)}; moving "
+        f"each view by its own correction leaves {length_text(registered, length_unit)}"
     )
 
 
@@ -128,11 +127,11 @@ def mixed_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session)
 
 
 def _left_out(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
-    to_um = MICROMETRES[session.length_unit]
     notes = []
     if outliers:
         named_outliers = [
-            f"{named(o, session)} ({o.distance * to_um:.3g} µm, {o.times:.0f} times the usual)" for o in outliers
+            f"{named(o, session)} ({length_text(o.distance, session.length_unit)}, {o.times:.0f} times the usual)"
+            for o in outliers
         ]
         more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""
         notes.append(f"Not used, because they contradict the rest: {', '.join(named_outliers[:_LISTED])}{more}.")

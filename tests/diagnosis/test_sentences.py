@@ -21,7 +21,7 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = sentence_of(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
-    assert "20 µm and 20 µrad" in told and told.endswith("; a note.")
+    assert "20 µm and 0.02 mrad" in told and told.endswith("; a note.")
     silent = sentence_of(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
-    assert "13.2 µm" in silent and "µrad" not in silent and "repeatability" not in silent
+    assert "13.2 µm" in silent and "mrad" not in silent and "repeatability" not in silent
     assert silent.endswith("; a note.")

@@ -24,7 +24,12 @@ def base(
     session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
-    """Find the transform between two robot bases from a stand with a measuring rod."""
+    """Find the transform between two robot bases from a stand with a measuring rod.
+
+    \b
+    Examples:
+      stitch base stand.toml --report page.html
+    """
     stand = read_stand(file)
     try:
         result = solve(stand)

@@ -25,7 +25,12 @@ def drill(
     session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
-    """Correct the drives of holes from reference holes that the robot has seen."""
+    """Correct the drives of holes from reference holes that the robot has seen.
+
+    \b
+    Examples:
+      stitch drill job.toml --report page.html
+    """
     job = read_job(file)
     result = solve_job(job)
     if output is not None:

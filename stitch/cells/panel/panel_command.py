@@ -25,7 +25,12 @@ def panel(
     session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
-    """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape."""
+    """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape.
+
+    \b
+    Examples:
+      stitch panel job.toml --report page.html
+    """
     job = read_job(file)
     result = solve_job(job)
     written = []

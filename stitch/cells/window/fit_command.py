@@ -23,7 +23,12 @@ def fit(
     session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
-    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path."""
+    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
+
+    \b
+    Examples:
+      stitch fit fit.toml --report page.html
+    """
     job = read_fit_job(file)
     parts = fit_parts(job)
     written = write_fit(job, parts, output) if output is not None else []

@@ -25,7 +25,12 @@ def seam(
     session: SessionOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
-    """Measure flush and gap at the stations of a seam, with uncertainty and verdict."""
+    """Measure flush and gap at the stations of a seam, with uncertainty and verdict.
+
+    \b
+    Examples:
+      stitch seam seam.toml --report page.html
+    """
     job = read_seam_job(file)
     seams = solve_seam(job)
     if output is not None:

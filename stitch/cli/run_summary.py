@@ -1,0 +1,89 @@
+"""What `stitch run` says at its end: stages, hand-eye with U, errors, verdict, files, the next command."""
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from stitch.comparison.model_history import model_history
+from stitch.comparison.plain_verdict import plain_verdict
+from stitch.frames import Array
+from stitch.model.hand_eye_uncertainty import expanded
+from stitch.runs.run import Run
+from stitch.system.console import console
+from stitch.units import METRES, known_text, length_text
+
+_FILES = ("stitched.ply", "mesh.ply", "recording.rrd", "report.html")
+
+
+def show(runs: list[Run], target: Path) -> None:
+    """For people, on standard error."""
+    terminal = console()
+    for result in runs:
+        for note in result.notes[: len(result.left_out)]:
+            terminal.print(note, soft_wrap=True, style="bold")
+        terminal.print(_stages(result))
+        for s in result.stages[1:]:
+            if s.note:
+                terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
+        if (history := model_history(result)) is not None:
+            terminal.print(plain_verdict(history, result.session.length_unit), soft_wrap=True, style="bold")
+        terminal.print(result.verdict, soft_wrap=True)
+        hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
+        for line in (*hidden, *result.notes[len(result.left_out) :]):
+            terminal.print(line, soft_wrap=True)
+        terminal.print(_errors(result), soft_wrap=True)
+    # One rig has one hand-eye.
+    for line in hand_eye_lines(runs[0].T_mount, runs[0].mount_covariance, runs[0].session.mount, _unit(runs[0])):
+        terminal.print(line, soft_wrap=True)
+    folders = [target] if len(runs) == 1 else [target / result.session.name for result in runs]
+    _files(terminal, folders)
+
+
+def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
+    """Position in mm and rotation vector in mrad with U (k = 2), both in the frame that carries the scanner."""
+    frame = "base" if mount == "eye_to_hand" else "flange"
+    to_mm = METRES[length_unit] * 1e3
+    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
+    U = expanded(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+    position, turn = (
+        ", ".join(f"{axis} {known_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
+    )
+    return [
+        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2):",
+        f"  position {position} mm",
+        f"  rotation vector {turn} mrad",
+    ]
+
+
+def _unit(result: Run) -> str:
+    return result.session.length_unit
+
+
+def _stages(result: Run) -> Table:
+    table = Table(title=result.session.name, title_justify="left")
+    for heading in ("stage", "rms", "correspondences", "iterations", "seconds"):
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    for s in result.stages:
+        rms = length_text(s.rms, _unit(result), 4)
+        table.add_row(s.name, rms, f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}")
+    return table
+
+
+def _errors(result: Run) -> str:
+    held, own, floor = (
+        length_text(x, _unit(result)) for x in (result.heldout_rms, result.residual_rms, result.noise_floor)
+    )
+    return f"Held-out error {held} (in the fit {own}, noise floor {floor})."
+
+
+def _files(terminal: Console, folders: list[Path]) -> None:
+    for folder in folders:
+        for name in _FILES:
+            if (folder / name).exists():
+                terminal.print(f"  {folder / name}", soft_wrap=True)
+    terminal.print(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}", soft_wrap=True)

@@ -1,0 +1,121 @@
+"""What a stranger asks first: help with examples that parse, cheap ones that run, the version, the tab key."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import typer
+
+from data_synth.fixtures.run_folders import bare_run
+from stitch.cli.main import build, main
+
+
+def commands(group, words=()):
+    """Every command with the words that call it."""
+    for name in group.commands:
+        command = group.commands[name]
+        if hasattr(command, "commands"):
+            yield from commands(command, (*words, name))
+        else:
+            yield (*words, name), command
+
+
+COMMANDS = dict(commands(typer.main.get_command(build())))
+
+
+def examples(command):
+    """Lines of its help, after the word Examples."""
+    return re.findall(r"^ *(stitch .*?) *$", command.help.partition("Examples:")[2], re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_help_has_examples_that_parse(words):
+    command = COMMANDS[words]
+    lines = examples(command)
+    assert lines, f"stitch {' '.join(words)} --help shows no example; write some into its docstring, after Examples:"
+    for line in lines:
+        call = shlex.split(line)
+        assert tuple(call[1 : 1 + len(words)]) == words
+        # Unknown options, missing arguments and numbers that are none end in an error.
+        command.make_context(line, call[1 + len(words) :])
+        assert len(line) < 110
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(line for name in ("effects", "check", "export") for line in examples(COMMANDS[(name,)])),
+        "stitch --version",
+        "stitch --help",
+        "stitch export --help",
+    ],
+)
+def test_the_cheap_examples_run(line, session, tmp_path, monkeypatch):
+    """In a folder with the session and the run that they speak of."""
+    if re.search("--program|--deep|mine.py|glb", line):
+        pytest.skip("needs a run of an arm, minutes, or a file of one's own")
+    shutil.move(session, tmp_path / "blade-17")
+    (tmp_path / "runs").mkdir()
+    bare_run(tmp_path / "runs" / "blade-17", np.eye(4), np.eye(6))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(shlex.split(line)[1:])
+    assert not ended.value.code
+
+
+def test_version_is_the_package_s(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"stitch {version('stitch')}\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("stitch ex", ["export"]),
+        ("stitch calibrate sp", ["sphere"]),
+        ("stitch run --eff", ["--effects", "--effects-file"]),
+    ],
+)
+def test_the_tab_key(typed, offered):
+    """As a shell asks; for the name of a command no library is loaded."""
+    code = "import sys; sys.argv[0] = 'stitch'\nfrom stitch.cli.main import main\ntry: main()\nfinally: print('numpy' in sys.modules)"
+    asked = {"_STITCH_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | asked, check=False
+    )
+    *names, loaded = out.stdout.split()
+    assert names == offered
+    assert loaded == str(typed.count(" ") > 1)
+
+
+def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
+    monkeypatch.chdir(session)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "--no-recording"])
+    told = capsys.readouterr().err
+    assert not ended.value.code and (session.parent / "runs" / session.name / "result.json").is_file()
+    assert sorted(path.name for path in session.iterdir()) == ["clouds", "session.toml", "views.csv"]
+    # What a person needs at the end: the hand-eye with U and its frame, errors, files, what to do next.
+    assert re.search(
+        r"Hand-eye T_base_scanner, in the frame of the base, ± U \(k = 2\):\n  position x -?[\d.]+ ± [\d.]+,", told
+    )
+    assert re.search(r"rotation vector x .* mrad\n", told)
+    assert re.search(r"Held-out error [\d.]+ µm \(in the fit [\d.]+ µm, noise floor [\d.]+ µm\)\.", told)
+    assert told.rstrip().endswith(f"Next: stitch diagnose ../runs/{session.name}")
+    assert "\x1b" not in told and "\r" not in told  # quiet where nobody watches
+
+
+def test_run_without_a_session_says_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["run"])
+    assert (
+        ended.value.code == 2 and "this folder has no session.toml; to fix: name a session" in capsys.readouterr().err
+    )
