@@ -10,8 +10,9 @@ def length_text(value: float, length_unit: str, digits: int = 3) -> str:
     """A length for people: 38.1 µm, 1.49 mm; a dash where nothing was measured."""
     if not np.isfinite(value):
         return "–"
-    um = float(f"{value * MICROMETRES[length_unit]:.{digits}g}")
-    return f"{_plain(um / 1e3, digits)} mm" if abs(um) >= 1e3 else f"{_plain(um, digits)} µm"
+    um = value * MICROMETRES[length_unit]
+    # 999.7 µm would be printed as 1000.
+    return f"{_plain(um / 1e3, digits)} mm" if abs(float(f"{um:.{digits}g}")) >= 1e3 else f"{_plain(um, digits)} µm"
 
 
 def angle_text(value: float, digits: int = 3) -> str:
@@ -28,7 +29,8 @@ def known_text(value: float, U: float) -> str:
 
 
 def _plain(value: float, digits: int) -> str:
-    """So many digits that count, never an exponent."""
+    """So many digits that count, more where there are more before the point; never an exponent."""
+    digits = max(digits, len(str(int(abs(value)))))
     return str(np.format_float_positional(value, precision=digits, fractional=False, unique=False, trim="-"))
 
 
