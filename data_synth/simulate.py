@@ -98,7 +98,7 @@ def _take_all(cell: Cell, moments: list[Moment], rail: Array, seed: int) -> list
     def take(moment: Moment) -> Taken:
         return take_view(cell, moment, rail[moment.index], np.random.default_rng([seed, 4, moment.index]))
 
-    return list(parallel(take, moments))
+    return list(parallel(take, moments, "taking views"))
 
 
 def _moments(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Array]) -> list[Moment]:

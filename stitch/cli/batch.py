@@ -19,6 +19,7 @@ from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.reading.session_toml import document, name_of
 from stitch.system.console import console
+from stitch.system.steps import steps
 from stitch.units import MICROMETRES, length_text
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
@@ -42,7 +43,7 @@ def batch(
     if len(set(folders)) < len(folders):
         twice = max(folders, key=folders.count).name
         raise InputError(f"two of the sessions are named {twice!r}; run them with -o of their own")
-    rows = list(_map(sessions, folders, force, workers, scheduler))
+    rows = list(steps("sessions", _map(sessions, folders, force, workers, scheduler), len(sessions)))
     if as_json:
         emit(to_json(rows))
     else:

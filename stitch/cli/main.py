@@ -12,10 +12,12 @@ from typing import Annotated
 import typer
 
 from stitch.cli.commands import CommandGroup
+from stitch.cli.live_line import TimeLeft, live_line
 from stitch.cli.streams import speak_any_terminal
 from stitch.errors import StitchError
 from stitch.reading.text_file import shortened
 from stitch.system import time_limit
+from stitch.system.steps import watched
 
 _LONGEST = 2000
 _ROOM = "; to fix: make room there, then run it again; what stood there is as it was"
@@ -64,7 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     speak_any_terminal()
     time_limit.may_end_process()
     try:
-        build()(list(arguments) if arguments is not None else None)
+        with watched(TimeLeft()):
+            try:
+                build()(list(arguments) if arguments is not None else None)
+            finally:
+                live_line().stop()
     except StitchError as error:
         _end(str(error), error.exit_code)
     except BrokenPipeError:

@@ -1,48 +1,46 @@
 """Progress on a terminal, as one of the recorders."""
 
-import atexit
+import time
 from collections.abc import Sequence
 from math import isfinite
 
+from stitch.cli.live_line import live_line
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Run, StageResult
-from stitch.system.console import console
-from stitch.units import MICROMETRES
+from stitch.units import length_text
 
 
 class Progress:
-    """One changing line on standard error; silent when that is no terminal."""
+    """The changing line of a terminal; silent elsewhere."""
 
     def __init__(self) -> None:
-        self.console = console()
-        self.status = self.console.status("reading") if self.console.is_terminal else None
-        self.to_um = 1e3
+        self.unit = "mm"
+        self.begun = time.monotonic()
 
     def start(self, session: Session) -> None:
         """Name what is being done."""
-        self.to_um = MICROMETRES[session.length_unit]
-        if self.status:
-            # An error on the way must not leave the terminal without a cursor.
-            atexit.register(self.status.stop)
-            self.status.start()
-            self.status.update(f"{session.name}: {len(session.views)} views, finding the hand-eye")
+        self.unit = session.length_unit
+        self._say(f"{session.name}: {len(session.views)} views, finding the hand-eye")
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Show where the iteration stands."""
-        if self.status:
-            # Labelled points have their partners by name.
-            within = f", partners within {gate * self.to_um:.4g} µm" if isfinite(gate) else ""
-            self.status.update(f"{stage} {index + 1}: {rms * self.to_um:.4g} µm rms{within}")
+        # Labelled points have their partners by name.
+        within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
+        self._say(f"{stage} {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
         """A stage has ended."""
 
     def finish(self, run: Run) -> None:
         """Clear the line."""
-        if self.status:
-            self.status.stop()
+        live_line().stop()
+
+    def _say(self, text: str) -> None:
+        """How many iterations there will be nobody knows: the time that has passed."""
+        seconds = round(time.monotonic() - self.begun)
+        live_line().say(f"{text}; {seconds // 60}:{seconds % 60:02d}")
 
 
 class Tee:

@@ -21,6 +21,7 @@ from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.state import State
 from stitch.stages.course import linearise
+from stitch.system.steps import steps
 from stitch.system.threads import library_threads_off
 
 
@@ -70,7 +71,7 @@ def linear_model_of(state: State) -> LinearModel:
 def _examined(linear: LinearModel, selection: Selection, matrix: Array, tests: int) -> list[CandidateEffect]:
     """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes."""
     scores, push, out = [r.score for r in selection.ranked], hand_eye_response(linear), []
-    for k, ranked in enumerate(selection.ranked):
+    for k, ranked in enumerate(steps("candidate effects on views left out", selection.ranked)):
         scored = ranked.score
         detectable = smallest_detectable(linear, scored.candidate, tests)
         out.append(

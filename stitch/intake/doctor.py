@@ -22,6 +22,7 @@ from stitch.integrity.motion_fit import FEWEST, Explained
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.integrity.surfaces_meet import CLEARER, Fallen, surfaces_meet
 from stitch.measurement.capture import Capture
+from stitch.system.steps import steps
 
 # Ways that the dear judge sees: the best of each cheap one.
 _SHORT = 4
@@ -110,7 +111,7 @@ def _decided(capture: Capture, ways: Sequence[Way], motions: RelativeScans | Non
     by_motion = distinct(by_motion, tried, _SHORT)
     short = by_motion if by_targets else list(dict.fromkeys([*distinct(by_centroid, tried, _SHORT), *by_motion]))
     judged = []
-    for i in short:
+    for i in steps("ways to read the poses", short):
         closed = closing.get(i)
         starts = [meets[i][1], *([closed.T_mount] if closed is not None and closed.closed >= _CLOSED else [])]
         judged.append(_judged(ways[i], surfaces_meet(capture, tried[i], starts), closed))

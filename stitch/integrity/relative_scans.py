@@ -41,7 +41,7 @@ def relative_scans(capture: Capture) -> RelativeScans:
     starts = _turns()
     usable = [not shows_no_surface(scan) for scan in capture.scans]
     tried = [(v, w) for v, w in pairs if usable[v] and usable[w]]
-    found = list(parallel(lambda pair: _between(capture, *pair, starts, size), tried))
+    found = list(parallel(lambda pair: _between(capture, *pair, starts, size), tried, "pairs of scans"))
     good = [i for i, best in enumerate(found) if best.closure > _CLOSES and best.near > _SHARED]
     motions = np.array([found[i].T for i in good]).reshape(-1, 4, 4)
     return RelativeScans(tuple(tried[i] for i in good), motions, len(pairs))

@@ -41,7 +41,7 @@ class Scan:
 def prepare(session: Session) -> tuple[Scan, ...]:
     """Scans of all views of a cloud session, in the order of views.csv."""
     clouds = [(view.name, view.cloud.points) for view in session.views if view.cloud]
-    return tuple(parallel(lambda item: prepare_view(*item), clouds))
+    return tuple(parallel(lambda item: prepare_view(*item), clouds, "preparing scans"))
 
 
 def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Scan:

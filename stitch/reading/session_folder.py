@@ -17,6 +17,7 @@ from stitch.reading.points_csv import read_points, read_targets
 from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
 from stitch.reading.views_csv import Row, read_views
+from stitch.system.steps import steps
 from stitch.units import METRES
 
 # Fewer points span no surface.
@@ -96,7 +97,7 @@ def _nominal(path: Path, sightings: dict[str, Sighting]) -> Nominal | None:
 def _views(path: Path, rows: list[Row], scale: float | None, sightings: dict[str, Sighting]) -> tuple[View, ...]:
     """The rows with what was seen; without a scale for the clouds, nothing is."""
     views = []
-    for row in rows:
+    for row in steps("reading scans", rows):
         cloud = None
         if scale is None:
             pass

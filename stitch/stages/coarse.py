@@ -28,6 +28,7 @@ from stitch.stages.initial_guess.hand_eye_candidates import (
     same_answer,
 )
 from stitch.stages.initial_guess.relative_motion import motion_candidates
+from stitch.system.steps import steps
 
 _SEARCH_POINTS = 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
@@ -120,7 +121,7 @@ def close_from(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]],
     """
     light = [replace(c, scans=tuple(sparse(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
     met: list[tuple[list[str], Array, list[float]]] = []
-    for source, start in starts:
+    for source, start in steps("trying hand-eyes", starts):
         half = _close(light, start, [COARSE_GATE * size] * len(captures), _UNTIL_THEY_MEET)
         if half is None:
             continue

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from stitch.system.steps import steps
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -23,9 +25,16 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=cores, thread_name_prefix="stitch", initializer=library_threads_off)
 
 
-def parallel(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """`map` over the cores, results in order; `function` must not call `parallel` itself."""
-    return _pool().map(function, items)
+def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> Iterator[Result]:
+    """`map` over the cores, results in order; `function` must not call `parallel` itself.
+
+    Args:
+        label: what the items are, for whoever watches a long loop.
+    """
+    if not label:
+        return _pool().map(function, items)
+    every = list(items)
+    return steps(label, _pool().map(function, every), len(every))
 
 
 def library_threads_off() -> Any:

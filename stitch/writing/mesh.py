@@ -115,6 +115,6 @@ def _heights(places: Array, points: Array, normals: Array, tree: Any, size: floa
         above = np.einsum("pki,pki->pk", (n + here[:, None]) / 2, block[:, None] - points[index])
         return (weight * above).sum(axis=1), distance[:, 0]
 
-    blocks = parallel(of, np.array_split(places, len(places) // _BLOCK + 1))
+    blocks = parallel(of, np.array_split(places, len(places) // _BLOCK + 1), "blocks of the mesh")
     heights, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return heights, nearest

@@ -16,6 +16,7 @@ from stitch.diagnosis.thresholds import (
     PRIOR_UNKNOWN,
 )
 from stitch.observations.linear_model import LinearModel
+from stitch.system.steps import steps
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
 
 def ranked_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
-    scores = [score(linear, c) for c in candidates]
+    scores = [score(linear, c) for c in steps("candidate effects", candidates)]
     return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
 
 

@@ -82,7 +82,7 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
         return feature_matching.align(source, target, T, reach=size)
 
     pairs = _neighbours(len(capture.scans))
-    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs))).reshape(-1, 4, 4)
+    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
 
 
 def _neighbours(views: int) -> list[tuple[int, int]]:

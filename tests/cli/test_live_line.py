@@ -1,0 +1,75 @@
+"""Progress with the time that is left: on a terminal, and nowhere else."""
+
+import os
+import pty
+import subprocess
+import sys
+from itertools import count
+
+import pytest
+
+from stitch.cli import live_line
+from stitch.cli.live_line import TimeLeft, told
+from stitch.system.steps import steps, watched
+from stitch.system.threads import parallel
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """What a terminal would show; the clock moves by a second whenever it is read."""
+    out, clock = [], count()
+
+    class Line:
+        say = staticmethod(out.append)
+        stop = staticmethod(lambda: out.append(""))
+
+    monkeypatch.setattr(live_line, "live_line", Line)
+    monkeypatch.setattr(live_line.time, "monotonic", lambda: float(next(clock)))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("done", "seconds", "text"),
+    [
+        (0, 5.0, None),  # nobody knows yet
+        (1, 0.4, None),  # it may be over before anybody has read it
+        (10, 30.0, "scans: 10 of 40, 1:30 left"),
+        (39, 390.0, "scans: 39 of 40, 0:10 left"),
+        (40, 400.0, None),
+    ],
+)
+def test_time_left_is_that_of_the_steps_before(done, seconds, text):
+    assert told("scans", done, 40, seconds) == text
+
+
+def test_loops_within_loops_are_told_together(said):
+    with watched(TimeLeft()):
+        for _ in steps("sessions", range(3)):
+            assert list(parallel(abs, [-1, -2, -3], "scans")) == [1, 2, 3]
+    assert said[3] == "sessions: 1 of 3, 0:10 left"
+    assert any(text.startswith("sessions: 2 of 3") and "; scans: 2 of 3, " in text for text in said)
+    assert said[-1] == ""  # the line is cleared
+
+
+def test_nobody_watches_nobody_counts(said):
+    assert list(steps("scans", (i for i in range(3)))) == [0, 1, 2] and list(steps("scans", [1, 2])) == [1, 2]
+    assert not said
+
+
+CODE = """
+import time
+from stitch.cli.live_line import TimeLeft
+from stitch.system.steps import steps, watched
+with watched(TimeLeft()):
+    for _ in steps("scans", range(4)): time.sleep(0.4)
+"""
+
+
+def test_a_terminal_shows_it_and_a_pipe_does_not():
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    subprocess.run([sys.executable, "-c", CODE], stderr=theirs, env=environment, check=True)
+    os.close(theirs)
+    assert b"scans: 3 of 4, 0:00 left" in os.read(ours, 100_000)
+    os.close(ours)
+    assert not subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True).stderr
