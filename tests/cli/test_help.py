@@ -79,8 +79,9 @@ def test_version_is_the_package_s(capsys):
     ("typed", "offered"),
     [
         ("stitch ex", ["export"]),
-        ("stitch calibrate sp", ["sphere"]),
-        ("stitch run --eff", ["--effects", "--effects-file"]),
+        # These load what the command needs.
+        pytest.param("stitch calibrate sp", ["sphere"], marks=pytest.mark.slow),
+        pytest.param("stitch run --eff", ["--effects", "--effects-file"], marks=pytest.mark.slow),
     ],
 )
 def test_the_tab_key(typed, offered):
