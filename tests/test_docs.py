@@ -92,7 +92,7 @@ def test_every_command_of_a_page_has_the_options_that_it_shows(page, options):
     text = page.read_text(encoding="utf-8")
     lines = [*re.findall(r"^(?:\$ |    )?(?:\.venv/bin/)?stitch (.+)$", text, re.MULTILINE)]
     lines += [text.removeprefix("stitch ") for text in quoted(page) if text.startswith("stitch ")]
-    known = {"--help", "--tables", "--seeds", "--scheduler"}.union(*options.values())
+    known = {"--help", "--version", "--tables", "--seeds", "--scheduler"}.union(*options.values())
     assert not [o for text in quoted(page) for o in re.findall(r"^--[a-z][\w-]*", text) if o not in known]
     for line in lines:
         command = next((c for c in sorted(options, key=len, reverse=True) if re.match(rf"{c}\b", line)), None)

@@ -25,7 +25,13 @@ def detect(
     ball: BallOption = None,
     as_json: Json = False,
 ) -> None:
-    """Find boards and balls in the scans of a session and write them as labelled points beside them."""
+    """Find boards and balls in the scans of a session and write them as labelled points beside them.
+
+    \b
+    Examples:
+      stitch detect calibration --board charuco:11x8:20:15:DICT_4X4_50
+      stitch detect calibration --ball 19.05 --ball any
+    """
     wanted = looked_for(board, ball)
     if wanted.nothing:
         raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
