@@ -1,6 +1,7 @@
 """ABB RAPID .mod: robtargets and jointtargets, declared or written into a move. Quaternions with w first."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ _LIST = re.compile(r"\[([^\[\]]*)\]")
 # What stands between commas, without the space around it.
 _CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 
+# Tool and work object are the last words of a move.
+_USED = re.compile(r"\bMove[LJ]\s+(\w+|\[[^;]*\])[^;]*,\s*(\w+)\s*(?:\\WObj\s*:=\s*(\w+))?\s*;", re.I)
 # What stands for an external axis that there is not: 9E9.
 _NONE = 8e9
 
@@ -36,7 +39,17 @@ def read(file: Path, text: str) -> list[Taught]:
     for match in _MOVE.finditer(clean):
         name = f"line{line_of(text, match.start())}"
         found += _targets(file, text, match.start(2), name, match[2], match[1].lower() == "absj")
-    return [point for _, point in sorted(found, key=lambda pair: pair[0])]
+    frames = _frames(clean, text)
+    return [replace(point, frame=frames.get(point.name, "")) for _, point in sorted(found, key=lambda pair: pair[0])]
+
+
+def _frames(clean: str, text: str) -> dict[str, str]:
+    """Tool and work object by the name of a point; empty for one that is used with several."""
+    used: dict[str, set[str]] = {}
+    for m in _USED.finditer(clean):
+        name = f"line{line_of(text, m.start())}" if m[1].startswith("[") else m[1]
+        used.setdefault(name, set()).add(f"{m[2]}, {m[3] or 'wobj0'}")
+    return {name: told.pop() if len(told) == 1 else "" for name, told in used.items()}
 
 
 def _without_comments(text: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from stitch import frames
 from stitch.controllers import tracker_csv, universal
 from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique, view_rows
-from stitch.controllers.program import PROGRAMS, given, require_one_frame
+from stitch.controllers.program import NOTHING_IN_FORCE, PROGRAMS, given, require_one_frame
 from stitch.controllers.taught import Taught
 from stitch.controllers.tracker_csv import Measured
 from stitch.errors import InputError, NoResultError
@@ -67,7 +67,7 @@ def _check_frames(file: Path, points: Sequence[Taught], frame: str | None, tool:
     taught_in = require_one_frame(file, points)
     if taught_in is None:
         return ()
-    if (frame is None or tool is None) and taught_in != "UF 0, UT 0":
+    if (frame is None or tool is None) and taught_in not in NOTHING_IN_FORCE:
         known = f" ({taught_in})" if taught_in else ""
         return (
             f"poses are those of the tool in the frame in which they were taught{known}; give --frame and --tool "

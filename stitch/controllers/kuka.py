@@ -18,6 +18,8 @@ _DECLARED = re.compile(
     r"^[ \t]*(?:GLOBAL\s+)?(?:DECL\s+)?(?:GLOBAL\s+)?(?:E6POS|POS|FRAME|E6AXIS|AXIS)\s+(\w+)\s*=\s*\{(.*?)\}",
     re.M | re.I | re.S,
 )
+# Tool and base of a point XP1 stand in FP1.
+_IN_FORCE = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{[^}]*?\bTOOL_NO\s+(\d+)[^}]*?\bBASE_NO\s+(\d+)", re.I)
 _MOTION = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+(?:(\w+)|\{(.*?)\})", re.M | re.I)
 _FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
@@ -41,7 +43,8 @@ def read(file: Path, text: str) -> list[Taught]:
 def _declared(file: Path, text: str) -> dict[str, Taught]:
     clean = without_comments(text, ";")
     found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2], m.start(2))) for m in _DECLARED.finditer(clean)]
-    return {name.upper(): point for name, point in found}
+    frames = {f"X{m[1]}".upper(): f"TOOL {m[2]}, BASE {m[3]}" for m in _IN_FORCE.finditer(clean)}
+    return {name.upper(): replace(point, frame=frames.get(name.upper(), "")) for name, point in found}
 
 
 def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taught]) -> Taught:

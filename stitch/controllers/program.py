@@ -1,5 +1,6 @@
 """A robot program with the places of its numbers, and the frame and tool in which it was taught."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ PROGRAMS: dict[str, ModuleType] = {
     ".mod": abb,
     ".script": universal,
 }
+# Frame and tool of nothing: points taught in them are flange poses in the base.
+NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0")
 _NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal: "ur"}
 
 
@@ -33,6 +36,7 @@ class Program:
     texts: dict[Path, str]  # of the files that hold the points' numbers, byte for byte
     T_base_frame: Array  # (4, 4) mm
     T_flange_tool: Array  # (4, 4) mm
+    again: tuple[str, ...] = ()  # points that are moved to more than once
 
 
 def read_program(file: Path, frame: str | None = None, tool: str | None = None) -> Program:
@@ -58,7 +62,7 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
     taught_in = require_one_frame(file, points)
-    if taught_in is not None and taught_in != "UF 0, UT 0":
+    if taught_in is not None and taught_in not in NOTHING_IN_FORCE:
         # A script of a UR has its poses in the base.
         lacking = [f"--{name}" for name, value in (("frame", frame), ("tool", tool)) if value is None]
         if reader is universal and "--frame" in lacking:
@@ -77,8 +81,15 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         )
     files = dict.fromkeys(p.file for p in points if p.file is not None)
     texts = {file: text} | {path: program_text(path) for path in files}
+    times = Counter(p.name for p in every)
     return Program(
-        file, _NAMES[reader], points, texts, given(reader.pose, "frame", frame), given(reader.pose, "tool", tool)
+        file,
+        _NAMES[reader],
+        points,
+        texts,
+        T_base_frame=given(reader.pose, "frame", frame),
+        T_flange_tool=given(reader.pose, "tool", tool),
+        again=tuple(p.name for p in points if times[p.name] > 1),
     )
 
 
@@ -101,7 +112,7 @@ def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array
 
 
 def require_one_frame(file: Path, points: Sequence[Taught]) -> str | None:
-    """Frame and tool of all poses as the file calls them, "" where it does not say; None without poses.
+    """Frame and tool of all poses as the file calls them, "" where it does not say of all; None without poses.
 
     Raises:
         InputError: points of different frames or tools.
@@ -109,10 +120,11 @@ def require_one_frame(file: Path, points: Sequence[Taught]) -> str | None:
     posed = [point for point in points if point.T_frame_tool is not None]
     if not posed:
         return None
-    other = next((point for point in posed if point.frame != posed[0].frame), None)
+    told = [point for point in posed if point.frame]
+    other = next((point for point in told if point.frame != told[0].frame), None)
     if other is not None:
         raise InputError(
-            f"{file} line {other.line}: {other.name} is taught in {other.frame}, {posed[0].name} in {posed[0].frame}; "
-            "import points of one frame and tool at a time"
+            f"{file} line {other.line}: {other.name} is taught in {other.frame}, {told[0].name} in {told[0].frame}; "
+            "to fix: give points of one frame and tool at a time"
         )
-    return posed[0].frame
+    return told[0].frame if len(told) == len(posed) else ""

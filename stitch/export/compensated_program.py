@@ -25,6 +25,8 @@ _MRAD_PER_MM = 2.0
 _LARGEST_TURN = np.radians(3.0)
 # Joint angles this far beyond those of the run's views are worth a word (rad).
 _BEYOND = np.radians(15.0)
+# Effects that hang on where a joint comes from.
+_BY_WAY = ("backlash", "settling")
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,10 @@ def _notes(
         notes.append(f"not compensated, since it hangs on time, speed or temperature: {', '.join(beyond)}")
     if arm.elsewhere:
         notes.append(f"not in a program's targets: {', '.join(arm.elsewhere)}")
+    sided = [term.name for term in arm.terms if term.name in _BY_WAY]
+    if sided and program.again:
+        told = f"moved to more than once, {' and '.join(sided)} undone for the first time alone"
+        notes.append(f"{told}: {', '.join(program.again)}")
     low, high = arm.joints.min(axis=0) - _BEYOND, arm.joints.max(axis=0) + _BEYOND
     outside = (targets.joints < low) | (targets.joints > high)
     names = [point.name for point, out in zip(program.points, outside.any(axis=1), strict=True) if out]

@@ -88,6 +88,24 @@ def test_kuka(tmp_path):
     assert views["line7"].T_base_flange[:3, :3] == pytest.approx(about("z", 90), abs=1e-8)
 
 
+def test_points_of_several_tools_are_not_mixed(tmp_path):
+    """A KUKA says tool and base in a point's FDAT, an ABB in the move."""
+    second = KUKA_DAT.replace(
+        "ENDDAT", "DECL E6POS XP2={X 1,Y 2,Z 3,A 0,B 0,C 0}\nDECL FDAT FP2={TOOL_NO 2,BASE_NO 0}\nENDDAT"
+    )
+    (tmp_path / "a.dat").write_text(second)
+    with pytest.raises(InputError, match="a.dat line 7: XP2 is taught in TOOL 2, BASE 0, XP1 in TOOL 1, BASE 0"):
+        import_file(tmp_path / "a.dat")
+    (tmp_path / "b.dat").write_text(KUKA_DAT.replace("TOOL_NO 1", "TOOL_NO 0"))
+    assert import_file(tmp_path / "b.dat").warnings == ()
+    (tmp_path / "a.mod").write_text(ABB.replace("z10, tool0", "z10, gripper \\WObj:=table"))
+    with pytest.raises(InputError, match="a.mod line 11: line11 is taught in gripper, table, p10 in tool0, wobj0"):
+        import_file(tmp_path / "a.mod")
+    # Of p20 and the array nobody says with which tool they are used.
+    (tmp_path / "b.mod").write_text(ABB)
+    assert "give --frame and --tool" in import_file(tmp_path / "b.mod").warnings[0]
+
+
 def test_abb(tmp_path):
     views, imported = rows(tmp_path, "Scan.mod", ABB, unit="mm")
     assert list(views) == ["p10", "p20", "home", "many_1", "many_2", "line10", "line11"]
