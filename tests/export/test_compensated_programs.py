@@ -12,6 +12,7 @@ from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.robot_programs import SUFFIXES, program
+from data_synth.fixtures.run_folders import bare_run
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
 from stitch.cli.main import main
@@ -22,6 +23,7 @@ from stitch.effects import EFFECTS
 from stitch.errors import InputError, NoResultError
 from stitch.export.arm_model import ArmModel
 from stitch.export.compensated_program import compensated_program
+from stitch.export.compensation import compensated
 from stitch.export.program_copy import moved_texts
 from stitch.measurement.torques import torques_of
 from stitch.model.term import Term
@@ -50,7 +52,7 @@ def arm_with(name, p, sigma=float("nan")):
     return ArmModel("cell", ROBOT, (term,), "mm", JOINTS)
 
 
-def stated(T, controller):
+def shown(T, controller):
     """A frame's numbers as --frame and --tool take them, by scipy."""
     R = Rotation.from_matrix(T[:3, :3])
     x, y, z, w = R.as_quat()
@@ -89,10 +91,10 @@ def test_the_true_arm_goes_where_the_program_meant(name, tmp_path):
     meant = np.vstack([kinematics.flange(ARM, JOINTS)] * 2) @ TOOL
     poses = [np.linalg.inv(FRAME) @ T for T in meant[3:]]
     (tmp_path / "w.src").write_bytes(program("kuka", JOINTS, poses).encode())
-    read = read_program(tmp_path / "w.src", stated(FRAME, "kuka"), stated(TOOL, "kuka"))
+    read = read_program(tmp_path / "w.src", shown(FRAME, "kuka"), shown(TOOL, "kuka"))
     copy = compensated_program(read, arm_with(name, p))
     (tmp_path / "c.src").write_bytes(program_bytes(copy.texts[tmp_path / "w.src"]))
-    after = read_program(tmp_path / "c.src", stated(FRAME, "kuka"), stated(TOOL, "kuka"))
+    after = read_program(tmp_path / "c.src", shown(FRAME, "kuka"), shown(TOOL, "kuka"))
     errors = [np.linalg.norm((reached(name, p, r) - meant)[:, :3, 3], axis=1) for r in (read, after)]
     moved = np.array([row["moved_mm"] for row in copy.rows()])
     assert errors[0].max() > 0.1
@@ -102,6 +104,24 @@ def test_the_true_arm_goes_where_the_program_meant(name, tmp_path):
     assert moved == pytest.approx(errors[0], rel=0.02, abs=2e-3)
 
 
+@pytest.mark.parametrize("name", ARMS)
+def test_arms_of_six_and_seven_joints_and_stretched_wrists(name):
+    """Two turns of a wrist about one axis are no way to undo anything: what can be undone is."""
+    own = ARMS[name]
+    table = robot_table(own)
+    robot = robot_from_dh(name, "standard", table["joints"], None, np.array(table["gravity"]), "mm")
+    joints = own.home + np.random.default_rng(0).uniform(-0.3, 0.3, (4, own.joints))
+    joints[0, 4] = 0.0
+    p = drawn("gear_eccentricity", own, joints, seed=1, amplitude=3.0)
+    parameters = EFFECTS["gear_eccentricity"].parameters(own.joints, (), "mm")
+    term = Term(EFFECTS["gear_eccentricity"], parameters).at(np.array([p.get(q.name, 0.0) for q in parameters]))
+    found = compensated(ArmModel("cell", robot, (term,), "mm", joints), joints, np.eye(4))
+    meant = kinematics.flange(own, joints)
+    before, after = (true_flanges("gear_eccentricity", p, own, q) - meant for q in (joints, found.joints))
+    assert np.abs(before[:, :3, 3]).max() > 0.05 and np.abs(after[:, :3, 3]).max() < 1e-6
+    assert np.abs(found.joints - joints).max() < 5e-3
+
+
 @pytest.mark.parametrize("controller", SUFFIXES)
 def test_every_controllers_targets_are_moved_alike(controller, tmp_path):
     """By its own digits: a listing of a FANUC has three decimals."""
@@ -109,7 +129,7 @@ def test_every_controllers_targets_are_moved_alike(controller, tmp_path):
     meant = np.vstack([kinematics.flange(ARM, JOINTS)] * 2) @ TOOL
     file = tmp_path / f"w{SUFFIXES[controller]}"
     file.write_bytes(program(controller, JOINTS, [np.linalg.inv(FRAME) @ T for T in meant[3:]]).encode())
-    frame, tool = stated(FRAME, controller), stated(TOOL, controller)
+    frame, tool = shown(FRAME, controller), shown(TOOL, controller)
     copy = compensated_program(read_program(file, frame, tool), arm_with("gear_eccentricity", p))
     text = program_bytes(copy.texts[file])
     before, file_after = file.read_bytes(), tmp_path / f"c{SUFFIXES[controller]}"
@@ -171,21 +191,26 @@ def test_a_motion_program_of_a_kuka_moves_the_points_of_its_data_list(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory, stitch_command):
-    """A run of an arm with two joints off by a milliradian, found from labelled points."""
-    folder = tmp_path_factory.mktemp("fitted")
+def stated(tmp_path_factory):
+    """A run folder whose model says that joint 2 of the labelled arm is off by a milliradian."""
+    folder = tmp_path_factory.mktemp("stated")
+    session, *_ = labelled_cell(2, views=6)
+    write_labelled(folder / "s", session)
+    effects = {"joint_offset": {"d2": (1e-3, "rad")}}
+    return bare_run(folder / "r", np.eye(4), np.eye(6), mount="eye_to_hand", effects=effects, session=folder / "s")
+
+
+@pytest.mark.slow
+def test_a_fitted_model_takes_the_error_down_to_its_own_uncertainty(tmp_path, stitch_command):
     offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
     session, *_ = labelled_cell(2, views=30, offset=offset)
-    write_labelled(folder / "s", session)
-    stitch_command("run", folder / "s", "-o", folder / "r", "--effects", "joint_offset", "--no-recording")
-    return folder / "r", offset
-
-
-def test_a_fitted_model_takes_the_error_down_to_its_own_uncertainty(fitted, tmp_path, stitch_command):
-    run, offset = fitted
+    write_labelled(tmp_path / "s", session)
+    stitch_command("run", tmp_path / "s", "-o", tmp_path / "r", "--effects", "joint_offset", "--no-recording")
     joints = np.random.default_rng(8).uniform(-1, 1, (8, 6))
     (tmp_path / "w.script").write_text(program("ur", joints, []))
-    out = stitch_command("export", run, "--program", tmp_path / "w.script", "-o", tmp_path / "c.script", "--json")
+    out = stitch_command(
+        "export", tmp_path / "r", "--program", tmp_path / "w.script", "-o", tmp_path / "c.script", "--json"
+    )
     document = json.loads(out)
     commanded = [point.joints for point in read_program(tmp_path / "c.script").points]
     meant = [flange(q) for q in joints]
@@ -263,17 +288,17 @@ def test_what_is_too_large_or_out_of_reach_is_refused(tmp_path):
         ),
     ],
 )
-def test_refused_commands_write_nothing(fitted, arguments, message, tmp_path, monkeypatch, capsys):
+def test_refused_commands_write_nothing(stated, arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.script").write_text(program("ur", JOINTS, []))
     (tmp_path / "w.ls").write_text(program("fanuc", JOINTS, []))
     with pytest.raises(SystemExit) as ended:
-        main(["export", str(fitted[0]), *arguments])
+        main(["export", str(stated), *arguments])
     assert ended.value.code == 2 and message in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["w.ls", "w.script"]
 
 
-def test_a_fanucs_third_joint_can_turn_with_its_second(fitted, tmp_path, stitch_command):
+def test_a_fanucs_third_joint_can_turn_with_its_second(stated, tmp_path, stitch_command):
     """The same arm and targets, once with J3 as the session has it and once from the horizontal."""
     joints = np.random.default_rng(8).uniform(-1, 1, (4, 6))
     shown = joints.copy()
@@ -282,7 +307,7 @@ def test_a_fanucs_third_joint_can_turn_with_its_second(fitted, tmp_path, stitch_
     for name, own, j3 in (("own", joints, "own"), ("shown", shown, "j2+j3")):
         (tmp_path / f"{name}.ls").write_text(program("fanuc", own, []))
         stitch_command(
-            "export", fitted[0], "--program", tmp_path / f"{name}.ls", "-o", tmp_path / f"{name}-c.ls", "--j3", j3
+            "export", stated, "--program", tmp_path / f"{name}.ls", "-o", tmp_path / f"{name}-c.ls", "--j3", j3
         )
         copies.append(np.array([point.joints for point in read_program(tmp_path / f"{name}-c.ls").points]))
     copies[1][:, 2] += copies[1][:, 1]

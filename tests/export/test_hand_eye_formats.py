@@ -151,7 +151,13 @@ def test_expanded_uncertainty_is_that_of_drawn_hand_eyes(controller, tmp_path):
 
 
 def test_what_the_numbers_do_not_hold_is_said(tmp_path):
-    run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE, unobservable=["rotation about z"], effects=["mount_drift"])
+    run = bare_run(
+        tmp_path / "r",
+        ANYWHERE,
+        COVARIANCE,
+        unobservable=["rotation about z"],
+        effects={"mount_drift": {"rx": (1e-4, "rad/h")}},
+    )
     for write in FORMATS.values():
         text = write(hand_eye_of(run))
         assert "Not observable from these motions, left at the coarse value: rotation about z" in text
