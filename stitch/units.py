@@ -6,13 +6,19 @@ METRES = {"mm": 1e-3, "m": 1.0}  # in one length_unit
 MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
 
 
-def length_text(value: float, length_unit: str, digits: int = 3) -> str:
-    """A length for people: 38.1 µm, 1.49 mm; a dash where nothing was measured."""
+def length_text(value: float, length_unit: str, digits: int = 3, zeros: bool = False) -> str:
+    """A length for people: 38.1 µm, 1.49 mm; a dash where nothing was measured.
+
+    Args:
+        zeros: keep those at the end, as in columns of tables.
+    """
     if not np.isfinite(value):
         return "–"
     um = value * MICROMETRES[length_unit]
     # 999.7 µm would be printed as 1000.
-    return f"{_plain(um / 1e3, digits)} mm" if abs(float(f"{um:.{digits}g}")) >= 1e3 else f"{_plain(um, digits)} µm"
+    if abs(float(f"{um:.{digits}g}")) >= 1e3:
+        return f"{_plain(um / 1e3, digits, zeros)} mm"
+    return f"{_plain(um, digits, zeros)} µm"
 
 
 def angle_text(value: float, digits: int = 3) -> str:
@@ -24,14 +30,16 @@ def known_text(value: float, U: float) -> str:
     """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
     if not np.isfinite(U) or U <= 0:
         return f"{_plain(value, 6)} ± –"
-    told = _plain(U, 2)
-    return f"{value:.{max(1 - int(np.floor(np.log10(U))), 0)}f} ± {told}"
+    told = _plain(U, 2, zeros=True)
+    return f"{value:.{len(told.partition('.')[2])}f} ± {told}"
 
 
-def _plain(value: float, digits: int) -> str:
+def _plain(value: float, digits: int, zeros: bool = False) -> str:
     """So many digits that count, more where there are more before the point; never an exponent."""
     digits = max(digits, len(str(int(abs(value)))))
-    return str(np.format_float_positional(value, precision=digits, fractional=False, unique=False, trim="-"))
+    trim = "k" if zeros and value else "-"
+    text = np.format_float_positional(value, precision=digits, fractional=False, unique=False, trim=trim)
+    return str(text).removesuffix(".")
 
 
 def rounded(value: float, sigma: float) -> str:

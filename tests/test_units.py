@@ -29,12 +29,24 @@ def test_lengths_are_in_mm_from_one_millimetre_on(value, unit, told):
     assert length_text(value, unit) == told
 
 
+def test_columns_keep_their_zeros():
+    assert [length_text(x, "mm", 4, zeros=True) for x in (0.022, 0.1011, 1.5, 0.0)] == [
+        "22.00 µm",
+        "101.1 µm",
+        "1.500 mm",
+        "0 µm",
+    ]
+
+
 @pytest.mark.parametrize(
     ("value", "U", "told"),
     [
         (1451.8213, 0.1432, "1451.82 ± 0.14"),
         (-0.21, 5.61, "-0.2 ± 5.6"),
         (12.3456, 23.4, "12 ± 23"),
+        (650.54321, 0.2, "650.54 ± 0.20"),
+        (2.5, 0.998, "2.5 ± 1.0"),
+        (2.5, 104.0, "2 ± 104"),
         (3.14, 0.0, "3.14 ± –"),
         (3.14, float("nan"), "3.14 ± –"),
     ],

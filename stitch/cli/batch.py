@@ -114,7 +114,7 @@ def _show(rows: list[dict[str, Any]]) -> None:
         table.add_column(heading, justify="left" if heading == "session" else "right")
     for row in rows:
         keys = ("residual_um", "registered_um", "noise_floor_um")
-        told = ["–"] * 3 if row["error"] else [length_text(row[key] / 1e3, "mm") for key in keys]
+        told = ["–"] * 3 if row["error"] else [length_text(row[key] / 1e3, "mm", zeros=True) for key in keys]
         table.add_row(Path(row["session"]).name, *told, "–" if row["error"] else f"{row['seconds']:.1f}")
     terminal.print(table)
     for row in rows:

@@ -127,7 +127,7 @@ def show_ledger(result: Run) -> None:
     for heading in ("step", "effects", "residual", "held-out", "noise floor"):
         table.add_column(heading, justify="left" if heading == "effects" else "right")
     for i, s in enumerate(result.ledger):
-        numbers = (length_text(x, unit, 4) for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
+        numbers = (length_text(x, unit, 4, zeros=True) for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
         table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
     terminal.print(table)
     if (history := model_history(result)) is not None:

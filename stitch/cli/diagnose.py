@@ -137,7 +137,7 @@ def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
     left = ["–", "–"]
     if s.cross_validation is not None:
         left = [
-            length_text(found.residual_rms * x**0.5, length_unit)
+            length_text(found.residual_rms * x**0.5, length_unit, zeros=True)
             for x in (s.cross_validation.inside, s.cross_validation.heldout)
         ]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

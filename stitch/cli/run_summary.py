@@ -69,7 +69,7 @@ def _stages(result: Run) -> Table:
     for heading in ("stage", "rms", "correspondences", "iterations", "seconds"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
     for s in result.stages:
-        rms = length_text(s.rms, _unit(result), 4)
+        rms = length_text(s.rms, _unit(result), 4, zeros=True)
         table.add_row(s.name, rms, f"{s.correspondences:,}", str(s.iterations), f"{s.seconds:.2f}")
     return table
 
