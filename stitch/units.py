@@ -37,8 +37,10 @@ def known_text(value: float, U: float) -> str:
 def _plain(value: float, digits: int, zeros: bool = False) -> str:
     """So many digits that count, more where there are more before the point; never an exponent."""
     digits = max(digits, len(str(int(abs(value)))))
-    trim = "k" if zeros and value else "-"
-    text = np.format_float_positional(value, precision=digits, fractional=False, unique=False, trim=trim)
+    keep = zeros and value != 0
+    text = np.format_float_positional(
+        value, precision=digits, fractional=False, unique=False, trim="k" if keep else "-"
+    )
     return str(text).removesuffix(".")
 
 

@@ -24,7 +24,12 @@ def note(
     by: Annotated[str, typer.Option("--by", metavar="NAME", help="Who says so.")] = "",
     as_json: Json = False,
 ) -> None:
-    """Write a remark beside a step of the model's history; it stays there when the model changes."""
+    """Write a remark beside a step of the model's history; it stays there when the model changes.
+
+    \b
+    Examples:
+      stitch note runs/blade-17 "fixture shimmed after this step" --step 0
+    """
     text, by = text.strip(), by.strip()
     if not text:
         raise InputError("TEXT: is empty; to fix: say what to remark")

@@ -28,7 +28,13 @@ def review(
     effects_file: EffectsFile = None,
     trust: Trust = False,
 ) -> None:
-    """See in a browser where a run fails, add what is missing, and watch the error fall; ends with Ctrl-C."""
+    """See in a browser where a run fails, add what is missing, and watch the error fall; ends with Ctrl-C.
+
+    \b
+    Examples:
+      stitch review runs/blade-17
+      stitch review runs/blade-17 --port 8080 --no-browser
+    """
     read_documents(run)
     if effects_file is not None and not effects_file.is_file():
         raise InputError(f"{effects_file}: no such file; --effects-file names a Python file with @effect functions")
