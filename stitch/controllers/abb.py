@@ -15,6 +15,8 @@ pose = quaternion_w_first
 
 _DECLARED = re.compile(r"\b(robtarget|jointtarget)\s+(\w+)\s*(?:\{\s*\d+\s*\})?\s*:=\s*([^;]*);", re.I)
 _MOVE = re.compile(r"\bMove(L|J|AbsJ)\s+(\[[^;]*?\]\s*\])\s*(?:\\|,)", re.I)
+# Arcs to targets that are written into the motion.
+UNREAD = re.compile(r"\bMoveC\s+[^;]*\[[^;]*;", re.I)
 _TARGET = re.compile(r"\[((?:[^\[\]]*\[[^\[\]]*\]){2,4})[^\[\]]*\]")
 _LIST = re.compile(r"\[([^\[\]]*)\]")
 # What stands between commas, without the space around it.

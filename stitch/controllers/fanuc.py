@@ -16,6 +16,8 @@ pose = fixed_xyz
 
 _POINT = re.compile(r"P\[(\d+)(?:\s*:\s*\"([^\"]*)\")?\]\s*\{(.*?)\}\s*;", re.S)
 _GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d+\s*:|\Z)", re.S)
+# Motions to position registers, which a listing does not hold, and along arcs to them.
+UNREAD = re.compile(r"^[ \t]*\d+:\s*[JLCA]\s+PR\[", re.M)
 _FRAME = re.compile(r"UF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 # Numbers, or the stars of a point that was never taught.
 _FIELD = re.compile(r"\b([XYZWPR]|[JE]\d)\s*=\s*([-+.\deE*]+)")

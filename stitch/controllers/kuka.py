@@ -15,12 +15,14 @@ CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"
 pose = zyx
 
 _DECLARED = re.compile(
-    r"^[ \t]*(?:GLOBAL\s+)?(?:DECL\s+)?(?:GLOBAL\s+)?(?:E6POS|POS|FRAME|E6AXIS|AXIS)\s+(\w+)\s*=\s*\{(.*?)\}",
+    r"^[ \t]*(?:GLOBAL\s+)?(?:DECL\s+)?(?:GLOBAL\s+)?(E6POS|POS|FRAME|E6AXIS|AXIS)\s+(\w+)\s*=\s*\{(.*?)\}",
     re.M | re.I | re.S,
 )
 # Tool and base of a point XP1 stand in FP1.
 _IN_FORCE = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{[^}]*?\bTOOL_NO\s+(\d+)[^}]*?\bBASE_NO\s+(\d+)", re.I)
 _MOTION = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+(?:(\w+)|\{(.*?)\})", re.M | re.I)
+# Motions whose targets are not read.
+UNREAD = re.compile(r"^[ \t]*S?(?:CIRC|SPL)(?:_REL)?\s+[\w{]", re.M | re.I)
 _FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
 
@@ -42,9 +44,14 @@ def read(file: Path, text: str) -> list[Taught]:
 
 def _declared(file: Path, text: str) -> dict[str, Taught]:
     clean = without_comments(text, ";")
-    found = [(m[1], _point(file, m[1], line_of(text, m.start(1)), m[2], m.start(2))) for m in _DECLARED.finditer(clean)]
+    found = [
+        (m[2], m[1], _point(file, m[2], line_of(text, m.start(2)), m[3], m.start(3))) for m in _DECLARED.finditer(clean)
+    ]
     frames = {f"X{m[1]}".upper(): f"TOOL {m[2]}, BASE {m[3]}" for m in _IN_FORCE.finditer(clean)}
-    return {name.upper(): replace(point, frame=frames.get(name.upper(), "")) for name, point in found}
+    return {
+        name.upper(): replace(point, frame=frames.get(name.upper(), ""), is_target=kind.upper() != "FRAME")
+        for name, kind, point in found
+    }
 
 
 def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taught]) -> Taught:
@@ -55,7 +62,7 @@ def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taug
         return _point(file, f"line{line}", line, match[2], match.start(2))
     if match[1].upper() not in known:
         raise InputError(f"{file} line {line}: {match[1]} is declared nowhere; put {file.stem}.dat beside the .src")
-    return known[match[1].upper()]
+    return replace(known[match[1].upper()], is_target=True)
 
 
 def _point(file: Path, name: str, line: int, body: str, begin: int) -> Taught:

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from stitch.controllers import abb, fanuc, kuka, universal
-from stitch.controllers.taught import Taught, program_text
+from stitch.controllers.taught import Taught, line_of, program_text, without_comments
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.reading.csv_number import is_number
@@ -37,6 +37,8 @@ class Program:
     T_base_frame: Array  # (4, 4) mm
     T_flange_tool: Array  # (4, 4) mm
     again: tuple[str, ...] = ()  # points that are moved to more than once
+    other: tuple[str, ...] = ()  # poses that are no targets: they stay
+    unread: tuple[int, ...] = ()  # lines of motions whose targets are not read: they stay too
 
 
 def read_program(file: Path, frame: str | None = None, tool: str | None = None) -> Program:
@@ -57,7 +59,8 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     if not file.is_file():
         raise InputError(f"{file}: no such file; to fix: name a program of the controller")
     text = program_text(file)
-    every: list[Taught] = reader.read(file, text)
+    told: list[Taught] = reader.read(file, text)
+    every = [p for p in told if p.is_target]
     points = tuple({(p.file, p.pose_at, p.joints_at): p for p in every}.values())
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
@@ -90,7 +93,15 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         T_base_frame=given(reader.pose, "frame", frame),
         T_flange_tool=given(reader.pose, "tool", tool),
         again=tuple(p.name for p in points if times[p.name] > 1),
+        other=tuple(p.name for p in told if not p.is_target),
+        unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(_plain(reader, text))),
     )
+
+
+def _plain(reader: ModuleType, text: str) -> str:
+    """The text without comments; lengths stay."""
+    mark = {kuka: ";", universal: "#", abb: "!"}.get(reader)
+    return text if mark is None else without_comments(text, mark)
 
 
 def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:

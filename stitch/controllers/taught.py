@@ -36,6 +36,7 @@ class Taught:
     joints_at: tuple[Span, ...] = ()  # where the joint angles stand
     file: Path | None = None  # in which they stand, where it is not the program itself
     moved_by: str = ""  # an external axis that is not at zero
+    is_target: bool = True  # False for a frame that may be a tool or a base, and for a pose that nothing moves to
 
 
 def fixed_xyz(numbers: Array) -> Array:

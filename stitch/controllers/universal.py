@@ -24,6 +24,9 @@ _LIST = r"(p?)\[([^\[\]]*)\]"
 _CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 _NAMED = re.compile(rf"\b(\w+)\s*=\s*{_LIST}")
 _MOVE = re.compile(rf"\bmove[jlpc]\s*\(\s*{_LIST}")
+# Arcs, whose second pose is not read, and targets that are computed in the call.
+UNREAD = re.compile(r"\bmove(?:c\s*\(|[jlp]\s*\(\s*\w+\s*\()")
+_USED = re.compile(r"\bmove[jlpc]\s*\(([^\n]*)")
 _POSE = tuple([f"{kind}_TCP_pose_{i}" for i in range(6)] for kind in ("actual", "target"))
 _JOINTS = tuple([f"{kind}_q_{i}" for i in range(6)] for kind in ("actual", "target"))
 
@@ -59,7 +62,13 @@ def _script(file: Path, text: str) -> list[Taught]:
             points[base] = replace(before, T_frame_tool=rotation_vector(values), pose_at=spans)
         else:
             points[base] = replace(before, joints=values, joints_at=spans)
-    return list(points.values())
+    used = {name for m in _USED.finditer(clean) for name in re.findall(r"\w+", m[1])}
+    return [replace(p, is_target=_moved_to(p, used)) for p in points.values()]
+
+
+def _moved_to(point: Taught, used: set[str]) -> bool:
+    """Whether a motion names the point: other poses are tools and planes."""
+    return point.name.startswith("line") or not used.isdisjoint({point.name, f"{point.name}_p", f"{point.name}_q"})
 
 
 def is_recording(text: str) -> bool:

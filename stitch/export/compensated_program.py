@@ -131,6 +131,11 @@ def _notes(
         notes.append(f"not compensated, since it hangs on time, speed or temperature: {', '.join(beyond)}")
     if arm.elsewhere:
         notes.append(f"not in a program's targets: {', '.join(arm.elsewhere)}")
+    if program.unread:
+        told = ", ".join(str(line) for line in program.unread)
+        notes.append(f"not moved, since these motions are not read (arcs, registers, computed targets): lines {told}")
+    if program.other:
+        notes.append(f"no targets of a motion, left as they are: {', '.join(program.other)}")
     sided = [term.name for term in arm.terms if term.name in _BY_WAY]
     if sided and program.again:
         told = f"moved to more than once, {' and '.join(sided)} undone for the first time alone"

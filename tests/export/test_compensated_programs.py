@@ -256,6 +256,39 @@ def test_programs_that_cannot_be_moved_are_refused(name, text, options, message,
         read_program(tmp_path / name, **options)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "other", "unread"),
+    [
+        ("a.src", KUKA_SRC.replace("LIN XP1", "CIRC XP1, XP1\nLIN XP1"), (), (5,)),
+        ("a.dat", KUKA_DAT.replace("ENDDAT", "DECL FRAME TABLE={X 900,Y 0,Z 500,A 0,B 0,C 0}\nENDDAT"), ("TABLE",), ()),
+        ("a.ls", FANUC.replace("/POS", "   2:L PR[4:home] 100mm/sec FINE    ;\n/POS"), (), (6,)),
+        (
+            "a.mod",
+            ABB.replace(
+                "  ENDPROC", "    MoveC p10, [[1,2,3],[1,0,0,0],[0,0,0,0],[9E9]], v100, fine, tool0;\n  ENDPROC"
+            ),
+            (),
+            (12,),
+        ),
+        (
+            "a.script",
+            UR.replace(
+                "end\n", "  tcp = p[0, 0, 0.2, 0, 0, 0]\n  set_tcp(tcp)\n  movec(p[1,0,0,0,0,0], p[0,1,0,0,0,0])\nend\n"
+            ),
+            ("tcp",),
+            (12,),
+        ),
+    ],
+)
+def test_what_is_no_target_or_not_read_stays_and_is_named(name, text, other, unread, tmp_path):
+    (tmp_path / "a.dat").write_text(KUKA_DAT)
+    (tmp_path / name).write_text(text)
+    zeros = [ZERO[{".ls": "fanuc", ".mod": "abb"}.get("." + name.split(".")[1], "kuka")]] * 2
+    read = read_program(tmp_path / name, *zeros)
+    assert read.other == other and read.unread == unread
+    assert not {point.name for point in read.points} & set(other)
+
+
 def test_what_is_too_large_or_out_of_reach_is_refused(tmp_path):
     p = {"d2": 4e-3}
     (tmp_path / "w.src").write_text(program("kuka", JOINTS, [FRAME]))
