@@ -68,6 +68,8 @@ def export_run(
         raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
+    if output is not None and not output.parent.is_dir():
+        raise InputError(f"{output}: there is no folder {output.parent}; to fix: make it, or name another")
     if program is not None:
         arm = arm_of(run, effects_file, trust)
         export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)

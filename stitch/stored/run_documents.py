@@ -65,12 +65,6 @@ def read_documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]
     Raises:
         InputError: no run folder, one of several sessions, or a damaged file.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
-    if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
-        inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
-        if inner:
-            raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
     return read_result(folder), ledger_steps(folder)
 
 
@@ -78,8 +72,14 @@ def read_result(folder: Path) -> dict[str, Any]:
     """result.json of a run folder.
 
     Raises:
-        InputError: missing, no JSON, or an entry of another kind than stitch writes; names the entry.
+        InputError: no run folder, one of several sessions, no JSON, or an entry of another kind than stitch writes.
     """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
+    if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
+        inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
+        if inner:
+            raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
     document = _checked(folder / "result.json", RESULT)
     assert isinstance(document, dict)
     return document

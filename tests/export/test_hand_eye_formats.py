@@ -170,6 +170,7 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
         (["--to", "lego"], "--to lego: to fix: one of hand-eye: ros, urdf"),
         (["--to", "ros", "--parent", "my flange"], "--parent 'my flange': to fix"),
         (["--to", "ros", "-o", "taken.yaml"], "taken.yaml: exists already"),
+        (["--to", "ros", "-o", "no/scanner.yaml"], "no/scanner.yaml: there is no folder no; to fix: make it"),
     ],
 )
 def test_bad_requests_write_nothing(arguments, message, tmp_path, monkeypatch, capsys):
@@ -184,8 +185,15 @@ def test_bad_requests_write_nothing(arguments, message, tmp_path, monkeypatch, c
 
 
 def test_no_run_is_one_line(tmp_path):
-    with pytest.raises(InputError, match=r"result.json"):
+    with pytest.raises(InputError, match=r"nowhere: no such run folder"):
+        hand_eye_of(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"result.json: not found"):
         hand_eye_of(tmp_path)
+    (tmp_path / "rig").mkdir()
+    inner = bare_run(tmp_path / "rig" / "monday", ANYWHERE, COVARIANCE)
+    (tmp_path / "rig" / "model.toml").write_bytes((inner / "model.toml").read_bytes())
+    with pytest.raises(InputError, match=r"rig: holds the runs of several sessions \(monday\); name one of them"):
+        hand_eye_of(tmp_path / "rig")
 
 
 def same(x, y, z, rotation, T=ANYWHERE):
