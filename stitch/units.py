@@ -1,4 +1,4 @@
-"""Numbers as people read them: mm from one millimetre on, µm below, mrad, with the digits that are known."""
+"""Numbers as people read them: mm, µm below one, mrad; with the digits that are known."""
 
 import numpy as np
 

@@ -17,6 +17,7 @@ from stitch.frames import Array
 from stitch.reading.csv_number import is_number
 from stitch.system.console import console
 from stitch.system.whole_file import whole
+from stitch.units import angle_text, length_text
 from stitch.writing.json_file import to_json
 
 _J3 = ("own", "j2+j3")
@@ -114,19 +115,19 @@ def _document(copy: CompensatedProgram, places: list[Path], limit: float) -> dic
 def _show(copy: CompensatedProgram, places: list[Path]) -> None:
     terminal, rows = console(), copy.rows()
     table = Table(title=f"{copy.program.file.name}: targets moved", title_justify="left")
-    for heading in ("target", "line", "moved (mm)", "U (k = 2)", "turned (mrad)"):
+    for heading in ("target", "line", "moved", "U (k = 2)", "turned"):
         table.add_column(heading, justify="left" if heading == "target" else "right")
     for row in rows[:_SHOWN]:
-        sizes = (f"{row[key]:.3f}" for key in ("moved_mm", "U_mm", "moved_mrad"))
-        table.add_row(row["target"], str(row["line"]), *sizes)
+        moved, U = length_text(row["moved_mm"], "mm", 4, zeros=True), length_text(row["U_mm"], "mm", zeros=True)
+        table.add_row(row["target"], str(row["line"]), moved, U, angle_text(row["moved_mrad"] / 1e3))
     terminal.print(table)
     if len(rows) > _SHOWN:
         terminal.print(f"{len(rows) - _SHOWN} more; --json has all.", soft_wrap=True)
     far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
-    effects = ", ".join(term.name for term in copy.arm.terms)
+    effects, unit = ", ".join(term.name for term in copy.arm.terms), "mm"
     terminal.print(
-        f"Undone: {effects}. {far['target']} moves farthest, by {far['moved_mm']:.3f} mm; under the model "
-        f"{f'up to {left * 1e3:.2g} µm remain' if left > _NOTHING else 'nothing remains'}.",
+        f"Undone: {effects}. {far['target']} moves farthest, by {length_text(far['moved_mm'], unit)}; under the "
+        f"model {f'up to {length_text(left, unit)} remain' if left > _NOTHING else 'nothing remains'}.",
         soft_wrap=True,
     )
     for note in copy.notes:
