@@ -116,7 +116,7 @@ def test_the_centre_of_a_sphere_says_nothing_of_how_its_surface_turns(runs, regh
     """The sphere with its own centre as a labelled point: no view is taken for turned, and the hand-eye stays."""
     folder = shutil.copytree(reghec("sphere"), tmp_path / "sphere")
     with pytest.raises(SystemExit) as ended:
-        main(["detect", str(folder), "--ball", "any"])
+        main(["detect", str(folder), "--ball", "any", "-o", str(folder / "points.csv")])
     assert not ended.value.code
     with_centre = run(load_session(folder))
     assert not with_centre.left_out

@@ -1,4 +1,4 @@
-"""`stitch detect SESSION`: boards and balls in the scans become labelled points, points.csv."""
+"""`stitch detect SESSION`: boards and balls in the scans as labelled points, the table points.csv."""
 
 import json
 import sys
@@ -10,47 +10,56 @@ import typer
 
 from stitch.cli.looked_for import BallOption, BoardOption, looked_for
 from stitch.cli.options import Json
-from stitch.cli.streams import emit
+from stitch.cli.streams import emit, results
 from stitch.errors import InputError
 from stitch.intake.targets_in_scans import points_columns, scans_of, targets_in, views_of_targets
 from stitch.measurement.labelled_points import Sighting
 from stitch.reading.session_folder import load_session
 from stitch.system.whole_file import whole
-from stitch.writing.session_files import write_table
+from stitch.writing.session_files import table_text, write_table
 
 
 def detect(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")],
     board: BoardOption = None,
     ball: BallOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="TABLE", help="points.csv to write; default standard output."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Find boards and balls in the scans of a session and write them as labelled points beside them.
+    """Find boards and balls in the scans of a session; with -o SESSION/points.csv they count as labelled points.
 
     \b
     Examples:
-      stitch detect calibration --board charuco:11x8:20:15:DICT_4X4_50
-      stitch detect calibration --ball 19.05 --ball any
+      stitch detect calibration --board charuco:11x8:20:15:DICT_4X4_50 -o calibration/points.csv
+      stitch detect calibration --ball any
     """
     wanted = looked_for(board, ball)
     if wanted.nothing:
         raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
-    file = session / "points.csv"
-    if file.exists() or file.is_symlink():
-        raise InputError(f"{file}: exists already; to fix: remove it, or give it another name")
+    if output is not None and (output.exists() or output.is_symlink()):
+        raise InputError(f"{output}: exists already; to fix: remove it, or name another file")
     loaded = load_session(session)
     found, notes = targets_in(scans_of(loaded), wanted)
     views = [view.name for view in loaded.views]
-    with whole(file) as scratch:
-        write_table(scratch, points_columns(views, found))
+    columns = points_columns(views, found)
+    if output is not None:
+        with whole(output) as scratch:
+            write_table(scratch, columns)
     for note in notes:
         print(f"{note}.", file=sys.stderr)
     if as_json:
         emit(json.dumps(_document(session, views, found, notes), indent=1))
+    elif output is None:
+        results().write(table_text(columns))
     showing = sum(bool(s.targets) for s in found)
     count = len(views_of_targets(found))
-    print(f"{file}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
-    print(f"next: stitch run {session}", file=sys.stderr)
+    where = output or "standard output"
+    print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
+    if output == session / "points.csv":
+        print(f"next: stitch run {session}", file=sys.stderr)
 
 
 def _document(session: Path, views: list[str], found: list[Sighting], notes: list[str]) -> dict[str, object]:

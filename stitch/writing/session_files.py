@@ -4,6 +4,7 @@ The one writer of the format: the cells hand out their readings with it, and sim
 """
 
 import csv
+import io
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -122,8 +123,14 @@ def write_ply(path: Path, cloud: Cloud) -> None:
 
 def write_table(file: Path, columns: Columns) -> None:
     """Write one table of a session."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            writer.writerow([f"{value:.12g}" if isinstance(value, float) else value for value in row])
+    file.write_text(table_text(columns), encoding="utf-8", newline="")
+
+
+def table_text(columns: Columns) -> str:
+    """A table as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([f"{value:.12g}" if isinstance(value, float) else value for value in row])
+    return out.getvalue()

@@ -1,6 +1,7 @@
 """Hand-eye from a sphere: real laser lines, synthetic cells of lines and areas, wrong poses and refusals."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -167,6 +168,16 @@ def test_a_free_radius_reveals_a_wrong_one(tmp_path):
 def test_a_wrong_radius_is_refused_with_the_one_found(tmp_path, kind, radius):
     folder = write_spheres(sphere_cell(4, kind, turns=0.7), tmp_path / "s", radius=radius)
     with pytest.raises(InputError, match=r"show (30|29\.9\d*) ±|the best has 30"):
+        calibrate_sphere(load_session(folder))
+
+
+@pytest.mark.slow
+def test_real_laser_lines_contradict_another_radius(shared_data, tmp_path):
+    """The sphere's radius is 40 mm; lines near its equator leave a tenth of a millimetre open."""
+    folder = shutil.copytree(shared_data / "fanuc-line-sphere", tmp_path / "s")
+    told = (folder / "session.toml").read_text(encoding="utf-8").replace("radius = 40.0", "radius = 45.0")
+    (folder / "session.toml").write_text(told, encoding="utf-8")
+    with pytest.raises(InputError, match=r"sphere.radius is 45, the scans show (39\.[5-9]|40\.[0-5])"):
         calibrate_sphere(load_session(folder))
 
 

@@ -59,12 +59,15 @@ def scatter_in_base(session):
 
 def test_organised_clouds_with_colour(cell, tmp_path, capsys):
     folder = write_board_session(tmp_path / "s", *cell)
-    code, out, err = ended(capsys, "detect", folder, "--board", BOARD, "--json")
+    code, out, err = ended(capsys, "detect", folder, "--board", BOARD, "--json", "-o", folder / "points.csv")
     assert code == 0, err
     assert json.loads(out)["views"].keys() == {"v0", "v1", "v2"} and "stitch run" in err
     assert scatter_in_base(load_session(folder)) < 0.05
-    code, _, err = ended(capsys, "detect", folder, "--board", BOARD)
+    table = (folder / "points.csv").read_text()
+    code, _, err = ended(capsys, "detect", folder, "--board", BOARD, "-o", folder / "points.csv")
     assert code == 2 and "exists already" in err
+    code, out, _ = ended(capsys, "detect", folder, "--board", BOARD)
+    assert code == 0 and out == table
 
 
 def test_depth_images_beside_pictures(cell, tmp_path, capsys):
@@ -82,7 +85,7 @@ def test_depth_images_beside_pictures(cell, tmp_path, capsys):
         depth = np.round(np.nan_to_num(scan.points[..., 2]) * 10).astype(np.uint16)
         assert cv2.imwrite(str(folder / f"clouds/depth_{i}.png"), depth)
         Image.fromarray(scan.grey).save(folder / f"clouds/color_{i}.png")
-    code, _, err = ended(capsys, "detect", folder, "--board", BOARD)
+    code, _, err = ended(capsys, "detect", folder, "--board", BOARD, "-o", folder / "points.csv")
     assert code == 0, err
     assert scatter_in_base(load_session(folder)) < 0.05
 
