@@ -105,8 +105,7 @@ def test_everybody_can_read_and_reach_it(browser, address, colours):
     story = Story(browser, address, color_scheme=colours)
     page = story.page
     story.says("#plots", "signed mean")
-    for details in page.locator("details > summary").all():
-        details.click()
+    page.evaluate("() => document.querySelectorAll('details').forEach(details => { details.open = true; })")
     read = page.evaluate(CONTRASTS)
     assert len(read) > 60
     assert [pair for pair in read if pair[0] < 4.5] == []
