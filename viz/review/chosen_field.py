@@ -69,7 +69,7 @@ def patch_weights(rows: ResidualRows, part: str) -> PatchWeights:
 def chosen_field(
     rows: ResidualRows, weights: PatchWeights, choice: Choice, comparison: dict[str, Any] | None, um: float
 ) -> dict[str, Any]:
-    """The field and the numbers of a choice, beside those of everything; plain data, errors in µm.
+    """The field and the numbers of a choice; plain data, errors in µm.
 
     Args:
         comparison: compare.json, whose tables have the bins.
@@ -77,13 +77,7 @@ def chosen_field(
     Raises:
         InputError: a view, a property or a bin that the run does not have.
     """
-    inside = _chosen(rows, choice, comparison)
-    every = np.ones(len(rows.view), bool)
-    out = {name: _of(rows, weights, mask, um) for name, mask in (("all", every), ("chosen", inside))}
-    return out | {"within": choice.within}
-
-
-def _of(rows: ResidualRows, weights: PatchWeights, mask: Mask, um: float) -> dict[str, Any]:
+    mask = _chosen(rows, choice, comparison)
     overall, e = _overall(rows, weights, mask) * um, rows.residual[mask] * um
     seen = overall[np.isfinite(overall)]
     return {
@@ -98,18 +92,18 @@ def _of(rows: ResidualRows, weights: PatchWeights, mask: Mask, um: float) -> dic
 
 def _overall(rows: ResidualRows, weights: PatchWeights, mask: Mask) -> Array:
     """(K,) mean over the chosen views of |their mean distance| at a patch; NaN where none of them tells."""
-    half, K = len(rows.view) // 2, weights.count
-    picked = np.flatnonzero(mask)
-    own = picked % half if half else picked
-    key = (rows.view[picked, None] * K + weights.patch[own]).ravel()
-    weight = weights.weight[own]
-    shape = (len(rows.views), K)
-    total = np.bincount(key, weight.ravel(), shape[0] * K).reshape(shape)
-    sums = np.bincount(key, (weight * rows.residual[picked, None]).ravel(), shape[0] * K).reshape(shape)
-    told = total > _ENOUGH
-    with np.errstate(invalid="ignore", divide="ignore"):
-        means = np.where(told, np.abs(sums / total), 0.0).sum(axis=0) / told.sum(axis=0)
-    return np.asarray(np.where(told.any(axis=0), means, np.nan))
+    half = max(len(rows.view) // 2, 1)
+    size, count = np.zeros((2, weights.count))
+    for v in range(len(rows.views)):
+        own = np.flatnonzero(mask & (rows.view == v))
+        patch, weight = weights.patch[own % half].ravel(), weights.weight[own % half]
+        total = np.bincount(patch, weight.ravel(), weights.count)
+        sums = np.bincount(patch, (weight * rows.residual[own, None]).ravel(), weights.count)
+        told = total > _ENOUGH
+        size[told] += np.abs(sums[told] / total[told])
+        count += told
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(count > 0, size / np.maximum(count, 1), np.nan))
 
 
 def _chosen(rows: ResidualRows, choice: Choice, comparison: dict[str, Any] | None) -> Mask:

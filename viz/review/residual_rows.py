@@ -34,11 +34,14 @@ class ResidualRows:
     @cached_property
     def properties(self) -> dict[str, Array]:
         """What depends on the point, as `stitch compare` names it."""
-        T = self.poses[self.view]
-        away = np.asarray(self.place - T[:, :3, 3])
-        x, y, z = np.einsum("nij,ni->jn", T[:, :3, :3], away)
-        far = np.linalg.norm(away, axis=1)
-        cosine = np.abs(np.einsum("ni,ni->n", away, self.normal)) / np.maximum(far, 1e-300)
+        away, seen = np.empty_like(self.place), np.empty(len(self.view))
+        for v, T in enumerate(self.poses):  # view by view: all at once would take several times the memory
+            own = np.flatnonzero(self.view == v)
+            ray = self.place[own] - T[:3, 3]
+            seen[own] = np.abs(np.einsum("ni,ni->n", ray, self.normal[own]))
+            away[own] = ray @ T[:3, :3]
+        far, (x, y, z) = np.linalg.norm(away, axis=1), away.T
+        cosine = seen / np.maximum(far, 1e-300)
         with np.errstate(invalid="ignore", divide="ignore"):
             field = {"field a = x/z": x / z, "field b = y/z": y / z, "field ρ": np.hypot(x, y) / z}
         return {"range": far, "incidence": np.degrees(np.arccos(np.clip(cosine, -1, 1))), **field}

@@ -3,9 +3,9 @@
 import re
 import threading
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
@@ -21,6 +21,15 @@ _NAME = re.compile(r"[A-Za-z_]\w{0,80}")
 _LONGEST_NOTE, _LONGEST_NAME = 2000, 80
 
 
+class _Rows(NamedTuple):
+    """Residuals of a model, how they count for the patches of the part, and the field of all of them."""
+
+    model: str
+    rows: ResidualRows
+    weights: PatchWeights
+    all: dict[str, Any]
+
+
 @dataclass
 class RunReview:
     """A run folder under review; what is asked from several threads is computed once."""
@@ -30,7 +39,7 @@ class RunReview:
     trust: bool = False  # the file that the model names
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _last: Snapshot | None = None
-    _rows: tuple[str, ResidualRows | None, PatchWeights | None] | None = None
+    _rows: _Rows | None = None
 
     @property
     def version(self) -> str:
@@ -91,19 +100,23 @@ class RunReview:
             InputError: the run has no such view, property or bin, or no field.
         """
         found = self.snapshot()
-        with self._lock:
-            if self._rows is None or self._rows[0] != found.model:
-                rows = read_rows(self.run, found.result)
-                usable = rows is not None and found.part is not None
-                weights = patch_weights(rows, found.part) if usable and rows and found.part else None
-                self._rows = (found.model, rows, weights)
-            _, rows, weights = self._rows
-        if rows is None or weights is None:
-            raise InputError(f"{self.run}: has no surfaces to show a part of")
-        if choice.place is not None and not choice.within:
-            choice = Choice(choice.views, choice.bins, choice.place, within=2 * weights.radius)
         um = MICROMETRES[found.result["length_unit"]]
-        return chosen_field(rows, weights, choice, found.comparison, um) | {"model": found.model}
+        with self._lock:
+            if self._rows is None or self._rows.model != found.model:
+                self._rows = None  # two at once would take twice the memory
+                self._rows = self._read_rows(found, um)
+            known = self._rows
+        if choice.place is not None and not choice.within:
+            choice = replace(choice, within=2 * known.weights.radius)
+        chosen = chosen_field(known.rows, known.weights, choice, found.comparison, um)
+        return {"model": found.model, "all": known.all, "chosen": chosen}
+
+    def _read_rows(self, found: Snapshot, um: float) -> _Rows:
+        rows = read_rows(self.run, found.result)
+        if rows is None or found.part is None:
+            raise InputError(f"{self.run}: has no surfaces to show a part of")
+        weights = patch_weights(rows, found.part)
+        return _Rows(found.model, rows, weights, all=chosen_field(rows, weights, Choice(), None, um))
 
     def arguments(self, kind: str, asked: dict[str, Any]) -> list[str]:
         """The command of what a page asked for.

@@ -142,5 +142,7 @@ function numbers(name, told, problem) {
   const { chosen, all } = told;
   root.replaceChildren(clear, element("p", {}, element("b", {}, `Chosen: ${name}`)),
     element("p", {}, `${chosen.views} of ${all.views} views, ${chosen.correspondences.toLocaleString("en")} residuals: rms ${um(chosen.rms)} (all: ${um(all.rms)}), `
-      + `on average over the part ${um(chosen.mean)} (all: ${um(all.mean)}), signed mean ${um(chosen.signed)}.`));
+      + `on average over the part ${um(chosen.mean)} (all: ${um(all.mean)})`
+      // Both sides of every correspondence count: without a choice among them the mean is zero.
+      + (Math.abs(chosen.signed) < 1e-6 ? "." : `, signed mean ${um(chosen.signed)}.`)));
 }
