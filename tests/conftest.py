@@ -120,6 +120,11 @@ def session(_blade_on_disk, tmp_path):
 @pytest.fixture
 def few_effects(monkeypatch):
     """A small library: what is tested is the choice, not how long all of it takes."""
+    whole = dict(EFFECTS)
     for name in set(EFFECTS) - {"joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash"}:
-        monkeypatch.delitem(EFFECTS, name)
+        del EFFECTS[name]
     monkeypatch.setattr(candidates, "empirical_effects", lambda views: [])
+    yield
+    # In their order: what is drawn at random goes by it.
+    EFFECTS.clear()
+    EFFECTS.update(whole)
