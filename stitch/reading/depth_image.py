@@ -33,7 +33,7 @@ def is_depth_image(path: Path) -> bool:
     try:
         with Image.open(path) as image:
             return image.mode in _DEEP
-    except (UnidentifiedImageError, OSError):
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError):
         return False
 
 

@@ -128,10 +128,11 @@ def picture_beside(scan: Path) -> Path | None:
     folders = [scan.parent, *(f for f in sorted(scan.parent.parent.iterdir()) if f.is_dir() and _COLOUR.search(f.name))]
     for folder in folders:
         for file in sorted(folder.iterdir()):
-            if file == scan or file.suffix.lower() not in _PICTURES or is_depth_image(file):
+            if file == scan or file.suffix.lower() not in _PICTURES:
                 continue
             told = _COLOUR.search(file.stem) or folder != scan.parent
-            if file.stem == scan.stem or (told and numbers and re.findall(r"\d+", file.stem)[-1:] == numbers[-1:]):
+            alike = told and numbers and re.findall(r"\d+", file.stem)[-1:] == numbers[-1:]
+            if (file.stem == scan.stem or alike) and not is_depth_image(file):
                 return file
     return None
 
