@@ -7,7 +7,7 @@ motion turns scanner and flange by the same angle (Shiu & Ahmad 1989). Where tha
 view's balls stay without names.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +24,8 @@ _CLEARLY = 3.0
 # Angles of scanner and flange agree within (rad): hundredths of a degree of poses, tenths of balls close together.
 _ANGLE = np.radians(2.0)
 _FEWEST = 3
-# Ways looked at for one view: with more, balls are too alike.
-_MOST_WAYS = 20000
+# Steps of the search for one view: a grid of many balls has more, and its ways are alike anyway.
+_MOST_STEPS = 100_000
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,8 @@ def _kinds(views: Sequence[ViewBalls]) -> list[Indices]:
 def _best_way(arrangement: _Placed, views: Sequence[ViewBalls], v: int, kinds: Indices) -> list[tuple[int, int]] | None:
     """Pairs (ball of the view, name) of the one way in which most balls fit; None where there is none or several."""
     view = views[v]
-    ways = list(_ways(arrangement, view, kinds))
-    most = max((len(way) for way in ways), default=0)
-    ways = [way for way in ways if len(way) == most]
-    if most < _FEWEST or len(ways) >= _MOST_WAYS:
+    ways = _ways(arrangement, view, kinds)
+    if not ways:
         return None
     rated = sorted(((_motion(arrangement, view, way), way) for way in ways), key=lambda pair: pair[0][1])
     floor = float(view.sigma.mean()) + 1e-12
@@ -112,29 +110,30 @@ def _best_way(arrangement: _Placed, views: Sequence[ViewBalls], v: int, kinds: I
     return close[0][1] if len(close) == 1 else None
 
 
-def _ways(arrangement: _Placed, view: ViewBalls, kinds: Indices) -> Iterator[list[tuple[int, int]]]:
-    """Every largest set of pairs whose distances agree: cliques, ball by ball."""
+def _ways(arrangement: _Placed, view: ViewBalls, kinds: Indices) -> list[list[tuple[int, int]]]:
+    """Every largest set of pairs whose distances agree: cliques, ball by ball; none where the search is too long."""
     K, B = len(arrangement.places), len(kinds)
     there = np.linalg.norm(arrangement.places[:, None] - arrangement.places[None], axis=2)
     here = np.linalg.norm(view.centres[:, None] - view.centres[None], axis=2)
     room = _SHARE * here + _SIGMAS * np.hypot(view.sigma[:, None], view.sigma[None])
-    most, count = [_FEWEST], [0]
+    found, steps = [list[tuple[int, int]]()], [0]
 
-    def grow(b: int, way: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-        if len(way) + B - b < most[0] or count[0] >= _MOST_WAYS:
+    def grow(b: int, way: list[tuple[int, int]]) -> None:
+        steps[0] += 1
+        most = max(_FEWEST, len(found[0]))
+        if len(way) + B - b < most or steps[0] > _MOST_STEPS:
             return
         if b == B:
-            most[0] = max(most[0], len(way))
-            count[0] += 1
-            yield list(way)
+            found[:] = [way] if len(way) > len(found[0]) else [*found, way]
             return
         for k in range(K):
             fits = arrangement.kinds[k] == kinds[b] and all(n != k for _, n in way)
             if fits and all(abs(here[b, a] - there[k, n]) < room[b, a] for a, n in way):
-                yield from grow(b + 1, [*way, (b, k)])
-        yield from grow(b + 1, way)
+                grow(b + 1, [*way, (b, k)])
+        grow(b + 1, way)
 
-    yield from grow(0, [])
+    grow(0, [])
+    return found if found[0] and steps[0] <= _MOST_STEPS else []
 
 
 def _motion(arrangement: _Placed, view: ViewBalls, way: Sequence[tuple[int, int]]) -> tuple[Array, float]:

@@ -114,3 +114,10 @@ def test_two_balls_of_one_radius_have_no_names_and_two_of_different_radii_do():
     assert label_balls([view(pair, [0, 0, 0]), view(pair, [0, 0, 1])]) == [[None, None]] * 2
     radii = np.array([10.0, 15])
     assert label_balls([view(pair, [0, 0, 0], radii), view(pair, [0, 0, 1], radii, [1, 0])]) == [[0, 1], [1, 0]]
+
+
+def test_a_grid_of_many_balls_ends_without_names_or_with_the_right_ones():
+    grid = np.array([[30.0 * x, 30.0 * y, 0] for x in range(6) for y in range(6)])
+    views = [view(grid, [0, 0, 0]), view(grid, [0.3, 0.1, 0.7], order=range(0, 36, 2))]
+    first, second = label_balls(views)
+    assert first == list(range(36)) and second in (list(range(0, 36, 2)), [None] * 18)
