@@ -141,9 +141,13 @@ def _problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> _Proble
 
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
-    variances = np.exp(log_variances)
+    with np.errstate(over="ignore"):
+        variances = np.exp(log_variances)
     mixed = problem.mixed
     V = mixed.covariance(variances)
+    # A leap that ran away ends among infinite variances: nothing is as unlikely.
+    if not np.isfinite(V).all():
+        return 1e300, np.zeros(len(variances))
     try:
         L = np.linalg.cholesky(V)
     except np.linalg.LinAlgError:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from stitch.statistics.variance_components import MixedModel, at_variances, fit_variances
+from stitch.statistics.variance_components import MixedModel, at_variances, deviance_slope, fit_variances
 
 
 def test_variances_are_found_again():
@@ -66,3 +66,10 @@ def test_scatter_that_no_number_has_is_none():
     # Other columns are compared at the same constants.
     more = fit_variances(MixedModel(z, A, C), A[..., :1] ** 2, np.ones(1), start=found.variances)
     assert np.isfinite(more.deviance - found.deviance) and more.variances[:2].tolist() == [0, 0]
+
+
+def test_variances_beyond_all_numbers_are_as_unlikely_as_nothing_else():
+    mixed = MixedModel(np.ones((1, 4)), np.zeros((1, 4, 0)), np.eye(4)[None, None])
+    for log_variance in (800.0, np.nan):
+        deviance, slope = deviance_slope(np.array([log_variance]), mixed)
+        assert deviance == 1e300 and not slope.any()
