@@ -69,7 +69,7 @@ def simulate(
     times, covariates = _climate(scene, len(plan.joints), cell)
     field_weights = field_map(scene.scanner, cell)
     T_mount = scene.T_mount @ frames.exp(cell.standard_normal(6) * np.repeat(scene.mount_spread, 3))
-    moments = _moments(scene, plan, times, covariates)
+    moments = moments_of(scene, plan, times, covariates)
     targets = targets_of(scene)
     true_cell = Cell(scene, mesh, laws, T_mount=T_mount, field_weights=field_weights, targets=targets)
     taken = _take_all(true_cell, moments, rail, seed)
@@ -101,7 +101,7 @@ def _take_all(cell: Cell, moments: list[Moment], rail: Array, seed: int) -> list
     return list(parallel(take, moments, "taking views"))
 
 
-def _moments(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Array]) -> list[Moment]:
+def moments_of(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Array]) -> list[Moment]:
     previous = np.vstack([plan.joints[:1], plan.joints[:-1]])
     # What a controller counts as a move: more than the last digit it writes.
     move = plan.joints - previous

@@ -1,21 +1,24 @@
 """The whole diagnosis: linear model, candidates, selection, what to measure next, one plain sentence."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.plausible_scatter import implausible, scatter_limit
+from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.selection.verdict import Selection, select, validated
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
-from stitch.diagnosis.validation.cross_validation import cross_validate
+from stitch.diagnosis.unnamed_errors import unnamed_errors
+from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
+from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
@@ -39,7 +42,7 @@ def diagnose_state(state: State) -> Diagnosis:
         matrix = alias_matrix(linear, [r.score for r in selection.ranked])
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
-        selection, notes = validated(selection, left_out, implausible(linear, limit))
+        selection, notes = _held(linear, selection, left_out, limit)
         rotation, translation = np.sqrt(linear.null.variances[:2])
         found = Diagnosis(
             verdict=selection.verdict,
@@ -51,16 +54,36 @@ def diagnose_state(state: State) -> Diagnosis:
             translation=float(translation),
             candidates=tuple(examined),
             matrix=matrix,
-            depends_on=tuple(dependences(linear, selection.empirical)),
+            depends_on=tuple(dependences(linear, candidates)),
             next=tuple(propose(linear, selection)),
             missing=missing,
             linear=linear,
             notes=notes,
             scatter_limit=limit,
             implausible=implausible(linear, limit),
+            unnamed=unnamed_errors(linear) if selection.verdict == "unknown_effect" else (),
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))
+
+
+def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
+    """The verdict alone: selected, and held against views left out."""
+    selection = select(linear, candidates, limit)
+    asked = [r for r in (*selection.named, selection.second) if r is not None]
+    left_out: dict[str, CrossValidation | None] = {r.name: cross_validate(linear, r.score) for r in asked}
+    return _held(linear, selection, left_out, limit)[0]
+
+
+def _held(
+    linear: LinearModel, selection: Selection, left_out: dict[str, CrossValidation | None], limit: ScatterLimit
+) -> tuple[Selection, tuple[str, ...]]:
+    """What is named, held against views left out and halves of the views; and why something is not."""
+    if selection.verdict != "missing_effect":
+        return selection, selection.notes
+    asked = [r for r in (*selection.named, selection.second) if r is not None]
+    wrong_anyway = implausible(linear, limit) or bool(unnamed_errors(linear))
+    return validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
 
 
 def linear_model_of(state: State) -> LinearModel:

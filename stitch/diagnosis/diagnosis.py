@@ -7,6 +7,7 @@ from stitch.diagnosis.design.next_view import Proposal
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
+from stitch.diagnosis.unnamed_errors import Unnamed
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array
@@ -49,6 +50,7 @@ class Diagnosis:
     scatter_limit: ScatterLimit  # what "adequate" is measured against
     implausible: bool  # the poses scatter by more than that
     notes: tuple[str, ...] = ()
+    unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
 
     def __repr__(self) -> str:

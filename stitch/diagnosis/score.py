@@ -6,7 +6,7 @@ integrated over amplitudes of plausible size, so that more parameters cost what 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -22,7 +22,9 @@ _SEEN = 0.5
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
-_HOPELESS = -4.0
+_HOPELESS = -1.5
+# Forms so far (nats) behind the best one of their candidate add less than a per cent to it.
+_FAR = 6.0
 # With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do, and a
 # wide prior in place of that of plausible sizes moves the variances not at all.
 _REFITTED, _AMONG_MANY = 20_000, 2
@@ -36,9 +38,10 @@ class Score:
     observable: bool
     form: Form  # the best one
     p_value: float  # of the candidate, its forms counted; not yet counted over candidates
-    log_bayes_factor: float  # over the null
+    log_bayes_factor: float  # over everything else that may be there
     values: Array  # (p,) of the best form, free fit
     covariance: Array  # (p, p); NaN where no form was worth a fit
+    beside: LinearModel | None = None  # with the pose errors that remain beside the best form, where these have a prior
 
     @property
     def name(self) -> str:
@@ -64,18 +67,29 @@ class _Tried:
     p_value: float = 1.0
     values: Array | None = None  # (p,) free fit; None where the form was not worth one
     covariance: Array | None = None
+    variances: Array | None = None  # (c,)
 
 
 def score(linear: LinearModel, candidate: Candidate) -> Score:
-    """Try all forms of a candidate."""
+    """Try all forms of a candidate beside everything else that poses may err by.
+
+    The candidate takes the place of its own share of the pose errors: it is asked for by name, all others remain of
+    whatever size the views give them.
+    """
+    base = linear.without([candidate.name])
     full = candidate.forms[0]
-    whites = [linear.residual(form.columns) for form in candidate.forms]
-    seen = bool((np.linalg.norm(whites[0], axis=0) * full.sizes > _SEEN).any()) if whites[0].size else False
-    quick = np.array([_at_null(linear, form, white) for form, white in zip(candidate.forms, whites, strict=True)])
+    starts = (base, *base.elsewhere)
+    whites = [at.residual(full.columns) * full.sizes for at in starts]
+    seen = any(bool((np.linalg.norm(white, axis=0) > _SEEN).any()) for white in whites if white.size)
+    quick = np.array([[_quick(base, at, form) for at in starts] for form in candidate.forms])
+    likely = quick.max(axis=1)
     size = linear.mixed.size
-    worth = np.argsort(-quick, kind="stable")[: _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size]
+    few = _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
+    worth = [i for i in np.argsort(-likely, kind="stable")[:few] if likely[i] >= max(_HOPELESS, likely.max() - _FAR)]
     tried = [
-        _try(linear, form) if i in worth and quick[i] >= _HOPELESS and whites[i].any() else _Tried(float(quick[i]))
+        _try(base, form, starts[int(quick[i].argmax())].null.variances)
+        if i in worth and candidate.forms[i].columns.any()
+        else _Tried(float(likely[i]))
         for i, form in enumerate(candidate.forms)
     ]
     weights = form_weights(candidate)
@@ -85,9 +99,21 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     best, form = tried[k], candidate.forms[k]
     if best.values is None or best.covariance is None:
         nothing = np.zeros(len(form.sizes))
-        return Score(candidate, seen, form, 1.0, total, values=nothing, covariance=np.diag(nothing + np.nan))
-    p, total = (p, total) if seen else (1.0, 0.0)
-    return Score(candidate, seen, form, p, total, values=best.values, covariance=best.covariance)
+        values, covariance = nothing, np.diag(nothing + np.nan)
+    else:
+        p, total, values, covariance = p if seen else 1.0, total if seen else 0.0, best.values, best.covariance
+    return Score(candidate, seen, form, p, total, values=values, covariance=covariance, beside=_beside(base, best))
+
+
+def _beside(base: LinearModel, best: _Tried) -> LinearModel | None:
+    if base.pose_errors is None or best.variances is None:
+        return None
+    return replace(base, null=at_variances(base.mixed, best.variances))
+
+
+def _quick(base: LinearModel, at: LinearModel, form: Form) -> float:
+    """Log Bayes factor over the base at given variances: what refitted variances can only raise."""
+    return _at_null(at, form, at.residual(form.columns)) + 0.5 * (base.null.deviance - at.null.deviance)
 
 
 def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
@@ -96,11 +122,11 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
     return [candidates[k] for k in np.argsort(-np.array(quick), kind="stable")[:count]]
 
 
-def _try(linear: LinearModel, form: Form) -> _Tried:
+def _try(linear: LinearModel, form: Form, start: Array) -> _Tried:
     """One form with its variances estimated anew."""
     mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
-    integrated = fit_variances(mixed, G, form.sizes, start=linear.null.variances)
-    if mixed.size > MANY_NUMBERS:
+    integrated = fit_variances(mixed, G, form.sizes, start=start)
+    if mixed.size > MANY_NUMBERS or linear.pose_errors is not None:
         free = at_variances(mixed, integrated.variances, G, wide)
     else:
         free = fit_variances(mixed, G, wide, integrated.variances)
@@ -109,7 +135,7 @@ def _try(linear: LinearModel, form: Form) -> _Tried:
     rank, square = _wald(theta, covariance, form.sizes)
     rest = max(mixed.size - a - rank, 1)
     p = f_tail(square / max(rank, 1), max(rank, 1), rest)
-    return _Tried(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance)
+    return _Tried(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance, integrated.variances)
 
 
 def _at_null(linear: LinearModel, form: Form, white: Array) -> float:

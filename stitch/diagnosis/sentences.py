@@ -4,6 +4,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import angle_text, length_text, rounded
 
 
@@ -48,6 +49,12 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
+    if d.unnamed and not d.implausible:
+        again = " and ".join(u.words for u in d.unnamed)
+        return (
+            f"{start}{follows}the errors of the poses repeat, they {again}{_repeating(d, length_unit)}, and scatter by "
+            f"{scatter} otherwise{_notes(d)}{_lack(d)}."
+        )
     if not d.implausible:
         otherwise = (
             f"the poses scatter by {scatter} otherwise" if _scatters(d) else "what was seen does not show the poses"
@@ -58,6 +65,12 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
         f"the same poses, so that those found on one object correct another{_notes(d)}{_lack(d)}."
     )
+
+
+def _repeating(d: Diagnosis, length_unit: str) -> str:
+    """How large the errors are that repeat without a name."""
+    size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
+    return f" ({length_text(float(size), length_unit, 2)})" if size > 0 else ""
 
 
 def _scatters(d: Diagnosis) -> bool:

@@ -16,6 +16,8 @@ from stitch.statistics.variance_posterior import mean_variances
 
 # Components as people call them; the arm's own keep the name of their effects.
 _WHITE = ("white rotation", "white translation", "sensor noise")
+# Sources that are new in every view, or no error of the poses.
+NOT_REPEATING = ("sensor noise", "white repeatability", "scanner field")
 _CALLED = {
     "sensor noise": "sensor noise",
     "white rotation": "white repeatability",
@@ -62,10 +64,9 @@ def variance_budget(linear: LinearModel, named: Sequence[Score] = ()) -> tuple[B
 def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) -> Iterator[tuple[str, float]]:
     """Sums of squares that each component leaves beside the model and what is named."""
     U = column_space(np.hstack([linear.reduce(linear.design), *named]))
-    components = np.concatenate([linear.mixed.components, errors.components[:, None]])
-    mixed = replace(linear.mixed, A=U[None], components=components, scales=errors.scales)
+    mixed = replace(linear.mixed, A=U[None])
     sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
-    for name, size, C in zip((*_WHITE, *errors.names), sizes, components[:, 0], strict=True):
+    for name, size, C in zip((*_WHITE, *errors.names), sizes, mixed.components[:, 0], strict=True):
         yield _CALLED.get(name, f"{name} of every joint"), float(size * (np.trace(C) - np.sum(U * (C @ U))))
     if linear.mixed.fixed is not None:
         C = linear.mixed.fixed[0]

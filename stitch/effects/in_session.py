@@ -14,6 +14,8 @@ _WHERE_FROM = {
     "velocity": "columns j1_velocity_deg_s … in views.csv",
     "time": "a column time_s in views.csv",
     "intensity": "an intensity for every point",
+    "optics": "a sensor with optics (kind area, line or camera under [scanner])",
+    "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
 }
 
 
@@ -50,7 +52,11 @@ def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:
 def lacking(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     """What an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
     views = measurement.views
-    known_here = {"intensity": measurement.has_intensity}
+    known_here = {
+        "intensity": measurement.has_intensity,
+        "optics": measurement.has_optics,
+        "surfaces": measurement.has_surfaces,
+    }
     missing = [need for need in effect.needs if not known_here.get(need, views.has(need))]
     if effect.prefers and not any(views.has(name) for name in (*effect.prefers, "time")):
         missing.append("time")

@@ -15,7 +15,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import Robot
-from stitch.measurement.session import Mount, Session
+from stitch.measurement.session import Mount, SensorKind, Session
 from stitch.measurement.views import ScanView, Views, views_of
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
@@ -34,6 +34,7 @@ class Measurement:
     scan_views: tuple[ScanView, ...]
     length_unit: str
     target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
+    sensor: SensorKind | None = None  # as the session states it
 
     @property
     def mount(self) -> Mount:
@@ -44,6 +45,16 @@ class Measurement:
     def has_intensity(self) -> bool:
         """True if every point has an intensity."""
         return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
+
+    @property
+    def has_optics(self) -> bool:
+        """True unless the sensor is known to have no lens: a tracker, or the probe that it follows."""
+        return self.sensor not in ("tracker", "probe")
+
+    @property
+    def has_surfaces(self) -> bool:
+        """True unless the sensor is known to see no surfaces, at no slant: a camera sees marks."""
+        return self.sensor in (None, "area", "line")
 
     def without(self, left_out: Sequence[int]) -> "Measurement":
         """The measurement less some views; of the others numbers, rows before and first values stay as they were."""
@@ -93,6 +104,7 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
         scan_views=tuple(scan_views),
         length_unit=session.length_unit,
         target_views=tuple(target_views),
+        sensor=session.scanner.kind,
     )
 
 

@@ -13,6 +13,7 @@ from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.robot import Robot
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
+SensorKind = Literal["area", "line", "tracker", "probe", "camera"]
 # ISO 9283: RP = l̄ + 3·S_l; for isotropic scatter σ a coordinate l̄ = 2σ√(2/π) and S_l = σ√(3 − 8/π).
 _RP_OF_SIGMA = float(2 * np.sqrt(2 / np.pi) + 3 * np.sqrt(3 - 8 / np.pi))
 
@@ -39,6 +40,7 @@ class Scanner:
     noise: float | None
     standoff: float | None
     optical_axis: Array  # (3,) unit vector in the scanner frame
+    kind: SensorKind | None = None  # None: nobody says; whatever a sensor may have can be asked for
 
 
 @dataclass(frozen=True)

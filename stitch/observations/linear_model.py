@@ -19,12 +19,11 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term
-from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.error_model import ErrorModel
 from stitch.observations.response import PointSums, Response
 from stitch.statistics.folds import JointEnd
 from stitch.statistics.least_squares import column_space
-from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
-from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances, whitener
+from stitch.statistics.variance_components import fit_variances
 
 
 class Trial(Protocol):
@@ -86,21 +85,13 @@ class Observation(Protocol):
 
 
 @dataclass(frozen=True)
-class LinearModel:
-    """One session under its model: what was seen beside hand-eye, landmarks and effects in use."""
+class LinearModel(ErrorModel):
+    """One session under its model: what was seen beside hand-eye, landmarks and effects in use, in the channel."""
 
     measurement: Measurement
     model: Model
     observation: Observation
     design: Array  # (·, a) response to hand-eye, landmarks and effects in use
-    mixed: MixedModel  # the same in the channel, with the components of the covariance
-    null: VarianceFit  # fitted without further columns
-    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
-
-    @cached_property
-    def satterthwaite(self) -> Satterthwaite:
-        """How well the null's scatter is known."""
-        return satterthwaite(self.mixed, self.null)
 
     def responses(self, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
@@ -109,24 +100,6 @@ class LinearModel:
     def reduce(self, response: Array) -> Array:
         """(n, P) numbers of the channel of a response (·, P)."""
         return self.observation.reduce(response)
-
-    def in_blocks(self, columns: Array) -> Array:
-        """(B, m, P) columns (n, P) as the variance components take them."""
-        return columns.reshape(*self.mixed.z.shape, columns.shape[1])
-
-    @cached_property
-    def covariance(self) -> Array:
-        """(B, m, m) of the channel under the null."""
-        return self.mixed.covariance(self.null.variances)
-
-    @cached_property
-    def _half(self) -> Array:
-        """(B, m, m) inverse Cholesky factors of the null's covariance."""
-        return whitener(self.mixed, self.null.variances)
-
-    def whiten(self, columns: Array) -> Array:
-        """(n, P) columns of the channel in units of the null's scatter."""
-        return np.asarray((self._half @ self.in_blocks(columns)).reshape(columns.shape))
 
     @cached_property
     def white_design(self) -> Array:
@@ -156,9 +129,11 @@ class LinearModel:
     def conditioned_on(self, columns: Array) -> "LinearModel":
         """The linear model with further free columns (n, p) of the channel."""
         mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
-        null = fit_variances(mixed, start=self.null.variances)
         design = np.hstack([self.design, self.observation.expand(columns)])
-        return replace(self, design=design, mixed=mixed, null=null)
+        out = replace(self, design=design, mixed=mixed, whole=None)
+        if self.pose_errors is None:
+            return replace(out, null=fit_variances(mixed, start=self.null.variances))
+        return out.refitted()
 
     def trial(self, response: Array, points: PointSums | None = None, precision: Array | None = None) -> Trial:
         """A model with the columns of a response (·, k)."""

@@ -12,8 +12,8 @@ the views' poses are a sum of processes, each with a covariance of known shape a
 White scatter of every scan, and the sensor's noise, come with the observation.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,10 +48,32 @@ class PoseErrors:
     names: tuple[str, ...]
     components: Array  # (c, 6V, 6V) per unit of each
     scales: Array  # (c,) that their σ usually has
+    effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
 
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
-        return replace(self, components=np.array([reduction @ C @ reduction.T for C in self.components]))
+        return replace(
+            self,
+            components=np.array([reduction @ C @ reduction.T for C in self.components]),
+            effects={name: (component, reduction @ own) for name, (component, own) in self.effects.items()},
+        )
+
+    def without(self, effects: Collection[str]) -> "PoseErrors":
+        """What poses may err beside some effects of the library: these are asked for by name."""
+        left = {name: own for name, own in self.effects.items() if name not in effects}
+        keep, components = list[int](), list[Array]()
+        for i, name in enumerate(self.names):
+            every = [own for component, own in self.effects.values() if component == name]
+            those = [own for component, own in left.values() if component == name]
+            if not every or those:
+                keep.append(i)
+                # What is left is summed anew: a difference of large numbers would not be positive.
+                untouched = len(every) == len(those)
+                components.append(self.components[i] if untouched else np.sum([own @ own.T for own in those], axis=0))
+        n = self.components.shape[1]
+        return PoseErrors(
+            tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n), self.scales[keep], left
+        )
 
 
 def white(views: int) -> PoseErrors:
@@ -68,13 +90,14 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white(sum(m.views.count for m in measurements))
-    found: dict[str, tuple[Array, float]] = {}
+    found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
         for name, effects in _families(_arm_effects(measurements)).items():
-            own = np.concatenate([_columns(m, model, centre, effects) for m, centre in sessions])
-            found[name] = (own @ own.T, _ARM)
+            own = [np.concatenate([_columns(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
+            members |= {e.name: (name, columns) for e, columns in zip(effects, own, strict=True)}
+            found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM)
         constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
         own = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
         found["smooth"] = (spread_over(own, alike_in_joints(joints)), _SMOOTH)
@@ -89,7 +112,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         for name, half in halves.items():
             found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
     components = np.array([c for c, _ in found.values()])
-    return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]))
+    return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]), members)
 
 
 def _carried(measurement: Measurement, centre: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot
-from stitch.measurement.session import Scanner, StatedRepeatability
+from stitch.measurement.session import Scanner, SensorKind, StatedRepeatability
 from stitch.reading.dh_rows import known_keys, numbers, robot_from_dh
 from stitch.reading.names import require_folder_name, require_name
 from stitch.reading.text_file import shortened
@@ -22,7 +22,7 @@ FORMAT = "stitch-session/1"
 
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
-    "scanner": {"pose", "noise", "standoff", "optical_axis"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind"},
     "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
@@ -96,7 +96,8 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
     if "pose" in table:
         T_mount = _pose(file, table["pose"])
     noise, standoff = (positive(file, table, "scanner", key) for key in ("noise", "standoff"))
-    return Scanner(T_mount, noise, standoff, _AXES[axis])
+    kind = choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
+    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind))
 
 
 def _pose(file: Path, value: Any) -> Array:

@@ -50,6 +50,21 @@ def grouped_folds(T_reference_mount: Array, lever: float) -> list[Indices]:
     return [f for f in [*by_time, *_regions(T_reference_mount, lever, _GROUPS)] if 0 < len(f) <= count // 2]
 
 
+def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Indices]]:
+    """Three ways to halve V views: in the order of time, by the region of their poses, alternately.
+
+    Args:
+        T_reference_mount: (V, 4, 4) in the order of time.
+        lever: length that makes a radian of orientation comparable with a distance.
+    """
+    views = np.arange(len(T_reference_mount))
+    twists = frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
+    # Along the direction in which the poses differ most.
+    along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
+    orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
+    return [tuple(np.sort(half) for half in np.array_split(order, 2)) for order in orders]
+
+
 def places(T_reference_mount: Array, lever: float) -> list[Indices]:
     """Index arrays of views near each other, every view in one: what a model does not know errs alike in one place."""
     count = len(T_reference_mount)

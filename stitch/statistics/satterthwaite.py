@@ -12,7 +12,7 @@ import numpy as np
 from stitch.frames import Array
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.variance_components import MixedModel, VarianceFit
-from stitch.statistics.variance_prior import FACTOR_SPREAD
+from stitch.statistics.variance_prior import prior_information
 
 # More is as good as knowing it.
 _MANY = 1e4
@@ -48,5 +48,5 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
         - 2 * np.einsum("cbik,dbik->cd", KU, KU, optimize=True)
         + np.einsum("ckl,dkl->cd", within, within, optimize=True)
     )
-    information[2, 2] += 1 / FACTOR_SPREAD**2
+    information += np.diag(prior_information(null.variances, mixed.scales))
     return Satterthwaite(white, np.linalg.pinv(information, rcond=1e-9, hermitian=True))

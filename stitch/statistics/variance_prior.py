@@ -29,6 +29,16 @@ def log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]
     return value, slope
 
 
+def prior_information(variances: Array, scales: Array | None) -> Array:
+    """(c,) what the prior alone knows of the log variances: half the curvature of `log_prior`."""
+    out = np.zeros(len(variances))
+    out[NOISE] = 1 / FACTOR_SPREAD**2
+    if scales is not None:
+        over = variances[NOISE + 1 :] / scales**2
+        out[NOISE + 1 :] = 0.5 * (1 + _SPIKE) * over / (1 + over) ** 2
+    return out
+
+
 def usual_variances(z: Array, components: Array) -> Array:
     """(c,) where a search begins: what was seen, mostly scatter and noise.
 

@@ -7,8 +7,10 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
+from stitch.diagnosis.score import score
 from stitch.diagnosis.selection.forward_selection import forward_selection
-from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
+from stitch.diagnosis.selection.inclusion import contest, wanted_group
+from stitch.diagnosis.selection.ranking import Ranked, certain, contends, rank, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     BEYOND_CHANCE,
@@ -18,7 +20,9 @@ from stitch.diagnosis.thresholds import (
     PRIOR_PHYSICAL,
     STEADY,
 )
+from stitch.diagnosis.unnamed_errors import unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation.halves import Halves
 from stitch.observations.linear_model import LinearModel
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
@@ -40,15 +44,19 @@ class Selection:
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
     """Name what is missing, or abstain."""
     ranked, empirical = ranked_all(linear, candidates)
-    contenders = [r for r in ranked if contends(r)]
     stray = _stray(empirical)
     adequate = Selection("adequate", (), ranked, empirical)
     unknown = replace(adequate, verdict="unknown_effect")
-    if stray is None and not any(certain(r) for r in contenders):
-        return unknown if implausible(linear, limit) else adequate
+    if stray is None and not any(certain(r) for r in ranked):
+        group = wanted_group(linear, candidates, len(ranked))
+        if group:
+            return replace(adequate, verdict="cannot_tell", named=group)
+        return unknown if implausible(linear, limit) or unnamed_errors(linear) else adequate
+    contenders, base = contest(linear, [r for r in ranked if contends(r)])
     if not contenders:
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
+    stray = _beside(base, stray, best)
     if linear.measurement.views.count >= MANY_VIEWS:
         found = forward_selection(linear, candidates, best)
         refused = found.refused
@@ -76,6 +84,14 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
 
 
+def _beside(base: LinearModel, stray: Ranked | None, best: Ranked) -> Ranked | None:
+    """A shape without a cause against the same errors as the best candidate."""
+    if stray is None or base.pose_errors is None:
+        return stray
+    scores = [score(base, r.score.candidate) for r in (stray, best)]
+    return rank(scores, tests=1)[1][0] if scores[0].observable else None
+
+
 def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
     """The best shape without a cause, where it is certain."""
     for r in empirical[:1]:
@@ -85,9 +101,13 @@ def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
 
 
 def validated(
-    selection: Selection, found: dict[str, CrossValidation | None], implausible: bool
+    selection: Selection,
+    found: dict[str, CrossValidation | None],
+    in_halves: dict[str, Halves | None],
+    wrong_anyway: bool,
 ) -> tuple[Selection, tuple[str, ...]]:
-    """An effect that does not help on views left out, or that one view carries, is not named; a second one may be.
+    """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
+    one may be.
 
     What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
     beyond chance.
@@ -98,7 +118,7 @@ def validated(
     for named in (selection.named[0], selection.second):
         if named is None:
             continue
-        refusal = _refused(named, found.get(named.name), implausible)
+        refusal = _refused(named, found.get(named.name), in_halves.get(named.name), wrong_anyway)
         if refusal is None:
             if named is selection.named[0]:
                 return selection, selection.notes
@@ -109,18 +129,19 @@ def validated(
     return nothing, tuple(notes[: len(selection.notes) + 1])
 
 
-def _refused(named: Ranked, left_out: CrossValidation | None, implausible: bool) -> tuple[str, str] | None:
+def _refused(
+    named: Ranked, left_out: CrossValidation | None, halves: Halves | None, wrong_anyway: bool
+) -> tuple[str, str] | None:
     """Verdict and reason if an effect does not stand the test of views left out."""
-    if left_out is None:
-        return None
-    if left_out.steadiness < STEADY:
+    otherwise = "unknown_effect" if wrong_anyway else "adequate"
+    if left_out is not None and left_out.steadiness < STEADY:
         note = f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
-        return "unknown_effect" if implausible or named.adjusted < BEYOND_CHANCE else "adequate", note
-    if not left_out.helps:
+        return "unknown_effect" if named.adjusted < BEYOND_CHANCE else otherwise, note
+    if left_out is not None and not left_out.helps:
         share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
-        note = f"{named.name} would not help on views left out (mean square pose error {share} of now)"
-        return "unknown_effect" if implausible else "adequate", note
-    return None
+        return otherwise, f"{named.name} would not help on views left out (mean square pose error {share} of now)"
+    objection = None if halves is None else halves.objection(named.name)
+    return None if objection is None else (otherwise, objection)
 
 
 def _order_open(best: Ranked, empirical: Sequence[Ranked]) -> bool:

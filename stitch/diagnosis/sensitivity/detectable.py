@@ -57,6 +57,7 @@ class Shown:
 
 def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
     """Smallest detectable size of every free parameter of a candidate among so many."""
+    linear = linear.without([candidate.name])
     shown = []
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
         white = linear.residual(form.columns)

@@ -30,6 +30,7 @@ class CrossValidation:
 
 def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     """Add the best form of a candidate to the model, in the linear approximation."""
+    linear = scored.beside or linear
     X, points = np.hstack([linear.design, scored.form.response]), scored.candidate.points
     own = None if points is None else points.of(scored.form.keep)
     trial, present = linear.trial(X, own), linear.present

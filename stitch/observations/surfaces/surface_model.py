@@ -10,6 +10,7 @@ from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term, stacked
+from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import pose_errors
 from stitch.observations.response import PointSums, Response
@@ -90,6 +91,9 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
     seen = independent(own, further, sizes, _UNSEEN)
     mixed = replace(mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
     design = np.hstack([jacobian(frames_of_mount, g.centre), extra[:, seen]])
-    null = fit_variances(mixed, both_starts=True)
     errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
-    return LinearModel(measurement, model, Surfaces(capture, freed, channel), design, mixed, null, errors)
+    mixed = with_errors(mixed, errors)
+    null = fit_variances(mixed, both_starts=True)
+    return LinearModel(
+        measurement, model, Surfaces(capture, freed, channel), design, mixed=mixed, null=null, pose_errors=errors
+    )

@@ -90,4 +90,4 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     A = np.concatenate([base, extra[..., seen]], axis=2)
     mixed = mixed_model_of_rows(rows, A)
     null = fit_variances(mixed, both_starts=True)
-    return LinearModel(measurement, model, Targets(rows, landmarks), A.reshape(n, -1), mixed, null)
+    return LinearModel(measurement, model, Targets(rows, landmarks), A.reshape(n, -1), mixed=mixed, null=null)

@@ -1,0 +1,130 @@
+"""Do names hold, and do unknowns stay unknown? Worlds that no model holds, judged blind.
+
+Usage: python bench/unknown_laws.py [--held-out] [--parts nothing,memory,...] [--scenes A,B] [--as-before]
+
+Every cell is simulated and run once; what its views show in other worlds is then drawn: true poses and points of
+data_synth's own laws, noise of the normal equations. Sizes of effects are multiples of what an arm that only scatters
+would show at the least in that cell. Seeds are of two kinds: those of development, and held-out ones, to be run once
+for each version of the diagnosis. --as-before asks as if poses scattered independently from view to view.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binomtest
+from unknown_cells import Asked, asked, seen
+from unknown_worlds import PARTS
+
+from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.thresholds import IMPLAUSIBLE
+
+SCENES = ("blade", "drill-plate", "blade-table")
+DEVELOPMENT, HELD_OUT = (0, 1), (800, 801)
+USUAL = ScatterLimit(*IMPLAUSIBLE)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One draw and what was said of it."""
+
+    cell: str
+    hidden: tuple[str, ...]
+    verdict: str
+    named: tuple[str, ...]
+    seconds: float
+
+    def __str__(self) -> str:
+        hidden, named = ", ".join(self.hidden) or "nothing", " ".join(self.named)
+        return f"{self.cell}: {hidden} → {self.verdict} {named} ({self.seconds:.1f} s)"
+
+    @property
+    def single(self) -> bool:
+        """One name, right or wrong."""
+        return self.verdict == "missing_effect"
+
+    @property
+    def alarm(self) -> bool:
+        """A name or a group."""
+        return bool(self.named)
+
+    @property
+    def right(self) -> bool:
+        """What is hidden, or one of it, is named or in the group."""
+        return any(name in self.hidden for name in self.named)
+
+
+def trials(part: str, cells: Sequence[Asked], as_before: bool = False) -> Iterator[Trial]:
+    """All draws of a part, over the cells in turn; `as_before`: as if poses scattered independently."""
+    make, count = PARTS[part]
+    for k in range(count):
+        a = cells[k % len(cells)]
+        rng = np.random.default_rng([a.cell.seed, k, list(PARTS).index(part), 17])
+        world, hidden = make(a, rng, k)
+        linear, begun = seen(a, world, rng), time.process_time()
+        linear = linear.scatter_only if as_before else linear
+        found = concluded(linear, a.candidates, USUAL)
+        names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
+        cell = f"{a.cell.scene} {a.cell.seed}"
+        yield Trial(cell, hidden, found.verdict, names, time.process_time() - begun)
+
+
+def shares(part: str, found: Sequence[Trial]) -> str:
+    """A row of the table, every share with its 95 % Wilson interval."""
+    columns: list[Callable[[Trial], bool]] = [
+        lambda t: t.single and not t.right,
+        lambda t: t.verdict == "cannot_tell" and not t.right,
+        lambda t: t.single and t.right,
+        lambda t: t.right,
+        lambda t: all(name in t.named for name in t.hidden) if t.hidden else False,
+        lambda t: t.verdict == "unknown_effect",
+        lambda t: t.verdict == "adequate",
+    ]
+    told = [f"{share(found, hit)}" for hit in columns]
+    return f"| {part} | {' | '.join(told)} |"
+
+
+def share(found: Sequence[Trial], hit: Callable[[Trial], bool]) -> str:
+    """k of n with its interval."""
+    k = sum(hit(t) for t in found)
+    low, high = binomtest(k, len(found)).proportion_ci(0.95, method="wilson")
+    return f"{k}/{len(found)} [{low:.2f}, {high:.2f}]"
+
+
+def told(part: str, cells: Sequence[Asked], as_before: bool) -> Iterator[Trial]:
+    """The trials of a part, printed as they come."""
+    for t in trials(part, cells, as_before):
+        print(f"{part}: {t}", flush=True)
+        yield t
+
+
+def main() -> None:
+    """Print every trial, and the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--held-out", action="store_true")
+    parser.add_argument("--as-before", action="store_true")
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--scenes", default=",".join(SCENES))
+    options = parser.parse_args()
+    seeds = HELD_OUT if options.held_out else DEVELOPMENT
+    cells = [asked(name, seed) for seed in seeds for name in options.scenes.split(",")]
+    rows = []
+    for part in options.parts.split(","):
+        found = []
+        for t in trials(part, cells, options.as_before):
+            found.append(t)
+            print(
+                f"{part}: {t.cell}: {', '.join(t.hidden)} → {t.verdict} {', '.join(t.named)} ({t.seconds:.1f} s)",
+                flush=True,
+            )
+        rows.append(shares(part, found))
+    print("\n| world | wrong name | wrong group | right name | right name or group | all of it | unknown | adequate |")
+    print("|---|---|---|---|---|---|---|---|", *rows, sep="\n")
+    print(f"\n{time.process_time():.0f} s of processor time")
+
+
+if __name__ == "__main__":
+    main()

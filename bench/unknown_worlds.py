@@ -1,0 +1,82 @@
+"""Worlds of the benchmark of names: what is hidden in a cell, drawn for one trial."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from blind_cells import drawn, smallest
+from blind_trials import LIBRARY
+from unknown_cells import Asked, World, white
+
+from data_synth import nature
+from data_synth.ordinary_arm import draw_arm, with_memory
+from data_synth.unnamed_laws import IN_TIME, UNNAMED
+
+
+def nothing(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """Scatter, and effects far below what can be seen."""
+    return World(_laws(a, {}, rng)), ()
+
+
+def memory(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """Autoregressive pose errors, 0.9 from view to view, of 40 µm and 40 µrad."""
+    return World(_laws(a, {}, rng), scatter=2 * with_memory(len(a.moments), 0.9, rng)), ("time",)
+
+
+def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """A law outside every dictionary; couplings as often as three others."""
+    law = (["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")])[k % (len(UNNAMED) + 1)]
+    error = UNNAMED[law](a.cell.plan, rng)
+    of_flange = error.shape[1] == 6 and law in IN_TIME
+    return World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error}), (law,)
+
+
+def effect(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """One effect of the library at twice its smallest detectable size."""
+    return _at(a, [_possible(a, rng, k)], 2.0, rng)
+
+
+def beside(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """One effect at three times that size, beside an ordinary arm of half the usual size."""
+    world, hidden = _at(a, [_possible(a, rng, k)], 3.0, rng)
+    return replace(world, arm=draw_arm(a.cell.plan.arm.joints, 0.5, rng)), hidden
+
+
+def two(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """Two effects at four times that size."""
+    first = _possible(a, rng, k)
+    second = first
+    while second == first:
+        second = _possible(a, rng, int(rng.integers(len(LIBRARY))))
+    return _at(a, [first, second], 4.0, rng)
+
+
+Part = Callable[[Asked, np.random.Generator, int], tuple[World, tuple[str, ...]]]
+PARTS: dict[str, tuple[Part, int]] = {
+    "nothing": (nothing, 24),
+    "memory": (memory, 24),
+    "unnamed": (unnamed, 32),
+    "effect": (effect, 42),
+    "beside": (beside, 21),
+    "two": (two, 21),
+}
+
+
+def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> nature.Nature:
+    return nature.draw(hidden, 1.0, a.cell.plan, rng)[0]
+
+
+def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:
+    """The k-th effect that this cell can have and show."""
+    able = [name for name in LIBRARY if any(c.name == name for c in a.candidates)]
+    return able[k % len(able)]
+
+
+def _at(a: Asked, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> tuple[World, tuple[str, ...]]:
+    chance = int(rng.integers(1 << 30))
+    plain = white(a.linear)
+    true = drawn(a.cell.scene, a.cell.plan, a.cell.measurement, laws, chance)
+    sizes = {law: smallest(plain, law, true[law]) for law in laws}
+    hidden = {law: multiple * size for law, size in sizes.items() if size is not None}
+    found = nature.draw(hidden, 1.0, a.cell.plan, np.random.default_rng([chance, 2]))[0]
+    return World(found), tuple(hidden)

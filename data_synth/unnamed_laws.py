@@ -1,0 +1,95 @@
+"""What arms do that no library of effects has: laws for the unknown.
+
+Each is drawn for one arm and returns errors of the joints (V, n) in rad, or of the flange in its own frame (V, 6) in
+rad and mm. Sizes are about 0.15 mrad or 0.05 mm rms, what a good arm is off by.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_synth.moment import Plan
+
+Array = NDArray[np.float64]
+_SIZE, _SHIFT = 1.5e-4, 0.05
+_RMS_OF_WAVE = float(np.sqrt(2.0))
+
+
+def coupling(plan: Plan, rng: np.random.Generator) -> Array:
+    """Two joints drag each other: sin q_i sin 2q_k, of 0.15 mrad."""
+    i, k = rng.choice(plan.useful, 2, replace=False)
+    return _of_joint(plan, i, _SIZE * np.sin(plan.joints[:, i]) * np.sin(2 * plan.joints[:, k]))
+
+
+def dress_pack(plan: Plan, rng: np.random.Generator) -> Array:
+    """Hoses pull one joint the harder, the farther two others are from where the hoses hang free."""
+    i, k, m = rng.choice(plan.useful, 3, replace=False)
+    off = [plan.joints[:, j] - rng.uniform(*_range(plan, j)) for j in (k, m)]
+    return _of_joint(plan, i, _scaled(np.hypot(*off) ** 1.5 * np.sign(np.sin(off[0]))))
+
+
+def spall(plan: Plan, rng: np.random.Generator) -> Array:
+    """A damaged tooth: a bump of 10° in the angle of one joint."""
+    i = int(rng.choice(plan.useful))
+    middle = rng.uniform(*_range(plan, i))
+    return _of_joint(plan, i, 3 * _SIZE * np.exp(-0.5 * ((plan.joints[:, i] - middle) / np.radians(10)) ** 2))
+
+
+def hysteresis(plan: Plan, rng: np.random.Generator) -> Array:
+    """A gear with friction and a spring (Prandtl's play): it follows the last reversals, not the last direction."""
+    i = int(rng.choice(plan.useful))
+    q, low_high = plan.joints[:, i], 0.25 * float(np.ptp(plan.joints[:, i]))
+    state = np.empty_like(q)
+    state[0] = q[0]
+    for v in range(1, len(q)):
+        state[v] = np.clip(state[v - 1], q[v] - low_high, q[v] + low_high)
+    return _of_joint(plan, i, _scaled(state - q))
+
+
+def ripple(plan: Plan, rng: np.random.Generator) -> Array:
+    """A wave generator: seven periods a turn of one joint."""
+    i, phase = int(rng.choice(plan.useful)), rng.uniform(0, 2 * np.pi)
+    return _of_joint(plan, i, _SIZE * _RMS_OF_WAVE * np.sin(7 * plan.joints[:, i] + phase))
+
+
+def thermal_cycle(plan: Plan, rng: np.random.Generator) -> Array:
+    """A cabinet that cools in turns: the flange swings to and fro every four to nine views."""
+    views = len(plan.joints)
+    swing = np.sin(2 * np.pi * np.arange(views) / rng.uniform(4, 9) + rng.uniform(0, 2 * np.pi))
+    return _RMS_OF_WAVE * swing[:, None] * _direction(rng)
+
+
+def gust(plan: Plan, rng: np.random.Generator) -> Array:
+    """For a stretch of views the arm stands in a draught, and comes back."""
+    views = len(plan.joints)
+    middle, width = rng.uniform(0.25, 0.75) * views, rng.uniform(0.08, 0.16) * views
+    return 2 * np.exp(-0.5 * ((np.arange(views) - middle) / width) ** 2)[:, None] * _direction(rng)
+
+
+UNNAMED: dict[str, Callable[[Plan, np.random.Generator], Array]] = {
+    law.__name__: law for law in (coupling, dress_pack, spall, hysteresis, ripple, thermal_cycle, gust)
+}
+IN_TIME = ("thermal_cycle", "gust")  # the others follow the joints
+
+
+def _of_joint(plan: Plan, joint: int, error: Array) -> Array:
+    out = np.zeros_like(plan.joints)
+    out[:, joint] = error
+    return out
+
+
+def _scaled(error: Array) -> Array:
+    """Of the usual rms about its mean."""
+    return np.asarray(_SIZE * (error - error.mean()) / max(float(error.std()), 1e-12))
+
+
+def _range(plan: Plan, joint: int) -> tuple[float, float]:
+    q = plan.joints[:, joint]
+    return float(q.min()), float(q.max())
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    """(6,) of 50 µm and 0.15 mrad."""
+    turn, shift = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
+    return np.concatenate([_SIZE * turn, _SHIFT * shift])

@@ -1,0 +1,61 @@
+"""What the poses do wrong again without a name: which processes of the prior the views want, and how large they are."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.thresholds import ODDS
+from stitch.observations.linear_model import LinearModel
+from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.variance_prior import NOISE
+
+# Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
+_WANDERING, _STOPS = ("wandering rotation", "wandering translation"), ("stop rotation", "stop translation")
+
+
+@dataclass(frozen=True)
+class Unnamed:
+    """One kind of errors that repeat, beside all others."""
+
+    words: str  # "they …"
+    log_bayes_factor: float  # over the same errors without it
+    joints: bool  # follows the pose rather than time
+
+
+def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
+    """Kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
+
+    Each is left out of the prior in turn, all other sizes fitted anew. A size that is not wanted goes to where its
+    prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
+    three nats (`variance_prior.py`), which the odds of 20 to 1 stand for.
+    """
+    if linear.pose_errors is None or _gain(linear, linear.scatter_only.null.deviance) < ODDS:
+        return ()
+    names = linear.pose_errors.names
+    kinds = {
+        "follow the joints": tuple(n for n in names if n not in (*_WANDERING, *_STOPS)),
+        "wander in time": _WANDERING,
+        "are shared by the scans of a stop": _STOPS,
+    }
+    found = [
+        Unnamed(words, _gain(linear, _deviance_without(linear, kind)), words == "follow the joints")
+        for words, kind in kinds.items()
+        if any(name in kind for name in names)
+    ]
+    wanted = sorted((u for u in found if u.log_bayes_factor > ODDS), key=lambda u: -u.log_bayes_factor)
+    # Where each can stand in for the other, the likelier alone is said to be there.
+    return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
+
+
+def _gain(linear: LinearModel, deviance: float) -> float:
+    return 0.5 * (deviance - linear.null.deviance)
+
+
+def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
+    """Of the null without some components."""
+    assert linear.pose_errors is not None and linear.mixed.scales is not None
+    keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
+    every = np.append(np.ones(NOISE + 1, bool), keep)
+    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=linear.mixed.scales[keep])
+    plain = np.append(linear.scatter_only.null.variances, 1e-2 * mixed.scales**2)
+    return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))

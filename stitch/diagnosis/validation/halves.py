@@ -1,0 +1,114 @@
+"""Whether an effect holds in halves of the views: found in one, judged in the other, which took no part in choosing it.
+
+The views are halved in the order of time, by the region of their poses, and alternately. In each half the form of the
+effect is chosen anew and its sizes are fitted; the other half says how much likelier its numbers are with that effect
+than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else
+among all the views has another size or sign in each half. All of it beside the pose errors that remain with the effect.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.candidates import Form
+from stitch.diagnosis.score import Score
+from stitch.diagnosis.thresholds import BY_CHANCE
+from stitch.frames import Array, Indices
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.statistics.folds import halves_of
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.tails import chi2_tail
+
+# A prior of this many plausible sizes keeps what a half does not see finite, and moves nothing else.
+_FREE = 30.0
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What the halves say of an effect that all views together suggest."""
+
+    log_bayes_factor: float  # of what each half predicts of the other, mean over the ways to halve
+    p_value: float  # that the sizes in both halves are one and the same, Bonferroni over the ways to halve
+
+    def objection(self, name: str) -> str | None:
+        """What speaks against an effect that explains much, if anything does."""
+        if self.log_bayes_factor <= 0:
+            return f"{name} found in one half of the views does not help in the other"
+        if self.p_value < BY_CHANCE:
+            return f"{name} has another size or sign in each half of the views (p = {self.p_value:.1g})"
+        return None
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What some views say of the parameters (p,) of a form: log likelihood vᵀθ − ½ θᵀIθ."""
+
+    information: Array  # (p, p)
+    vector: Array  # (p,)
+
+    def fitted(self, prior: Array) -> tuple[Array, Array]:
+        """Mean (p,) and precision (p, p) with a prior (p,) around zero."""
+        precision = self.information + np.diag(prior**-2)
+        return np.linalg.solve(precision, self.vector), precision
+
+
+def halves(scored: Score) -> Halves | None:
+    """The best form of a candidate, and all its forms, in halves of the views; None where pose errors have no prior."""
+    base = scored.beside
+    if base is None or not isinstance(base.observation, Surfaces):
+        return None
+    surfaces = base.observation
+    gains, p_values = [], []
+    ways = halves_of(surfaces.capture.T_reference_mount, surfaces.freed.overlaps.gram.lever)
+    for way in ways:
+        bases = [_explained(base, surfaces, other) for other in reversed(way)]
+        gains.append(sum(_predicted(base, scored.candidate.forms, *pair) for pair in (bases, bases[::-1])))
+        a, b = (_seen(base, U, scored.form) for U in bases)
+        p_values.append(_same_size(a, b, scored.form.sizes))
+    return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)))
+
+
+def _explained(base: LinearModel, surfaces: Surfaces, out: Indices) -> Array:
+    """(n, r) orthonormal basis of what the model, and the views that are left out moving freely, explain."""
+    free = np.eye(surfaces.channel.reduction.shape[1])[:, (6 * out[:, None] + np.arange(6)).ravel()]
+    return column_space(np.hstack([base.white_design, base.whiten(surfaces.reduce(free))]))
+
+
+def _seen(base: LinearModel, explained: Array, form: Form) -> _Seen:
+    white = base.whiten(form.columns)
+    white = white - explained @ (explained.T @ white)
+    return _Seen(white.T @ white, white.T @ base.white_z)
+
+
+def _predicted(base: LinearModel, forms: Sequence[Form], chosen_in: Array, judged_in: Array) -> float:
+    """Log Bayes factor in one half of the form that the other half prefers, at the sizes found there."""
+    seen = [_seen(base, chosen_in, form) for form in forms]
+    best = max(range(len(forms)), key=lambda i: _gain(seen[i], np.zeros(len(forms[i].sizes)), _prior(forms[i])))
+    mean, precision = seen[best].fitted(forms[best].sizes)
+    return _gain(_seen(base, judged_in, forms[best]), mean, precision)
+
+
+def _prior(form: Form) -> Array:
+    return np.diag(form.sizes**-2)
+
+
+def _gain(seen: _Seen, mean: Array, precision: Array) -> float:
+    """Log of the likelihood over that of no effect, averaged over a normal prior."""
+    scale = 1 / np.sqrt(np.diag(precision))
+    units = np.outer(scale, scale)
+    P, told, v, m = precision * units, seen.information * units, seen.vector * scale, mean / scale
+    pull = v + P @ m
+    square = pull @ np.linalg.solve(told + P, pull) - m @ P @ m
+    return float(0.5 * square - 0.5 * (np.linalg.slogdet(told + P)[1] - np.linalg.slogdet(P)[1]))
+
+
+def _same_size(a: _Seen, b: _Seen, sizes: Array) -> float:
+    """p-value of a χ² test of the difference, over the combinations that both halves see."""
+    (mean_a, one), (mean_b, other) = (s.fitted(_FREE * sizes) for s in (a, b))
+    d = (mean_a - mean_b) / sizes
+    covariance = sum(np.linalg.inv(p * np.outer(sizes, sizes)) for p in (one, other))
+    values, vectors = np.linalg.eigh(covariance)
+    told = values < 0.5 * _FREE**2
+    return chi2_tail(float(np.sum((vectors.T @ d)[told] ** 2 / values[told])), int(told.sum())) if told.any() else 1.0

@@ -1,0 +1,103 @@
+"""Numbers that were seen, and how they may err: components of a covariance, their sizes, models with fewer."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.observations.pose_errors import PoseErrors
+from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
+from stitch.statistics.variance_components import MixedModel, VarianceFit, at_variances, fit_variances, whitener
+from stitch.statistics.variance_prior import NOISE
+
+# A component that is as good as absent, as a share of the variance that it usually has.
+_ABSENT = 1e-2
+
+
+def with_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
+    """The mixed model of one block with scatter, noise, and what the poses err beside."""
+    components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
+    return replace(mixed, components=components, scales=errors.scales)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorModel:
+    """What was seen of one session in the channel, under errors whose sizes the numbers tell."""
+
+    mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
+    null: VarianceFit  # fitted without further columns
+    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
+    whole: Self | None = None  # the one that this was taken from, where some pose errors are left out
+
+    @cached_property
+    def satterthwaite(self) -> Satterthwaite:
+        """How well the null's scatter is known."""
+        return satterthwaite(self.mixed, self.null)
+
+    def in_blocks(self, columns: Array) -> Array:
+        """(B, m, P) columns (n, P) as the variance components take them."""
+        return columns.reshape(*self.mixed.z.shape, columns.shape[1])
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(B, m, m) of the channel under the null."""
+        return self.mixed.covariance(self.null.variances)
+
+    @cached_property
+    def _half(self) -> Array:
+        """(B, m, m) inverse Cholesky factors of the null's covariance."""
+        return whitener(self.mixed, self.null.variances)
+
+    def whiten(self, columns: Array) -> Array:
+        """(n, P) columns of the channel in units of the null's scatter."""
+        return np.asarray((self._half @ self.in_blocks(columns)).reshape(columns.shape))
+
+    def without(self, effects: Collection[str]) -> Self:
+        """The model in which an arm does not err by some effects of the library, of any size."""
+        own = frozenset(effects) & frozenset({} if self.pose_errors is None else self.pose_errors.effects)
+        if not own or self.pose_errors is None:
+            return self
+        if own not in self._reduced:
+            errors = self.pose_errors.without(own)
+            started = replace(self, mixed=with_errors(self.mixed, errors), pose_errors=errors, whole=self)
+            self._reduced[own] = started.refitted()
+        return self._reduced[own]
+
+    @cached_property
+    def _reduced(self) -> dict[frozenset[str], Self]:
+        """What `without` has found already."""
+        return {}
+
+    def refitted(self) -> Self:
+        """The same with the null fitted anew, from every place where its maximum may lie."""
+        starts = [other.null.variances for other in self.elsewhere]
+        starts += [self.null.variances] if self.whole is None else []
+        begun = [fit_variances(self.mixed, start=start) for start in starts]
+        return replace(self, null=min(begun, key=lambda fit: fit.deviance))
+
+    @cached_property
+    def scatter_only(self) -> Self:
+        """As if poses erred independently from view to view."""
+        if self.pose_errors is None:
+            return self
+        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], scales=None)
+        return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
+
+    @cached_property
+    def elsewhere(self) -> tuple[Self, ...]:
+        """The same at other variances than those of the null, where beside a further effect its maximum may lie: where
+        there is nothing but scatter, as much as without other errors or as much as beside them, and where the whole of
+        the pose errors has them."""
+        if self.pose_errors is None:
+            return ()
+        whole = self.whole or self
+        few = _ABSENT * self.pose_errors.scales**2
+        found = [np.append(own.null.variances[: NOISE + 1], few) for own in (whole.scatter_only, self)]
+        if self.whole is not None and self.whole.pose_errors is not None:
+            own = dict(zip(self.whole.pose_errors.names, self.whole.null.variances[NOISE + 1 :], strict=True))
+            kept = [own[name] for name in self.pose_errors.names]
+            found.append(np.append(self.whole.null.variances[: NOISE + 1], kept))
+        return tuple(replace(self, null=at_variances(self.mixed, variances)) for variances in found)
