@@ -104,6 +104,7 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
     candidate = candidate_of(linear, EFFECTS[effect])
     if candidate is None:
         return None
+    linear = linear.without([effect])
     e, tests = linear.mixed, len(EFFECTS)
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])

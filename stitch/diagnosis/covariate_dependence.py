@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.selection.ranking import Ranked, ranked_all
 from stitch.frames import Array
 from stitch.measurement.views import Views
@@ -28,13 +27,15 @@ class Dependence:
     shape: str  # the empirical form that fits best, in words
 
 
-def dependences(linear: LinearModel, candidates: Sequence[Candidate]) -> list[Dependence]:
+def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
     """The best empirical form of every covariate, clearest first.
 
     Over scatter alone: what follows a covariate may also be an error of the poses that repeats; this says where it is.
     """
-    linear, views = linear.scatter_only, linear.measurement.views
-    empirical = ranked_all(linear, [c for c in candidates if c.empirical])[1]
+    if linear.pose_errors is not None:
+        linear = linear.scatter_only
+        empirical = ranked_all(linear, [r.score.candidate for r in empirical])[1]
+    views = linear.measurement.views
     best: dict[str, Ranked] = {}
     for r in empirical:
         group = r.score.candidate.effect.group

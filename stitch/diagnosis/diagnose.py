@@ -54,7 +54,7 @@ def diagnose_state(state: State) -> Diagnosis:
             translation=float(translation),
             candidates=tuple(examined),
             matrix=matrix,
-            depends_on=tuple(dependences(linear, candidates)),
+            depends_on=tuple(dependences(linear, selection.empirical)),
             next=tuple(propose(linear, selection)),
             missing=missing,
             linear=linear,

@@ -22,12 +22,16 @@ _SEEN = 0.5
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
-_HOPELESS = -1.5
+_HOPELESS = -4.0
+# Under several variances, of which one is nearly that of the maximum, they gain half a nat at the most.
+_HOPELESS_ANYWHERE = -1.5
 # Forms so far (nats) behind the best one of their candidate add less than a per cent to it.
 _FAR = 6.0
 # With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do, and a
 # wide prior in place of that of plausible sizes moves the variances not at all.
 _REFITTED, _AMONG_MANY = 20_000, 2
+# With many components of the pose errors a fit among more numbers than this takes half a second.
+_LONG = 250
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,8 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     seen = any(bool((np.linalg.norm(white, axis=0) > _SEEN).any()) for white in whites if white.size)
     quick = np.array([[_quick(base, at, form) for at in starts] for form in candidate.forms])
     likely = quick.max(axis=1)
-    size = linear.mixed.size
-    few = _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
-    worth = [i for i in np.argsort(-likely, kind="stable")[:few] if likely[i] >= max(_HOPELESS, likely.max() - _FAR)]
+    least = _HOPELESS if base.pose_errors is None else max(_HOPELESS_ANYWHERE, likely.max() - _FAR)
+    worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [
         _try(base, form, starts[int(quick[i].argmax())].null.variances)
         if i in worth and candidate.forms[i].columns.any()
@@ -103,6 +106,14 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     else:
         p, total, values, covariance = p if seen else 1.0, total if seen else 0.0, best.values, best.covariance
     return Score(candidate, seen, form, p, total, values=values, covariance=covariance, beside=_beside(base, best))
+
+
+def _refitted(linear: LinearModel) -> int:
+    """How many forms of a candidate are worth a fit of their own."""
+    size = linear.mixed.size
+    if linear.pose_errors is not None and size > _LONG:
+        return 1
+    return _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
 
 
 def _beside(base: LinearModel, best: _Tried) -> LinearModel | None:

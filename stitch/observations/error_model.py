@@ -15,6 +15,8 @@ from stitch.statistics.variance_prior import NOISE
 
 # A component that is as good as absent, as a share of the variance that it usually has.
 _ABSENT = 1e-2
+# Among more numbers a search takes a second: one from the likeliest start must do.
+_MANY = 250
 
 
 def with_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
@@ -73,9 +75,11 @@ class ErrorModel:
 
     def refitted(self) -> Self:
         """The same with the null fitted anew, from every place where its maximum may lie."""
-        starts = [other.null.variances for other in self.elsewhere]
-        starts += [self.null.variances] if self.whole is None else []
-        begun = [fit_variances(self.mixed, start=start) for start in starts]
+        starts = [other.null for other in self.elsewhere]
+        starts += [at_variances(self.mixed, self.null.variances)] if self.whole is None else []
+        if self.mixed.size > _MANY:
+            starts = [min(starts, key=lambda fit: fit.deviance)]
+        begun = [fit_variances(self.mixed, start=fit.variances) for fit in starts]
         return replace(self, null=min(begun, key=lambda fit: fit.deviance))
 
     @cached_property

@@ -60,6 +60,17 @@ def test_offsets_and_links_move_the_views_as_another_kinematics_says(cell):
             assert np.linalg.norm(x - seen @ (seen.T @ x)) < 2e-3 * np.linalg.norm(x)
 
 
+def test_an_effect_that_is_asked_for_by_name_is_no_error_of_its_own_kind(cell):
+    """Gears without eccentricity are those of two periods a turn; without both there are none."""
+    prior = prior_of(cell)
+    one = prior.without(["gear_eccentricity"])
+    harmonic = prior.effects["gear_harmonic"][1]
+    C = one.components[one.names.index("gears")]
+    np.testing.assert_allclose(C, harmonic @ harmonic.T, atol=1e-12 * np.abs(C).max())
+    assert [n for n in prior.names if n not in one.without(["gear_harmonic"]).names] == ["gears"]
+    np.testing.assert_array_equal(one.components[0], prior.components[0])
+
+
 def test_an_arm_of_one_and_the_same_pose_repeats_what_it_does(cell):
     """Two views of one pose: no component of the arm tells them apart, and what stops share is asked for."""
     measured, measurement, freed = cell

@@ -73,6 +73,7 @@ BAD = {
     "axis": (toml(r"\+z", "up"), ["optical_axis"]),
     "axis as a vector": (toml(r'"\+z"', "[0, 0, 1]"), ["scanner.optical_axis is [0, 0, 1]", '"+z"']),
     "axis that no effect knows": (toml(r"\+z", "-x"), ["scanner.optical_axis is '-x'", "turn the clouds"]),
+    "sensor of no kind": (toml(r'"\+z"', '"+z"\nkind = "laser"'), ["kind is 'laser'", "'tracker'"]),
     "gravity in words": (table('[robot]\njoints = [{ a = 1 }]\ngravity = "down"'), ["session.toml", "gravity is 'down'"]),
     "URDF that is no name": (table("[robot]\nurdf = 5"), ["session.toml", "robot.urdf is 5"]),
     "link that is no name": (table('[robot]\nurdf = "r.urdf"\nflange_link = ["a"]'), ["robot.flange_link is ['a']"]),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.statistics.folds import grouped_folds, joint_ends
+from stitch.statistics.folds import grouped_folds, halves_of, joint_ends
 
 
 def test_ends_of_joints_are_fifths_of_what_was_driven():
@@ -24,3 +24,16 @@ def test_folds_leave_out_neighbours():
     assert sorted(np.concatenate(folds[:5])) == list(range(20))
     assert all(np.ptp(f) == 3 for f in folds[:5])  # four in a row by time
     assert all(len(set(T[f, 0, 3])) == 1 for f in folds[5:])  # one place each by pose
+
+
+def test_halves_share_no_view_and_leave_out_none():
+    T = np.tile(np.eye(4), (13, 1, 1))
+    T[:, 0, 3] = np.random.default_rng(0).permutation(13) * 100.0
+    in_time, by_place, alternately = halves_of(T, 100.0)
+    for one, other in (in_time, by_place, alternately):
+        assert sorted([*one, *other]) == list(range(13)) and abs(len(one) - len(other)) == 1
+    assert in_time[0].max() < in_time[1].min()
+    # One half lies beyond the other, whichever way round.
+    x = [T[half, 0, 3] for half in by_place]
+    assert x[0].max() < x[1].min() or x[1].max() < x[0].min()
+    assert set(alternately[0] % 2) == {0} and set(alternately[1] % 2) == {1}

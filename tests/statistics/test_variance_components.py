@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from stitch.statistics.inverse import inverted
 from stitch.statistics.variance_components import MixedModel, at_variances, deviance_slope, fit_variances
 
 
@@ -73,3 +74,12 @@ def test_variances_beyond_all_numbers_are_as_unlikely_as_nothing_else():
     for log_variance in (800.0, np.nan):
         deviance, slope = deviance_slope(np.array([log_variance]), mixed)
         assert deviance == 1e300 and not slope.any()
+
+
+def test_one_block_is_inverted_as_many_are():
+    half = np.random.default_rng(4).normal(size=(2, 7, 7))
+    V = half @ half.transpose(0, 2, 1) + np.eye(7)
+    inverse, logdet = inverted(V[:1])
+    assert np.allclose(inverse[0] @ V[0], np.eye(7), atol=1e-12)
+    assert logdet + inverted(V[1:])[1] == pytest.approx(inverted(V)[1])
+    assert inverted(-V[:1])[1] == np.inf

@@ -6,6 +6,7 @@ the other's part: then the smallest set is sought without which the views cannot
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import score
@@ -20,8 +21,19 @@ def contest(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ran
     base = linear.without([r.name for r in contenders])
     if len(contenders) < 2 or base is linear:
         return list(contenders), base
-    again = rank([score(base, r.score.candidate) for r in contenders], tests=len(contenders))[0]
-    return list(again), base
+    return sorted((rescored(base, r) for r in contenders), key=lambda r: -r.log_posterior), base
+
+
+def rescored(base: LinearModel, ranked: Ranked) -> Ranked:
+    """The same candidate with its score in another model; it counts among as many as before."""
+    own = score(base, ranked.score.candidate)
+    family = ranked.adjusted / max(ranked.score.p_value, 1e-300)
+    return replace(
+        ranked,
+        score=own,
+        adjusted=min(1.0, own.p_value * family),
+        log_posterior=ranked.log_posterior + own.log_bayes_factor - ranked.score.log_bayes_factor,
+    )
 
 
 def wanted_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
@@ -31,6 +43,9 @@ def wanted_group(linear: LinearModel, candidates: Sequence[Candidate], tests: in
         tests: candidates among which the best is chosen.
     """
     families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
+    if not families or linear.without(families).null.deviance < linear.null.deviance:
+        # No error of joints or links helps: none stands in for another.
+        return ()
     known = {c.name: c for c in candidates if not c.empirical}
     ranked = rank([score(linear.without(families), c) for c in known.values()], tests)[0]
     best = next((r for r in ranked if certain(r)), None)

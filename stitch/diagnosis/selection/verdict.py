@@ -7,10 +7,9 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
-from stitch.diagnosis.score import score
 from stitch.diagnosis.selection.forward_selection import forward_selection
-from stitch.diagnosis.selection.inclusion import contest, wanted_group
-from stitch.diagnosis.selection.ranking import Ranked, certain, contends, rank, ranked_all, ranked_one
+from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
+from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     BEYOND_CHANCE,
@@ -56,7 +55,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if not contenders:
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
-    stray = _beside(base, stray, best)
+    stray = stray and rescored(base, stray)
     if linear.measurement.views.count >= MANY_VIEWS:
         found = forward_selection(linear, candidates, best)
         refused = found.refused
@@ -82,14 +81,6 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
     verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
     return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
-
-
-def _beside(base: LinearModel, stray: Ranked | None, best: Ranked) -> Ranked | None:
-    """A shape without a cause against the same errors as the best candidate."""
-    if stray is None or base.pose_errors is None:
-        return stray
-    scores = [score(base, r.score.candidate) for r in (stray, best)]
-    return rank(scores, tests=1)[1][0] if scores[0].observable else None
 
 
 def _stray(empirical: Sequence[Ranked]) -> Ranked | None:

@@ -26,6 +26,9 @@ from stitch.statistics.variance_components import fit_variances
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
 _UNSEEN = 0.25
+# Scoring every candidate beside all errors that poses may have takes a minute for so many views; there poses count as
+# scattering independently, and effects are sought several at once.
+_MOST_VIEWS = 100
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,10 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
     seen = independent(own, further, sizes, _UNSEEN)
     mixed = replace(mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
     design = np.hstack([jacobian(frames_of_mount, g.centre), extra[:, seen]])
-    errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
-    mixed = with_errors(mixed, errors)
+    errors = None
+    if measurement.views.count < _MOST_VIEWS:
+        errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
+        mixed = with_errors(mixed, errors)
     null = fit_variances(mixed, both_starts=True)
     return LinearModel(
         measurement, model, Surfaces(capture, freed, channel), design, mixed=mixed, null=null, pose_errors=errors

@@ -1,0 +1,36 @@
+"""What may be asked of a session follows its sensor."""
+
+from dataclasses import replace
+
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.effects.contract import EFFECTS
+from stitch.effects.in_session import lacking, require
+from stitch.errors import InputError
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import measurement_of
+
+SENSOR = {name for name, e in EFFECTS.items() if e.place == "sensor" and e.tier == "physical"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "never"),
+    [
+        (None, set()),
+        ("area", set()),
+        ("line", set()),
+        ("camera", {"incidence_bias", "intensity_bias"}),
+        ("tracker", SENSOR),
+        ("probe", SENSOR),
+    ],
+)
+def test_a_tracker_has_no_lens_and_a_camera_sees_no_slant(kind, never):
+    session, *_ = labelled_cell(2, views=4)
+    session = replace(session, scanner=replace(session.scanner, kind=kind))
+    measurement = measurement_of(session, capture(session))
+    words = {"optics", "surfaces"}
+    assert {name for name in SENSOR if words & set(lacking(measurement, EFFECTS[name]))} == never
+    if kind == "tracker":
+        with pytest.raises(InputError, match=r"lens_distortion needs a sensor with optics .*\[scanner\]"):
+            require(measurement, EFFECTS["lens_distortion"])
