@@ -32,7 +32,7 @@ class ErrorModel:
     mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
     null: VarianceFit  # fitted without further columns
     pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
-    whole: Self | None = None  # the one that this was taken from, where some pose errors are left out
+    whole: "ErrorModel | None" = None  # the one that this was taken from, where some pose errors are left out
 
     @cached_property
     def satterthwaite(self) -> Satterthwaite:
@@ -99,7 +99,7 @@ class ErrorModel:
             return ()
         whole = self.whole or self
         few = _ABSENT * self.pose_errors.scales**2
-        found = [np.append(own.null.variances[: NOISE + 1], few) for own in (whole.scatter_only, self)]
+        found = [np.append(null.variances[: NOISE + 1], few) for null in (whole.scatter_only.null, self.null)]
         if self.whole is not None and self.whole.pose_errors is not None:
             own = dict(zip(self.whole.pose_errors.names, self.whole.null.variances[NOISE + 1 :], strict=True))
             kept = [own[name] for name in self.pose_errors.names]

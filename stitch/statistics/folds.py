@@ -62,7 +62,8 @@ def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Ind
     # Along the direction in which the poses differ most.
     along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
     orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
-    return [tuple(np.sort(half) for half in np.array_split(order, 2)) for order in orders]
+    halves = [np.array_split(order, 2) for order in orders]
+    return [(np.sort(first), np.sort(second)) for first, second in halves]
 
 
 def places(T_reference_mount: Array, lever: float) -> list[Indices]:
