@@ -56,6 +56,7 @@ def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     assert linear.pose_errors is not None and linear.mixed.scales is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     every = np.append(np.ones(NOISE + 1, bool), keep)
-    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=linear.mixed.scales[keep])
-    plain = np.append(linear.scatter_only.null.variances, 1e-2 * mixed.scales**2)
+    scales = linear.mixed.scales[keep]
+    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=scales)
+    plain = np.append(linear.scatter_only.null.variances, 1e-2 * scales**2)
     return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))

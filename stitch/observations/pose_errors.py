@@ -99,8 +99,8 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
             members |= {e.name: (name, columns) for e, columns in zip(effects, own, strict=True)}
             found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM)
         constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
-        own = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
-        found["smooth"] = (spread_over(own, alike_in_joints(joints)), _SMOOTH)
+        links = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
+        found["smooth"] = (spread_over(links, alike_in_joints(joints)), _SMOOTH)
     flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
     halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
     unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}

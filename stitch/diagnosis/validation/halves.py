@@ -53,7 +53,7 @@ class _Seen:
     def fitted(self, prior: Array) -> tuple[Array, Array]:
         """Mean (p,) and precision (p, p) with a prior (p,) around zero."""
         precision = self.information + np.diag(prior**-2)
-        return np.linalg.solve(precision, self.vector), precision
+        return np.asarray(np.linalg.solve(precision, self.vector), float), precision
 
 
 def halves(scored: Score) -> Halves | None:
