@@ -43,7 +43,9 @@ def diagnose_state(state: State) -> Diagnosis:
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
-        rotation, translation = np.sqrt(linear.null.variances[:2])
+        unnamed = unnamed_errors(linear) if selection.verdict == "unknown_effect" else ()
+        # Where it is said what repeats, scatter is the rest; else all of it.
+        rotation, translation = np.sqrt((linear if unnamed else linear.scatter_only).null.variances[:2])
         found = Diagnosis(
             verdict=selection.verdict,
             effects=tuple(r.name for r in selection.named),
@@ -61,7 +63,7 @@ def diagnose_state(state: State) -> Diagnosis:
             notes=notes,
             scatter_limit=limit,
             implausible=implausible(linear, limit),
-            unnamed=unnamed_errors(linear) if selection.verdict == "unknown_effect" else (),
+            unnamed=unnamed,
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))

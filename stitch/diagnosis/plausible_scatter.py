@@ -41,8 +41,10 @@ def scatter_limit(session: Session) -> ScatterLimit:
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
     """True if the poses scatter as no arm does, or by more than is stated and chance explains.
 
-    An estimated variance of ν degrees of freedom exceeds a stated one by χ²(ν)/ν at most.
+    All of it counts, what repeats too: the views may not tell which it is. An estimated variance of ν degrees of
+    freedom exceeds a stated one by χ²(ν)/ν at most.
     """
+    linear = linear.scatter_only
     for i, (allowed, stated) in enumerate(
         ((limit.rotation, limit.rotation_stated), (limit.translation, limit.translation_stated))
     ):

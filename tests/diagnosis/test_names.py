@@ -14,7 +14,6 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
@@ -69,10 +68,9 @@ def test_an_offset_of_one_joint_is_named(cell):
 
 
 def test_poses_that_wander_get_no_name(cell):
-    """0.2 mm and 0.2 mrad that every view hands on to the next: no drift, no slip, no growth."""
+    """0.6 mm and 0.6 mrad that every view hands on to the next: no drift, no settling, no growth."""
     measured, *_ = cell
     for seed in range(2):
-        wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([2e-4, 0.2], 3)
-        found, linear = said_of(cell, measured.T_base_flange @ frames.exp(wander))
+        wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([6e-4, 0.6], 3)
+        found, _ = said_of(cell, measured.T_base_flange @ frames.exp(wander))
         assert found.verdict == "unknown_effect" and not found.named
-        assert unnamed_errors(linear)[0].words == "wander in time"
