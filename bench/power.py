@@ -15,10 +15,9 @@ from blind_cells import drawn, smallest
 from blind_trials import LIBRARY, cell_without, pin
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
-from stitch.diagnosis.selection.verdict import select, validated
+from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
@@ -26,11 +25,7 @@ from stitch.statistics.variance_components import fit_variances
 
 def verdict(linear: LinearModel, candidates: list[Candidate]) -> str:
     """As `diagnose` judges, less what it says about it."""
-    limit = ScatterLimit(*IMPLAUSIBLE)
-    selection = select(linear, candidates, limit)
-    asked = {r.name: r for r in (*selection.named, selection.second) if r is not None}
-    left_out = {name: cross_validate(linear, r.score) for name, r in asked.items()}
-    return validated(selection, left_out, implausible(linear, limit))[0].verdict
+    return concluded(linear, candidates, ScatterLimit(*IMPLAUSIBLE)).verdict
 
 
 def redrawn(linear: LinearModel, shift: Array, rng: np.random.Generator) -> LinearModel:
