@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.score import Score
+from stitch.diagnosis.score import Score, score
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel, Trial
 
@@ -29,15 +29,40 @@ class CrossValidation:
 
 
 def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
-    """Add the best form of a candidate to the model, in the linear approximation."""
-    linear = scored.beside or linear
-    X, points = np.hstack([linear.design, scored.form.response]), scored.candidate.points
+    """Add the best form of a candidate to the model, in the linear approximation.
+
+    What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
+    are predicted, beside everything else that poses may err by.
+    """
+    fitted = linear.scatter_only
+    added = scored if linear.pose_errors is None else score(fitted, scored.candidate)
+    whole, shares, weights, _ = _left_out(fitted, added)
+    beside = scored.beside or linear
+    trial, *_, scatter = _left_out(beside, scored)
+    poses, poses_sigma = share_of(*scatter)
+    present = fitted.present
+    return CrossValidation(
+        inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
+        heldout=float(np.average(shares, weights=weights)),
+        poses=poses,
+        poses_sigma=poses_sigma,
+        steadiness=_steadiness(beside, trial, _columns(beside, scored), trial.solve()),
+    )
+
+
+def _columns(linear: LinearModel, scored: Score) -> Array:
+    """(·, a + k) response to the model and the candidate."""
+    return np.hstack([linear.design, scored.form.response])
+
+
+def _left_out(linear: LinearModel, scored: Score) -> tuple[Trial, list[float], list[float], Array]:
+    """The fit with a candidate; per fold the share of its squares that a fit without it leaves, their weights, and
+    (2, G) scatter of its poses."""
+    X, points = _columns(linear, scored), scored.candidate.points
     own = None if points is None else points.of(scored.form.keep)
     trial, present = linear.trial(X, own), linear.present
     believed = linear.trial(X, own, believed_size(linear, scored))
-    whole = trial.solve()
-    shares, weights = [], []
-    scatter = np.zeros((2, 0))
+    shares, weights, scatter = [], [], np.zeros((2, 0))
     for fold in linear.observation.folds():
         touched = linear.observation.touched(fold)
         without = [t.solve(fold) for t in (believed, present)]
@@ -46,14 +71,7 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
         weights.append(squares[1])
         off = [t.scatter(fold, x) for t, x in zip((trial, present), without, strict=True)]
         scatter = np.column_stack([scatter, off])
-    poses, poses_sigma = share_of(*scatter)
-    return CrossValidation(
-        inside=float(trial.squares(whole).sum() / present.squares(present.solve()).sum()),
-        heldout=float(np.average(shares, weights=weights)),
-        poses=poses,
-        poses_sigma=poses_sigma,
-        steadiness=_steadiness(linear, trial, X, whole),
-    )
+    return trial, shares, weights, scatter
 
 
 def believed_size(linear: LinearModel, scored: Score) -> Array:
