@@ -70,7 +70,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         more = 0.0 if second is None else second.score.log_bayes_factor + np.log(PRIOR_PHYSICAL / len(ranked))
         if stray.log_posterior > best.log_posterior + more + ODDS:
             return unknown
-    if _order_open(best, empirical):
+    if _order_open(base, best, empirical):
         return unknown
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
     others = (r for r in likely if r.name != best.name and r.name not in refused)
@@ -135,10 +135,12 @@ def _refused(
     return None if objection is None else (otherwise, objection)
 
 
-def _order_open(best: Ranked, empirical: Sequence[Ranked]) -> bool:
+def _order_open(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) -> bool:
     """True for a gear error that over so short a range may be one of an order without a name."""
-    near = (r.name for r in empirical if r.log_posterior > best.log_posterior - ODDS)
-    return best.name in _GEARS and any(name.startswith(_NAMELESS_ORDERS) for name in near)
+    nameless = [r for r in empirical if r.name.startswith(_NAMELESS_ORDERS)] if best.name in _GEARS else []
+    if base.pose_errors is not None:
+        nameless = [rescored(base, r) for r in nameless]
+    return any(r.log_posterior > best.log_posterior - ODDS for r in nameless)
 
 
 def _both(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked] | None:
