@@ -8,6 +8,9 @@ from stitch.frames import Array
 
 def inverted(V: Array) -> tuple[Array, float]:
     """(B, m, m) inverse of a covariance, and log det; infinite where it has none."""
+    # A search or a leap that ran away ends among infinite variances.
+    if not np.isfinite(V).all():
+        return V, np.inf
     if len(V) > 1:
         try:
             L = np.linalg.cholesky(V)

@@ -85,8 +85,8 @@ def fit_variances(
     scattered = np.arange(len(first)) != NOISE
     begin = [first, first - 9.0 * scattered] if both_starts else [first]
     centre = np.log(usual_variances(mixed.z, mixed.components))
-    flat = _FLAT if start is None or mixed.scales is None else _FLAT_BEGUN
-    flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else flat
+    few = _FLAT if start is None or mixed.scales is None else _FLAT_BEGUN
+    flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else few
     bounds = [(c - _SPAN[0], c + _SPAN[1]) if s else _FACTORS for c, s in zip(centre, scattered, strict=True)]
     present = np.einsum("cbii->c", mixed.components) > 0
     bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
@@ -103,8 +103,7 @@ def at_variances(
     """The same without searching: mean, covariance and deviance for given variances (c,)."""
     problem = _problem(mixed, G, prior)
     deviance, _ = _deviance(np.log(np.maximum(variances, _ABSENT)), problem)
-    V = mixed.covariance(variances)
-    X = problem.X
+    V, X = mixed.covariance(variances), problem.X
     weighted = np.linalg.solve(V, np.concatenate([X, mixed.z[..., None]], axis=2))
     M = _summed(X, weighted[..., :-1]) + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
@@ -146,11 +145,9 @@ def _problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> _Proble
 def _deviance(log_variances: Array, problem: _Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     with np.errstate(over="ignore"):
-        variances = np.exp(log_variances)
-    mixed = problem.mixed
+        mixed, variances = problem.mixed, np.exp(log_variances)
     inverse, logdet = inverted(mixed.covariance(variances))
-    # A leap that ran away ends among infinite variances: nothing is as unlikely.
-    if not (np.isfinite(logdet) and np.isfinite(inverse).all()):
+    if not np.isfinite(logdet):
         return 1e300, np.zeros(len(variances))
     WX = inverse @ problem.X
     M = _summed(problem.X, WX) + np.diag(problem.precision)
