@@ -7,11 +7,13 @@ pictures.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -77,6 +79,16 @@ def memory(process: subprocess.Popen[str]) -> str:
         return "memory unknown"
     sizes = {line.split(":")[0]: int(line.split()[1]) / 1e3 for line in status.splitlines() if line.startswith("Vm")}
     return f"{sizes['VmRSS']:.0f} MB, {sizes['VmHWM']:.0f} MB at most"
+
+
+def choices(address: str, process: subprocess.Popen[str]) -> None:
+    """What the fields of everything, of a view and of a place cost the server."""
+    for choice in ({}, {"views": ["v003"]}, {"place": [0.0, 0.0, 0.0], "within": 50.0}):
+        before = processor_seconds(process)
+        asked = urllib.request.Request(f"{address}chosen", json.dumps(choice).encode(), method="POST")
+        told = json.load(urllib.request.urlopen(asked))["chosen"]
+        cost = processor_seconds(process) - before
+        print(f"choice {choice}: rms {told['rms'] or 0:.1f} µm, {cost:.2f} s of one core; {memory(process)}")
 
 
 class Camera:
@@ -187,6 +199,8 @@ def main() -> None:
         with served(folder / "run") as (address, process):
             page = browser.new_page(viewport=WIDE)
             camera = Camera(page, keep=given.session is None)
+            if given.session is None:
+                choices(address, process)
             page.goto(address)
             story(camera, given.effect)
             print(memory(process))
