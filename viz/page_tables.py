@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.comparison.model_history import ModelHistory
+from stitch.comparison.model_history import ModelHistory, change_of
 from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, rounded
@@ -66,6 +66,19 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
+    ]
+
+
+def note_rows(run: Run) -> list[dict[str, str]]:
+    """What reviewers remarked on the steps of the ledger."""
+    return [
+        {
+            "step": change_of(run.ledger, i),
+            "text": note.text,
+            "signed": ", ".join(x for x in (note.by, note.at[:10]) if x),
+        }
+        for i, step in enumerate(run.ledger)
+        for note in step.notes
     ]
 
 

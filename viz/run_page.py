@@ -14,7 +14,7 @@ from viz.filled_templates import render, script_json
 from viz.history_figures import waterfall
 from viz.identity import identity
 from viz.page_parts import png, svg
-from viz.page_tables import effect_rows, hand_eye_rows, matrix, target_rows, view_rows
+from viz.page_tables import effect_rows, hand_eye_rows, matrix, note_rows, target_rows, view_rows
 from viz.part_camera import camera_for
 from viz.part_data import part_data
 from viz.part_picture import part_picture
@@ -54,6 +54,7 @@ def _content(run: Run, tolerance: float | None) -> dict[str, object]:
         "effects": effect_rows(run),
         "waterfall": (svg(waterfall(run.ledger, unit)), captions.WATERFALL) if len(run.ledger) > 1 else None,
         "steps": [] if history is None else history.steps,
+        "notes": note_rows(run),
         "pictures": _pictures(run),
         "targets": target_rows(run),
     }

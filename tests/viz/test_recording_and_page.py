@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
 from stitch.comparison.model_history import model_history
+from stitch.runs.run import Note
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
 from viz.run_page import write_report
@@ -87,11 +88,14 @@ def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp
 
 def test_page_needs_nothing_beside_it_and_says_everything(recorded, tmp_path):
     result, _ = recorded
-    write_report(replace(result, unobservable=("translation along the axis of joint 6",)), tmp_path / "r.html")
+    noted = replace(result.ledger[-1], notes=(Note("2026-03-01T10:00:00+00:00", "Q", "clamp <loose>"),))
+    told = replace(result, unobservable=("translation along the axis of joint 6",), ledger=(*result.ledger[:-1], noted))
+    write_report(told, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)
     assert "blade &lt;1&gt;" in page
     assert "translation along the axis of joint 6" in page
+    assert re.search(r"<b>hand-eye alone</b>: clamp &lt;loose&gt; <span>\(Q, 2026-03-01\)</span>", page)
     assert all(view.name in page for view in result.session.views)
     assert all(f"<td>{stage.name}</td>" in page for stage in result.stages)
 
