@@ -89,7 +89,7 @@ def first_session(folder: Path, stated: Stated) -> FirstSession:
     axis, axis_guess = optical_axis(clouds)
     told = guesses_of(found, raw, decided, points, own_units, stated)
     guesses = (*told, settled.guess, axis_guess, *of_targets)
-    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, seen)
+    return FirstSession(found, raw, own_units[0], decided, settled, guesses, optical_axis=axis, sightings=seen)
 
 
 def _raw(found: Found) -> RawPoses:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
+from stitch.integrity.left_alone import left_alone
 from stitch.integrity.view_test import Projector, Test, ViewModel, projector, test
-from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import VarianceFit
 
 # Chance that a session without blunders loses a view.
@@ -81,23 +81,11 @@ def off_anyway(model: ViewModel, alone: Sequence[int], unlinked: Sequence[int]) 
     out = []
     for v in unlinked:
         beside = model.columns([*alone, *(w for w in unlinked if w != v)])
-        tested, p = _left_alone(model, beside, v)
+        tested, p = left_alone(model, beside, v)
         p = min(1.0, model.count * p)
         if p < FAMILY_WISE:
             out.append(Blunder(v, tested, p))
     return out
-
-
-def _left_alone(model: ViewModel, columns: Array | None, view: int) -> tuple[Test, float]:
-    """One view tested under the scatter that all others have without it, and the chance of that.
-
-    One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
-    of a scatter taken from the rest: half of them count.
-    """
-    under = projector(model, model.fit(_beside(columns, model.views[view])), columns)
-    tested = test(under, model.views[view])
-    free = max((under.degrees - tested.degrees) // 2, 1)
-    return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
 
 
 def _rosner(model: ViewModel, first: Array | None, alone: Sequence[int]) -> Found:
@@ -116,7 +104,7 @@ def _rosner(model: ViewModel, first: Array | None, alone: Sequence[int]) -> Foun
         tests = {v: test(under, model.views[v]) for v in rest}
         likely = sorted(rest, key=lambda v: (tests[v].p_value, -tests[v].statistic))[:_LEFT_ALONE]
         # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
-        chance = {v: min(tests[v].p_value, _left_alone(model, columns, v)[1]) for v in likely}
+        chance = {v: min(tests[v].p_value, left_alone(model, columns, v)[1]) for v in likely}
         worst = min(likely, key=lambda v: chance[v])
         p = min(1.0, chance[worst] * len(rest))
         freed.append(Blunder(worst, tests[worst], p))

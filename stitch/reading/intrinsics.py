@@ -108,7 +108,9 @@ def _of(file: Path, level: dict[str, Any]) -> Intrinsics | None:
         )
     width, height = (_whole(level, *names) for names in (("width", "image_width"), ("height", "image_height")))
     size = None if width is None or height is None else (width, height)
-    return Intrinsics(file, fx, fy, cx, cy, _distortion(level), size, _units_per_metre(file, level))
+    return Intrinsics(
+        file, fx, fy, cx, cy, distortion=_distortion(level), size=size, units_per_metre=_units_per_metre(file, level)
+    )
 
 
 def _matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:

@@ -1,0 +1,20 @@
+"""One view tested under the scatter that the others have without it: it cannot hide in what it inflates itself."""
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.integrity.view_test import Test, ViewModel, projector, test
+from stitch.statistics.tails import f_tail
+
+
+def left_alone(model: ViewModel, columns: Array | None, view: int) -> tuple[Test, float]:
+    """One view tested under the scatter that all others have without it, and the chance of that.
+
+    One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
+    of a scatter taken from the rest: half of them count.
+    """
+    own = model.views[view]
+    under = projector(model, model.fit(own if columns is None else np.column_stack([columns, own])), columns)
+    tested = test(under, own)
+    free = max((under.degrees - tested.degrees) // 2, 1)
+    return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
