@@ -13,6 +13,8 @@ from stitch import frames
 from stitch.cells.window.seam import Station
 from stitch.cli.main import main
 
+# Half a minute; the pieces of the line have tests of their own.
+pytestmark = pytest.mark.slow
 # A door of half the size: the same shapes, a quarter of the triangles.
 DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
 # A bulge that is 3 mm deep in the body and not in its CAD.

@@ -88,6 +88,7 @@ def test_offset_of_the_first_joint_is_never_named_where_the_hand_eye_hides_it():
     assert np.isnan(sigmas[5])
 
 
+@pytest.mark.slow
 def test_turning_the_last_joint_alone_names_nothing():
     measured = measured_blade(
         4, views=10, pixels=90, tilt=0.0, roll=0.0, aim=0.0, distance=0.0, hidden={"joint_offset": 3.0}
@@ -96,6 +97,7 @@ def test_turning_the_last_joint_alone_names_nothing():
     assert found.verdict in ("adequate", "cannot_tell")
 
 
+@pytest.mark.slow
 def test_prediction_of_the_null_is_the_present_residual():
     _, result = blade_run(6, {})
     linear = linear_model_of(state_of(result))

@@ -76,6 +76,7 @@ def test_poses_that_contradict_all_scans_are_refused(good):
         run(replace(good, views=tuple(views), robot=None))
 
 
+@pytest.mark.slow
 def test_a_model_of_another_mount_is_refused(good):
     found = run(good)
     T = found.T_mount @ frames.exp(np.array([0, 0, 0, 50.0, 0, 0]))

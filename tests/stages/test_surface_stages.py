@@ -87,6 +87,7 @@ def test_perfect_poses_leave_the_noise_that_was_put_in():
     assert found.overlaps[0].gram.rms == pytest.approx(truth.gram.rms, rel=0.03)
 
 
+@pytest.mark.slow
 def test_several_captures_share_one_hand_eye():
     """Two sessions of one rig know the hand-eye better than either."""
     cells = [captured_blade(seed, views=8, spread=(0.0, 0.0)) for seed in (3, 4)]

@@ -100,6 +100,7 @@ NAMELESS = """() => [...document.querySelectorAll("button, input, select, textar
     && !(e.labels && e.labels.length)).map(e => e.outerHTML.slice(0, 200))"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colours", ["light", "dark"])
 def test_everybody_can_read_and_reach_it(browser, address, colours):
     story = Story(browser, address, color_scheme=colours)

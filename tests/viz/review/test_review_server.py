@@ -111,6 +111,7 @@ def test_numbers_of_a_choice_are_those_of_the_tables(server, run):
     assert nothing["correspondences"] == 0
 
 
+@pytest.mark.slow
 def test_two_pages_hear_the_same_and_a_stale_one_changes_nothing(server, run, stitch_command):
     pages, before = [server.listen(), server.listen()], server.state()
     status, job = server.post("jobs", {"kind": "add", "effects": ["range_scale"], "model": before["model"]})
@@ -156,7 +157,7 @@ def test_own_python_is_checked_by_a_command_and_its_fault_told_in_a_line(server,
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds the fit's process by Linux's /proc")
-@pytest.mark.parametrize("how", ["stopped", "killed"])
+@pytest.mark.parametrize("how", [pytest.param("stopped", marks=pytest.mark.slow), "killed"])
 def test_a_fit_that_is_ended_leaves_the_run_as_it_was(server, run, how):
     page, before = server.listen(), server.state()
     kept = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
