@@ -13,7 +13,7 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.integrity.left_alone import left_alone
-from stitch.integrity.view_test import Projector, Test, ViewModel, projector, test
+from stitch.integrity.view_test import Projector, Test, ViewModel, beside, projector, test
 from stitch.statistics.variance_components import VarianceFit
 
 # Chance that a session without blunders loses a view.
@@ -71,7 +71,7 @@ def find_blunders(model: ViewModel, alone: Sequence[int] = ()) -> Found:
     block = _block(model, first, plain)
     if block is None:
         return plain
-    columns = _beside(first, _block_columns(model, block.start, block.what))
+    columns = beside(first, _block_columns(model, block.start, block.what))
     with_block = _rosner(model, columns, alone)
     return Found(with_block.blunders, block, with_block.fit, with_block.further, with_block.under)
 
@@ -110,7 +110,7 @@ def _rosner(model: ViewModel, first: Array | None, alone: Sequence[int]) -> Foun
         freed.append(Blunder(worst, tests[worst], p))
         if p < FAMILY_WISE:
             significant = len(freed)
-        columns = _beside(columns, model.views[worst])
+        columns = beside(columns, model.views[worst])
     fit, columns, under = states[significant]
     return Found(tuple(freed[:significant]), None, fit, columns, under)
 
@@ -128,10 +128,10 @@ def _block(model: ViewModel, first: Array | None, plain: Found) -> Block | None:
         for what in ("part", "scanner")
     }
     k, what = max(tried, key=lambda key: tried[key].statistic)
-    both = [_likelihood(model, _beside(first, _block_columns(model, k, w))) for w in ("part", "scanner")]
+    both = [_likelihood(model, beside(first, _block_columns(model, k, w))) for w in ("part", "scanner")]
     what = "part" if both[0][0] <= both[1][0] else "scanner"
     deviance, fit = both[0 if what == "part" else 1]
-    drift = min(_likelihood(model, _beside(first, c))[0] for c in _drifts(model))
+    drift = min(_likelihood(model, beside(first, c))[0] for c in _drifts(model))
     singles, _ = _likelihood(model, plain.further)
     # Every single blunder takes six numbers of its own: by Akaike's rule each must earn two.
     alone = singles + 12 * max(len(plain.blunders) - 1, 0)
@@ -163,9 +163,3 @@ def _drifts(model: ViewModel) -> list[Array]:
     """(n, 6) each: part or scanner moves in proportion to the number of the view."""
     order = np.linspace(-1, 1, model.count)[:, None, None]
     return [np.asarray((order * columns).sum(axis=0)) for columns in (model.views, model.mounts)]
-
-
-def _beside(columns: Array | None, more: Array | None) -> Array | None:
-    if columns is None or more is None:
-        return more if columns is None else columns
-    return np.column_stack([columns, more])

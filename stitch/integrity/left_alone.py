@@ -1,9 +1,7 @@
 """One view tested under the scatter that the others have without it: it cannot hide in what it inflates itself."""
 
-import numpy as np
-
 from stitch.frames import Array
-from stitch.integrity.view_test import Test, ViewModel, projector, test
+from stitch.integrity.view_test import Test, ViewModel, beside, projector, test
 from stitch.statistics.tails import f_tail
 
 
@@ -14,7 +12,7 @@ def left_alone(model: ViewModel, columns: Array | None, view: int) -> tuple[Test
     of a scatter taken from the rest: half of them count.
     """
     own = model.views[view]
-    under = projector(model, model.fit(own if columns is None else np.column_stack([columns, own])), columns)
+    under = projector(model, model.fit(beside(columns, own)), columns)
     tested = test(under, own)
     free = max((under.degrees - tested.degrees) // 2, 1)
     return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)

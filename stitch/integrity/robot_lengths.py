@@ -4,7 +4,7 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.integrity.problems import Problem
-from stitch.integrity.view_test import ViewModel, projector, test
+from stitch.integrity.view_test import ViewModel, beside, projector, test
 
 # No scanner in use is off by this share of its lengths, and no arm.
 _SCALE = 0.01
@@ -19,8 +19,7 @@ def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | 
         T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
     """
     column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
-    beside = column if further is None else np.column_stack([further, column])
-    found = test(projector(model, model.fit(beside), further), column)
+    found = test(projector(model, model.fit(beside(further, column)), further), column)
     share = float(found.estimate[0])
     if abs(share) < _SCALE or found.p_value > _CHANCE:
         return None

@@ -105,6 +105,11 @@ def view_model(capture: Capture, T_mount: Array, freed: FreePoses) -> ViewModel:
     )
 
 
+def beside(columns: Array | None, more: Array) -> Array:
+    """(n, ·) columns with more of them, where there are any."""
+    return more if columns is None else np.column_stack([columns, more])
+
+
 @dataclass(frozen=True)
 class Projector:
     """P of one null hypothesis: a fitted covariance and a free mean."""

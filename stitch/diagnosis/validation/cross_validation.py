@@ -35,10 +35,11 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     are predicted, beside everything else that poses may err by.
     """
     fitted = linear.scatter_only
-    added = scored if linear.pose_errors is None else score(fitted, scored.candidate)
-    whole, shares, weights, _ = _left_out(fitted, added)
     beside = scored.beside or linear
-    trial, *_, scatter = _left_out(beside, scored)
+    trial, shares, weights, scatter = _left_out(beside, scored)
+    whole = trial
+    if beside is not fitted:
+        whole, shares, weights, _ = _left_out(fitted, score(fitted, scored.candidate))
     poses, poses_sigma = share_of(*scatter)
     present = fitted.present
     return CrossValidation(
