@@ -12,10 +12,9 @@ from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
-from stitch.model.bound import in_unit
+from stitch.model.bound import bound, in_unit
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
-from stitch.model.term import Term
 from stitch.runs.recorder import Recorder, Silent
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
@@ -31,18 +30,20 @@ def run(
     recorder: Recorder | None = None,
     effects: Sequence[str] = (),
     keep: bool = False,
+    arm: ModelFile | None = None,
 ) -> Run:
     """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
 
     Args:
         effects: names of effects to fit together with the hand-eye.
+        arm: effects of joints and links that stay as they are, while everything else is fitted.
         keep: fuse also the views that do not belong.
 
     Raises:
         InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
-    return run_rig([session], model, [recorder or Silent()], effects, keep)[0]
+    return run_rig([session], model, [recorder or Silent()], effects, keep, arm)[0]
 
 
 def run_rig(
@@ -51,6 +52,7 @@ def run_rig(
     recorders: Sequence[Recorder] | None = None,
     effects: Sequence[str] = (),
     keep: bool = False,
+    arm: ModelFile | None = None,
 ) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
     require_same_rig(sessions, model)
@@ -62,7 +64,8 @@ def run_rig(
         measurements = [measurement_of(session, capture(session)) for session in sessions]
         effects = list(dict.fromkeys(effects))
         model = in_unit(model, sessions[0].length_unit) if model else None
-        require_effects(measurements, [*effects, *(model.effects if model else ())])
+        arm = in_unit(arm, sessions[0].length_unit) if arm else None
+        require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         begun = kind.start(sessions, measurements, model)
         measurements = [about_part(m, begun.T_mount) for m in measurements]
         seconds = clock.lap()
@@ -71,8 +74,8 @@ def run_rig(
         if model:
             fit = partial(kind.apply, file=model)
         else:
-            terms_at = partial(_terms_at, sessions[0], effects) if effects else None
-            fit = partial(kind.fit, begun=begun, terms_at=terms_at, recorder=recorders[0])
+            begin_at = partial(_with_effects, sessions[0], effects, arm) if effects or arm else None
+            fit = partial(kind.fit, begun=begun, begin_at=begin_at, recorder=recorders[0])
         found = admitted_fit(sessions, measurements, fit, keep)
         end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
         runs = []
@@ -124,9 +127,9 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
         recorder.start(session)
         require_effects([measurement], effects)
-        kept = [term for term in state.model.terms if term.name in effects]
         new = [name for name in effects if name not in state.model.effects]
-        model = Model(state.model.T_mount, (*kept, *_terms_at(session, new, measurement, state.model, state.gate)))
+        model = _with_further(session, new, measurement, state.model, state.gate)
+        model = model.with_terms([term for term in model.terms if term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
         begun = Coarse(state.T_mount_coarse, gate, "of the first run", ())
         before = kind.begin(measurement, begun, clock.lap(), recorder)
@@ -144,9 +147,19 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         return collected(session, 0, end, before, recorder)
 
 
-def _terms_at(
+def _with_effects(
+    session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
+) -> Model:
+    """The model with another run's arm, if any, and with further effects."""
+    if arm:
+        known_arm = bound(arm, measurement)
+        model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
+    return _with_further(session, effects, measurement, model, gate)
+
+
+def _with_further(
     session: Session, effects: Sequence[str], measurement: Measurement, model: Model, gate: float
-) -> list[Term]:
-    """Terms for further effects, begun where the views suggest them."""
+) -> Model:
+    """The model with further effects, begun where the views suggest them."""
     linear = partial(linearise, session, measurement, model, gate)
-    return initial_terms(measurement, [known(name) for name in effects], linear)
+    return model.with_terms([*model.terms, *initial_terms(measurement, [known(name) for name in effects], linear)])

@@ -27,14 +27,16 @@ library_threads_off()
 
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
-    "test_surface_stages.py",
+    "test_review_in_browser.py",
     "test_blade_diagnosis.py",
-    "test_scanner_field.py",
     "test_diagnosis_commands.py",
-    "test_labelled_commands.py",
-    "test_joint_effects.py",
+    "test_admission.py",
     "test_readme_example.py",
-    "test_extend_page.py",
+    "test_run_folder.py",
+    "test_window.py",
+    "test_surface_stages.py",
+    "test_sphere.py",
+    "test_cell_outputs.py",
 )
 
 

@@ -16,6 +16,7 @@ from stitch.effects.in_session import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.measurement.session import Session
+from stitch.model.arm import kept_arm
 from stitch.model.model_toml import write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
@@ -39,6 +40,10 @@ def run(
     hand_eye: Annotated[
         Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
     ] = None,
+    arm: Annotated[
+        Path | None,
+        typer.Option("--arm", metavar="RUN2", help="Keep the arm of another run (joints, links), fit all else."),
+    ] = None,
     effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
     effects_file: EffectsFile = None,
     trust: Trust = False,
@@ -58,6 +63,7 @@ def run(
       stitch run blade-17 -o found --effects joint_offset,backlash
       stitch run monday tuesday -o both
       stitch run blade-18 --hand-eye found --mesh
+      stitch run other-scanner --arm found
     """
     require_tolerance(tolerance)
     names_of_effects = [name.strip() for name in effects.split(",") if name.strip()]
@@ -65,9 +71,10 @@ def run(
         load_effects(effects_file)
     for name in names_of_effects:
         known(name)
-    if names_of_effects and hand_eye:
+    if hand_eye and (names_of_effects or arm):
         raise InputError(
-            "--effects and --hand-eye: a model that is used as it is brings its own effects; name one of the two"
+            f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
+            "name one of the two"
         )
     here = not sessions
     sessions = sessions or [_here()]
@@ -75,10 +82,13 @@ def run(
     names = _names(loaded)
     target = output or Path("../runs" if here else "runs") / "+".join(names)
     model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
+    kept = kept_arm(trusted_model(arm, effects_file, trust)[0]) if arm else None
+    if kept and (twice := set(names_of_effects) & set(kept.effects)):
+        raise InputError(f"--effects {twice.pop()}: the arm of {arm} brings it already; to fix: leave it out")
     with run_folder.new_folder(target, sessions, force) as scratch:
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, names_of_effects, keep)
+        runs = run_rig(loaded, model, recorders, names_of_effects, keep, kept)
         if effects_file:
             runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
         for result, folder in zip(runs, folders, strict=True):

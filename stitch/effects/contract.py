@@ -46,6 +46,7 @@ class Parameter:
     argument: str = ""  # of the effect's function that it is, or is a part of
     value: float = 0.0
     sigma: float = float("nan")  # NaN where the views do not show it: it is held at its value
+    kept: bool = False  # of an arm that another run fitted: not fitted again
 
     @property
     def discrete(self) -> bool:
@@ -53,13 +54,20 @@ class Parameter:
         return self.unit == "view"
 
     @property
+    def held(self) -> bool:
+        """True if it stays at its value, even where the views could show another."""
+        return bool(self.grid) or self.kept
+
+    @property
     def fitted(self) -> bool:
-        """True if the views show it: a held one stays at its value."""
+        """True if views showed it, of this session or of the run that its arm comes from."""
         return bool(np.isfinite(self.sigma))
 
     @property
     def status(self) -> str:
         """Whether it was fitted, or why it was held."""
+        if self.kept:
+            return "of another run's arm, as it is"
         if self.fitted:
             return "fitted"
         return "held: the best of those tried" if self.grid else "held: these views do not show it"

@@ -1,6 +1,6 @@
 """The arm of a run as its model has it: where the flange truly goes for commanded joint angles."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +14,14 @@ from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
 from stitch.measurement.torques import torques_of
 from stitch.measurement.views import Views, views_of
+from stitch.model.arm import ARM
 from stitch.model.bound import bound, in_unit
+from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.forward import perturbed_frames
 from stitch.model.term import Term
 from stitch.reading.session_folder import load_session
 from stitch.stored.run_documents import read_result
 from stitch.stored.trusted_model import trusted_model
-
-ARM = ("robot", "links")
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class ArmModel:
     length_unit: str
     joints: Array  # (V, n) rad, where the model was fitted
     elsewhere: tuple[str, ...] = ()  # effects of the model that are not the arm's
+    covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # of all parameters together
 
     def at_rest(self) -> tuple["ArmModel", tuple[str, ...]]:
         """The arm with what joint angles alone decide, and the names of effects that hang on time, speed or heat."""
@@ -72,9 +73,16 @@ def arm_of(folder: Path, effects_file: Path | None = None, trust: bool = False) 
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     measurement = _bare(session.name, session.robot, T_base_flange, views, session.length_unit)
     own = {name: values for name, values in file.effects.items() if known(name).place in ARM}
-    terms = bound(in_unit(replace(file, effects=own), session.length_unit), measurement).terms
-    elsewhere = tuple(name for name in file.effects if name not in own)
-    return ArmModel(session.name, session.robot, terms, session.length_unit, views.joints, elsewhere)
+    model = bound(in_unit(replace(file, effects=own), session.length_unit), measurement)
+    return ArmModel(
+        session=session.name,
+        robot=session.robot,
+        terms=model.terms,
+        covariance=model.effects_covariance,
+        length_unit=session.length_unit,
+        joints=views.joints,
+        elsewhere=tuple(name for name in file.effects if name not in own),
+    )
 
 
 def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array) -> Measurement:

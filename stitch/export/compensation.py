@@ -10,7 +10,7 @@ from stitch.export.inverse_kinematics import LEVER
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
-from stitch.model.term import Term
+from stitch.model.term import Term, split, stacked
 
 _STEPS = 30
 _DONE = 1e-13
@@ -73,18 +73,13 @@ def _approach(q: Array) -> Array:
 
 
 def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array) -> Array:
-    """(K,) 2·√Σ (∂x/∂p·σ_p)² over the fitted parameters."""
+    """(K,) 2·√tr(J·Σ·Jᵀ), Σ of all fitted parameters together: errors of one make up for errors of another."""
 
     def place(terms: tuple[Term, ...]) -> Array:
         return np.asarray((replace(arm, terms=terms).true_flange(q, _previous(q), approach) @ T_flange_tool)[:, :3, 3])
 
-    here = place(arm.terms)
-    total = np.zeros(len(q))
-    for term in arm.terms:
-        for i, p in enumerate(term.parameters):
-            if not p.fitted:
-                continue
-            stepped = term.at(term.values + p.sigma * np.eye(len(term.parameters))[i])
-            moved = place(tuple(stepped if other is term else other for other in arm.terms)) - here
-            total += np.einsum("ki,ki->k", moved, moved)
-    return np.asarray(COVERAGE_FACTOR * np.sqrt(total))
+    here, values = place(arm.terms), np.array([p.value for p in stacked(arm.terms)], float)
+    # Columns of the root are steps of about one sigma: J·L by differences, column by column.
+    steps = arm.covariance.root(arm.terms).T
+    moved = np.array([place(split(arm.terms, values + step)) - here for step in steps]).reshape(-1, *here.shape)
+    return np.asarray(COVERAGE_FACTOR * np.sqrt(np.einsum("pki,pki->k", moved, moved)))

@@ -12,8 +12,9 @@ from stitch.system.threads import parallel
 
 # Neighbours of the local plane: enough to average the noise, few enough to follow a fillet.
 _PLANE_NEIGHBOURS = 16
-# The quadric of the noise estimate has six coefficients; 24 neighbours leave 18 degrees of freedom.
-_QUADRIC_NEIGHBOURS = 24
+# The quadric of the noise estimate has six coefficients; 16 neighbours leave ten degrees of freedom, and
+# stay within one curve of the surface where a thin part is scanned in coarse steps.
+_QUADRIC_NEIGHBOURS = 16
 _NOISE_SAMPLES = 1500
 # Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
 # radius, the centroid has left the point: the surface ends here.
@@ -66,7 +67,9 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
     offset = np.linalg.norm(centroid - own, axis=1)
     usable = (confidence > _GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
     usable &= variation < _CREASE_VARIATION
-    noise = _noise(points, own, normals, tree)
+    # Across an edge no quadric fits: there the surface would count as noise.
+    smooth = usable if usable.any() else np.ones_like(usable)
+    noise = _noise(points, own[smooth], normals[smooth], tree)
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
         distance, _ = tree.query(own, k=2)

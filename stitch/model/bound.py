@@ -28,10 +28,10 @@ def bound(file: ModelFile, measurement: Measurement) -> Model:
         own = parameters_in(measurement, effect)
         _require_same(measurement, effect, stated, {p.name: p.unit for p in own})
         filled = [
-            replace(p, value=stated[p.name].value, sigma=stated[p.name].sigma) if p.name in stated else p for p in own
+            replace(p, value=s.value, sigma=s.sigma, kept=s.kept) if (s := stated.get(p.name)) else p for p in own
         ]
         terms.append(Term(effect, tuple(filled)))
-    return Model(file.T_mount, tuple(terms), file.covariance, file.targets)
+    return Model(file.T_mount, tuple(terms), file.covariance, file.targets, file.effects_covariance)
 
 
 def _require_same(
@@ -65,6 +65,9 @@ def in_unit(file: ModelFile, length_unit: str) -> ModelFile:
         T = T.copy()
         T[:3, 3] *= factor
         moved.append(T)
+    known = file.effects_covariance
+    units = {f"{name}.{key}": p.unit for name, own in file.effects.items() for key, p in own.items()}
+    factors = np.array([factor ** _power(units.get(name, ""), file.length_unit) for name in known.names])
     return replace(
         file,
         length_unit=length_unit,
@@ -75,6 +78,7 @@ def in_unit(file: ModelFile, length_unit: str) -> ModelFile:
             name: {key: _rescaled(p, file.length_unit, length_unit, factor) for key, p in own.items()}
             for name, own in file.effects.items()
         },
+        effects_covariance=replace(known, matrix=known.matrix * np.outer(factors, factors)),
         targets={
             name: Target(t.position * factor, t.sigma * factor, t.orientation) for name, t in file.targets.items()
         },
@@ -82,8 +86,12 @@ def in_unit(file: ModelFile, length_unit: str) -> ModelFile:
 
 
 def _rescaled(p: Parameter, old: str, new: str, factor: float) -> Parameter:
-    """A unit counts lengths where `old` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
-    above, _, below = p.unit.partition("/")
-    power = (above.strip() == old) - (below.strip() == old)
+    power = _power(p.unit, old)
     unit = "/".join(new if part.strip() == old else part for part in p.unit.split("/"))
     return replace(p, unit=unit, value=p.value * factor**power, sigma=p.sigma * factor**power)
+
+
+def _power(unit: str, length: str) -> int:
+    """A unit counts lengths where `length` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
+    above, _, below = unit.partition("/")
+    return (above.strip() == length) - (below.strip() == length)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stitch.frames import Array
+from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.term import Term
 
 
@@ -26,6 +27,7 @@ class Model:
     terms: tuple[Term, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of T·exp(ξ), scanner frame, rotation first
     targets: dict[str, Target] = field(default_factory=dict)
+    effects_covariance: EffectsCovariance = field(default_factory=EffectsCovariance)
 
     @property
     def effects(self) -> list[str]:

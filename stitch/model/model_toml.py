@@ -10,6 +10,7 @@ import tomli_w
 from stitch.effects.contract import Parameter
 from stitch.errors import InputError
 from stitch.frames import Array, is_rigid
+from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.model import Target
 from stitch.reading.toml_file import choice, read_toml, text
 from stitch.units import METRES
@@ -33,6 +34,7 @@ class ModelFile:
     effects: dict[str, dict[str, Parameter]] = field(default_factory=dict)
     effects_file: str | None = None  # Python file with effects of the user's own
     targets: dict[str, Target] = field(default_factory=dict)  # of a session with labelled points
+    effects_covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # stands in result.json
 
 
 def write_model(model: ModelFile, path: Path) -> None:
@@ -112,7 +114,7 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
 def _parameter_table(p: Parameter) -> dict[str, Any]:
     """TOML has a nan, but who reads it expects a word."""
     known = {"sigma": p.sigma} if p.fitted else {"observable": False}
-    return {"value": p.value, **known, "unit": p.unit}
+    return {"value": p.value, **known, "unit": p.unit, **({"kept": True} if p.kept else {})}
 
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
@@ -120,7 +122,11 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
         return {
             str(name): {
                 str(p): Parameter(
-                    str(p), str(f.get("unit", "")), value=float(f["value"]), sigma=float(f.get("sigma", np.nan))
+                    str(p),
+                    str(f.get("unit", "")),
+                    value=float(f["value"]),
+                    sigma=float(f.get("sigma", np.nan)),
+                    kept=f.get("kept") is True,
                 )
                 for p, f in parameters.items()
             }

@@ -68,6 +68,13 @@ def stacked(terms: Sequence[Term]) -> tuple[Parameter, ...]:
     return tuple(p for term in terms for p in term.parameters)
 
 
+def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
+    """(P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
+    out = np.array([p.sigma if p.kept else np.nan for p in stacked(terms)], float)
+    out[fitted] = sigmas
+    return out
+
+
 def split(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
     """The terms with values, and sigmas, of all their parameters in one row."""
     out, at = [], 0

@@ -102,13 +102,14 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
     """(P,) parameters that the views support and can tell apart.
 
     Args:
-        before: (P,) what explained scatter so far.
+        before: (P,) what explained scatter so far; never what another run's arm brought.
         whitened: the observation in units of the scatter that is left when some parameters explain theirs.
     """
     sizes = np.array([p.typical for p in stacked(terms)])
     groups, effects, at = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
-        own = one_by_one(term.effect, term.parameters)
+        kept = any(p.kept for p in term.parameters)
+        own = [] if kept else one_by_one(term.effect, term.parameters)
         groups += [[at + i for i in group] for group in own]
         effects += [number] * len(own)
         at += len(term.parameters)

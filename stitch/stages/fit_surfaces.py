@@ -8,9 +8,10 @@ import numpy as np
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
+from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
 from stitch.model.model import Model
-from stitch.model.term import split, stacked
+from stitch.model.term import known_sigmas, split, stacked
 from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import pair_squares
@@ -79,8 +80,11 @@ class _Linearised:
     def step(self, choice: _Choice, errors: PoseErrors | None = None) -> _Step:
         """The step, with a covariance that counts how poses may err; without, one of scatter alone."""
         fitted, before = choice.fitted, self.values
-        # A parameter at zero that is not zero errs alike in every view, as the scanner does.
-        repeating = [np.hstack([r, c * choice.omitted]) for r, c in zip(choice.repeating, self.columns, strict=True)]
+        # A parameter at zero that is not zero errs alike in every view, as the scanner does; so does another run's arm.
+        kept = kept_root(self.model.terms, self.model.effects_covariance)
+        repeating = [
+            np.hstack([r, c * choice.omitted, c @ kept]) for r, c in zip(choice.repeating, self.columns, strict=True)
+        ]
         columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
         found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating, errors)
         values = before.copy()
@@ -89,7 +93,9 @@ class _Linearised:
         values[fitted] = found.values
         moved = float(np.max(np.abs(values - before)[fitted] / found.values_sigma, initial=0.0))
         return _Step(
-            model=Model(found.T_mount, split(self.model.terms, values), found.covariance),
+            model=replace(
+                self.model, T_mount=found.T_mount, terms=split(self.model.terms, values), covariance=found.covariance
+            ),
             moved=moved,
             rms=_model_rms(self.freed),
             hand_eye=found,
@@ -106,7 +112,7 @@ class _Linearised:
 
     @property
     def _held(self) -> Mask:
-        return np.array([bool(p.grid) for p in stacked(self.model.terms)], bool)
+        return np.array([p.held for p in stacked(self.model.terms)], bool)
 
     def _whitened(self, free: Mask) -> Whitened:
         channels = [(c, f, extra) for c, f, extra in zip(self.captures, self.freed, self.columns, strict=True)]
@@ -148,10 +154,15 @@ def fit_surfaces(
 
     last, history = iterate(_Surfaces(measurements, gates), model, watch)
     last = last.linearised.with_errors(last.choice)
-    sigmas = np.full(len(last.fitted), np.nan)
-    sigmas[last.fitted] = np.sqrt(np.diag(last.hand_eye.values_covariance))
+    sigmas = known_sigmas(last.model.terms, last.fitted, np.sqrt(np.diag(last.hand_eye.values_covariance)))
     values = np.array([p.value for p in stacked(last.model.terms)], float)
-    model = replace(last.model, terms=split(last.model.terms, values, sigmas))
+    covariance = covariance_of_fit(
+        last.model.terms,
+        last.fitted,
+        last.hand_eye.values_covariance,
+        kept_root(last.model.terms, model.effects_covariance),
+    )
+    model = replace(last.model, terms=split(last.model.terms, values, sigmas), effects_covariance=covariance)
     captures, freed = _free(measurements, model, [f.overlaps.gate for f in last.freed])
     overlaps = [_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True)]
     return Correction(

@@ -7,9 +7,10 @@ import numpy as np
 
 from stitch.frames import Array, Mask, exp
 from stitch.measurement.measurement import Measurement
+from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
 from stitch.model.model import Model
-from stitch.model.term import split, stacked
+from stitch.model.term import known_sigmas, split, stacked
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.observations.targets.rows import Rows, effect_columns, mixed_model_of_rows, rows_of
 from stitch.observations.targets.target_fit import TargetFit, rms_of
@@ -72,7 +73,7 @@ class _Linearised:
         variances = self._variances(X)
         blocks = self._blocks(X, self.sizes[choice], self.values[choice], variances)
         x, covariance, a = blocks.solve(), blocks.estimates_covariance(), self.base.shape[2]
-        held, values = np.array([bool(p.grid) for p in stacked(self.model.terms)], bool), self.values.copy()
+        held, values = np.array([p.held for p in stacked(self.model.terms)], bool), self.values.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[np.logical_not(held | choice)] = 0.0
         values[choice] += x[a:]
@@ -141,10 +142,19 @@ def fit_targets(
     rows, a = last.linearised.rows, last.linearised.base.shape[2]
     inflation = last.blocks.inflation(places(rows.capture.T_reference_mount, rows.reach), last.covariance)
     covariance = last.covariance * inflation
-    sigmas = np.full(len(last.fitted), np.nan)
-    sigmas[last.fitted] = np.sqrt(np.diag(covariance)[a:])
+    # Another run's arm is known to its own sigmas, and errs alike in every view.
+    terms = last.model.terms
+    kept = kept_root(terms, model.effects_covariance)
+    moved = last.blocks.moved_by(last.linearised.columns @ kept)
+    covariance = covariance + moved @ moved.T
+    sigmas = known_sigmas(terms, last.fitted, np.sqrt(np.diag(covariance)[a:]))
     values = np.array([p.value for p in stacked(last.model.terms)], float)
-    model = Model(last.model.T_mount, split(last.model.terms, values, sigmas), covariance[:6, :6])
+    model = Model(
+        last.model.T_mount,
+        split(terms, values, sigmas),
+        covariance[:6, :6],
+        effects_covariance=covariance_of_fit(terms, last.fitted, covariance[a:, a:], kept),
+    )
     final = rows_of(corrected(measurement, model), model.T_mount, last.landmarks)
     return TargetFit(
         model=model,

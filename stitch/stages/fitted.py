@@ -9,7 +9,6 @@ from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
-from stitch.model.term import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
@@ -18,8 +17,8 @@ from stitch.stages.correction import Correction
 from stitch.stages.finish import Finished
 from stitch.stages.outlier_removal import FittedSession
 
-# From a measurement, its model and the gate to the terms that effects begin with.
-TermsAt = Callable[[Measurement, Model, float], Sequence[Term]]
+# From a measurement, its model and the gate to the model that the fit of effects begins with.
+BeginAt = Callable[[Measurement, Model, float], Model]
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Course(Protocol):
         sessions: Sequence[Session],
         measurements: Sequence[Measurement],
         begun: Coarse,
-        terms_at: TermsAt | None,
+        begin_at: BeginAt | None,
         recorder: Recorder,
     ) -> Fitted:
         """Hand-eye and effects from the coarse hand-eye on."""

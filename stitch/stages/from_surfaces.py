@@ -27,7 +27,7 @@ from stitch.stages.correction import Correction
 from stitch.stages.evaluate_targets import placed_targets
 from stitch.stages.finish import Finished, finish_surfaces, show
 from stitch.stages.fit_surfaces import fit_surfaces
-from stitch.stages.fitted import Fitted, TermsAt
+from stitch.stages.fitted import BeginAt, Fitted
 from stitch.stages.outlier_removal import FittedSession, without_outliers
 from stitch.stages.reuse import reuse
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
@@ -59,7 +59,7 @@ def fit(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
     begun: Coarse,
-    terms_at: TermsAt | None,
+    begin_at: BeginAt | None,
     recorder: Recorder,
 ) -> Fitted:
     """The hand-eye from the scans; with effects, both."""
@@ -72,13 +72,12 @@ def fit(
             return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
 
         first = correct(captures, begun.T_mount, begun.gate, recorder, repeating, erring)
-        if terms_at is None:
+        if begin_at is None:
             return first
         gates = [overlaps.gate for overlaps in first.overlaps]
         weighed = [_weighed(m, own.noise_factor) for m, own in zip(measurements, first.captures, strict=True)]
         # An event or a time constant is one for the whole rig: the first session says where it begins.
-        terms = terms_at(weighed[0], Model(first.model.T_mount), gates[0])
-        return fit_surfaces(weighed, Model(first.model.T_mount, tuple(terms)), gates, recorder)
+        return fit_surfaces(weighed, begin_at(weighed[0], Model(first.model.T_mount), gates[0]), gates, recorder)
 
     return _fitted(*without_outliers(measurements, once, _targets))
 

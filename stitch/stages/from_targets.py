@@ -22,7 +22,7 @@ from stitch.stages.coarse import REUSED, STATED, Coarse
 from stitch.stages.evaluate_targets import evaluate_targets
 from stitch.stages.finish import Finished, finish_targets
 from stitch.stages.fit_targets import fit_targets
-from stitch.stages.fitted import Fitted, TermsAt
+from stitch.stages.fitted import BeginAt, Fitted
 from stitch.stages.outlier_removal import without_outliers
 from stitch.stages.sentences import target_notes
 
@@ -54,15 +54,15 @@ def fit(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
     begun: Coarse,
-    terms_at: TermsAt | None,
+    begin_at: BeginAt | None,
     recorder: Recorder,
 ) -> Fitted:
     """Hand-eye and targets; then, with effects, all of them."""
     first = refit(sessions, measurements, Model(begun.T_mount), (), recorder)
-    if terms_at is None:
+    if begin_at is None:
         return first
-    own, model = first.sessions[0].measurement, Model(first.model.T_mount)
-    return refit(sessions, [own], model.with_terms(terms_at(own, model, begun.gate)), (), recorder)
+    own = first.sessions[0].measurement
+    return refit(sessions, [own], begin_at(own, Model(first.model.T_mount), begun.gate), (), recorder)
 
 
 def refit(

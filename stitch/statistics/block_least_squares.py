@@ -60,6 +60,11 @@ class Blocks:
         inverse = _inverse(self.information.sum(axis=0) + np.diag(self.precision), self.scale)
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
+    def moved_by(self, errors: Array) -> Array:
+        """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
+        pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
+        return np.asarray(_inverse(self.information.sum(axis=0) + np.diag(self.precision), self.scale) @ pulls)
+
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)

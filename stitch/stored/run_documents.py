@@ -9,6 +9,7 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
 from stitch.errors import InputError
+from stitch.model.effects_covariance import EffectsCovariance
 from stitch.reading.text_file import read_text, shortened
 from stitch.runs.run import LedgerStep, Note
 
@@ -49,6 +50,7 @@ RESULT = _table(
     },
     disagreement={"type": ["object", "null"], "properties": {"gate": _NUMBER}},
     outliers=_list(_table({"view": _TEXT, "target": {"type": ["string", "null"]}})),
+    effects_covariance=_table({"parameters": _list(_TEXT), "matrix": _list(_list(_NUMBER))}),
     cloud_noise_factor=_NUMBER,
     left_out=_list(_table({"view": _TEXT, "why": _TEXT})),
     linkage=_table({}, components=_list(_list(_TEXT)), weak=_list(_table({"view": _TEXT}))),
@@ -83,6 +85,33 @@ def read_result(folder: Path) -> dict[str, Any]:
     document = _checked(folder / "result.json", RESULT)
     assert isinstance(document, dict)
     return document
+
+
+def covariance_of_effects(path: Path) -> EffectsCovariance:
+    """What the result beside a model.toml says of its effects' parameters; nothing where there is none.
+
+    Args:
+        path: folder of a run or of a rig, or a model.toml.
+
+    Raises:
+        InputError: a result.json that is damaged, or a matrix of another size than its names.
+    """
+    folder = path if path.is_dir() else path.parent
+    found = [folder / "result.json", *sorted(folder.glob("*/result.json"))]
+    file = next((f for f in found if f.is_file()), None)
+    stated = read_result(file.parent).get("effects_covariance") if file else None
+    if not stated:
+        return EffectsCovariance()
+    names, rows = tuple(stated["parameters"]), stated["matrix"]
+    if [len(row) for row in rows] != [len(names)] * len(names):
+        raise InputError(
+            f"{file}: effects_covariance.matrix is not {len(names)}x{len(names)} for its {len(names)} parameters; "
+            "to fix: run `stitch run` again, or take the entry out"
+        )
+    matrix = np.array(rows, float).reshape(len(names), len(names))
+    if not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
+        raise InputError(f"{file}: effects_covariance holds no variances; to fix: run `stitch run` again")
+    return EffectsCovariance(names, matrix)
 
 
 def read_ledger(folder: Path) -> list[dict[str, Any]]:

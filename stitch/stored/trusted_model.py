@@ -1,5 +1,6 @@
 """The model of a run folder, and the Python file of effects that it names: run only where somebody allows it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.model.model_toml import ModelFile, read_model
+from stitch.stored.run_documents import covariance_of_effects
 
 
 def trusted_model(path: Path, effects_file: Path | None = None, trust: bool = False) -> tuple[ModelFile, str | None]:
@@ -20,7 +22,7 @@ def trusted_model(path: Path, effects_file: Path | None = None, trust: bool = Fa
     Raises:
         InputError: no model, a value in it that is no number, or a file of effects that nobody has allowed.
     """
-    model = read_model(path)
+    model = replace(read_model(path), effects_covariance=covariance_of_effects(path))
     file = path / "model.toml" if path.is_dir() else path
     for effect, fitted in model.effects.items():
         for name, parameter in fitted.items():

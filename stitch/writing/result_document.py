@@ -28,6 +28,7 @@ def model_of(run: Run) -> ModelFile:
         effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
         effects_file=run.effects_file,
         targets=targets_of(run.targets),
+        effects_covariance=run.model.effects_covariance,
     )
 
 
@@ -54,6 +55,10 @@ def result_document(run: Run) -> dict[str, Any]:
         "effects": {
             term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
             for term in run.terms
+        },
+        "effects_covariance": {
+            "parameters": list(run.model.effects_covariance.names),
+            "matrix": run.model.effects_covariance.matrix.tolist(),
         },
         "views": [
             *(_view(run, v) for v in range(len(run.session.views))),

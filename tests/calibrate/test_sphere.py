@@ -54,7 +54,7 @@ def test_error_is_that_of_the_covariance(kind):
         assert np.all(ratio > 0.4)
 
 
-@pytest.mark.parametrize("kind", ["line", "area"])
+@pytest.mark.parametrize("kind", [pytest.param("line", marks=pytest.mark.slow), "area"])
 def test_exact_without_noise(kind):
     cell = sphere_cell(3, kind, pose_noise=0.0, noise=0.0)
     start = global_start(cell.G, views_of(cell))
@@ -103,7 +103,7 @@ def test_decoupled_is_exact_where_orientations_are_equal_and_absent_where_none_a
     assert decoupled(cell.G[3:], q[3:]) is None
 
 
-@pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
+@pytest.mark.parametrize("mount", [pytest.param("eye_in_hand", marks=pytest.mark.slow), "eye_to_hand"])
 def test_command_on_both_mounts(mount, tmp_path, capsys):
     cell = sphere_cell(5, "line", turns=0.6)
     folder = write_spheres(cell, tmp_path / "s", mount)

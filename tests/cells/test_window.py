@@ -120,6 +120,7 @@ def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     assert shown.outside[at].all()
 
 
+@pytest.mark.slow
 def test_two_parts_in_one_scan(pane, pane_cad):
     Ts = [truth(5), truth(5) @ frames.make(np.eye(3), [30.0, -450.0, 40.0])]
     scans = [scan_pane(pane, T, 5 + i) for i, T in enumerate(Ts)]

@@ -56,6 +56,7 @@ def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, ca
     assert not (raw / "session.toml").exists() and not (raw / "views.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
     table = raw / "RobotPoses.dat"
     table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))

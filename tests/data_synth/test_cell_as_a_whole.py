@@ -17,7 +17,7 @@ from stitch.system.threads import library_threads_off
 VIEWS = 8
 
 
-HIDDEN = ("joint_compliance", "part_slip")
+HIDDEN = ("joint_compliance", pytest.param("part_slip", marks=pytest.mark.slow))
 
 
 def leaves(folder, hidden: dict[str, float], scene: str = "blade"):

@@ -92,7 +92,10 @@ def test_latency_of_a_line_scanner():
             assert np.linalg.norm(y - naive, axis=1).mean() == pytest.approx(amplitude * 0.16, rel=0.1, abs=1e-9)
 
 
-@pytest.mark.parametrize("scene", ["blade", "blade-table", "panel", "spheres", "car-door", "drill-plate"])
+@pytest.mark.parametrize(
+    "scene",
+    ["blade", "blade-table", "panel", "spheres", pytest.param("car-door", marks=pytest.mark.slow), "drill-plate"],
+)
 def test_nothing_hidden_leaves_noise_alone(scene):
     """Clouds placed by the true poses: distances to the part over their sigma are a normal distribution."""
     cell = clean(scene, rays=40)

@@ -115,6 +115,7 @@ def test_blade_stands_on_its_root(root):
     assert np.diff(widths).min() < -0.5
 
 
+@pytest.mark.slow
 def test_blade_facets_stay_near_the_smooth_blade():
     coarse, fine = mesh_of("blade"), build_shape("blade", sections=300, around=960)
     places = coarse.triangles_center[coarse.triangles_center[:, 2] > 52.5]
@@ -202,6 +203,7 @@ def test_window_pane_leaves_the_gap():
     assert np.sqrt(square.min()) == pytest.approx(16.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_same_parameters_same_bytes(tmp_path):
     for suffix in (".ply", ".stl"):
         first = write_mesh(build_shape("blade"), tmp_path / f"a{suffix}")

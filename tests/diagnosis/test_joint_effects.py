@@ -47,7 +47,7 @@ def test_an_honest_cell_is_adequate():
     assert found.verdict == "adequate", found.sentence
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_growth_is_found_wherever_the_part_is_held(mount):
     """No session says which point of a part stands still; the flange and the robot's base need not be near it."""
     still = TARGETS[0] + [80.0, -40.0, -90.0] + (0 if mount == "eye_to_hand" else TABLE)

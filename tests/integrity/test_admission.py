@@ -61,7 +61,7 @@ def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
     assert amount == pytest.approx(5.0, rel=0.05)
 
 
-@pytest.mark.parametrize("factor", [1.0254, 0.97])
+@pytest.mark.parametrize("factor", [1.0254, pytest.param(0.97, marks=pytest.mark.slow)])
 def test_scans_of_another_scale_are_refused_though_they_fit_each_other(good, factor):
     views = [replace(v, cloud=Cloud(v.cloud.points * factor)) for v in good.views]
     with pytest.raises(InputError, match="times as large") as refused:

@@ -111,7 +111,7 @@ def test_few_views_without_blunders_are_left_alone():
     assert alarms <= stats.binom.isf(1e-3, 200, 0.01)
 
 
-@pytest.mark.parametrize("start", [4, 10, 17])
+@pytest.mark.parametrize("start", [4, *(pytest.param(k, marks=pytest.mark.slow) for k in (10, 17))])
 def test_a_common_step_is_one_block_and_a_drift_is_none(start):
     model = direct(5)
     step = np.zeros((VIEWS, 6))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
@@ -174,7 +175,7 @@ def test_a_page_or_picture_that_fails_leaves_the_old_one(changing, monkeypatch):
         write(path, text[: len(text) // 2], **options)
         raise OSError("disk full")
 
-    class Broken:
+    class Broken(Figure):
         def savefig(self, file, **options):
             if options["format"] == "png":
                 file.write_bytes(b"half")

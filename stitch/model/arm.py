@@ -1,0 +1,29 @@
+"""The arm of another run: its effects on joints and links as they are, under another mount, tool or day."""
+
+from dataclasses import replace
+
+from stitch.effects.in_session import known
+from stitch.errors import InputError
+from stitch.model.model_toml import ModelFile
+
+ARM = ("robot", "links")  # where the effects of an arm stand in the chain
+
+
+def kept_arm(file: ModelFile) -> ModelFile:
+    """The model with nothing but the effects of its arm, all of them kept.
+
+    Raises:
+        InputError: an effect that is not known, or none of the arm.
+    """
+    effects = {
+        name: {key: replace(p, kept=True) for key, p in own.items()}
+        for name, own in file.effects.items()
+        if known(name).place in ARM
+    }
+    if not effects:
+        used = ", ".join(file.effects) or "none"
+        raise InputError(
+            f"--arm: the model has no effect of joints or links (its effects: {used}); to fix: name the run of a "
+            "session that showed them, after `stitch add`"
+        )
+    return replace(file, effects=effects, targets={})
