@@ -1,0 +1,77 @@
+"""The arm of one series of measured poses judged on another series, with base and probe of its own.
+
+Run: python bench/kept_arm.py [--every 4] [--write]; writes the table of docs/points.md. Needs the measured data
+beside the project (two series of one UR10, each with a laser tracker somewhere else).
+"""
+
+import argparse
+import os
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stitch.measurement.session import Session
+from stitch.model.arm import kept_arm
+from stitch.pipeline import run
+from stitch.reading.session_folder import load_session
+from stitch.runs.run import Run
+from stitch.runs.state import state_of
+from stitch.stepwise import suggest
+from stitch.writing.result_document import model_of
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
+PAGE = ROOT / "docs" / "points.md"
+SERIES = ("ur10-tmac-A", "ur10-tmac-C")
+MARKS = ("<!-- kept arm: begin -->", "<!-- kept arm: end -->")
+
+
+def every(session: Session, step: int) -> Session:
+    """Every so many views of a session."""
+    return replace(session, views=session.views[::step])
+
+
+def row(name: str, found: Run) -> str:
+    """A line of the table."""
+    sigma = 2e3 * np.sqrt(np.diag(found.mount_covariance))[:3].max()
+    return f"| {name} | {found.residual_rms:.3f} | {found.heldout_rms:.3f} | {sigma:.2f} |"
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--every", type=int, default=4, help="every n-th pose of both series")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/points.md")
+    given = parser.parse_args()
+    series = {name: every(load_session(SHARED / name), given.every) for name in SERIES}
+    lines, found = [], {}
+    for name, session in series.items():
+        began = time.monotonic()
+        result, told, _ = suggest(state_of(run(session)), 5)
+        assert result is not None, told
+        found[name] = result
+        seconds = time.monotonic() - began
+        print(f"{name}: {len(session.views)} poses, {', '.join(result.effects)}, {seconds:.0f} s", flush=True)
+    lines.append("| poses judged | arm | rms, mm | on poses left out, mm | U of the hand-eye's turn, mrad |")
+    lines.append("|---|---|---:|---:|---:|")
+    for name, other in zip(SERIES, reversed(SERIES), strict=True):
+        session = series[name]
+        ways = {
+            "nominal": run(session),
+            f"of {other} (`--arm`)": run(session, arm=kept_arm(model_of(found[other]))),
+            "fitted here": found[name],
+        }
+        lines += [row(f"{name} | {way}", result) for way, result in ways.items()]
+    printed = "\n".join(lines)
+    print(printed)
+    if given.write:
+        text = PAGE.read_text(encoding="utf-8")
+        block = f"{MARKS[0]}\n{printed}\n{MARKS[1]}"
+        PAGE.write_text(re.sub(f"{MARKS[0]}.*{MARKS[1]}", lambda _: block, text, flags=re.S), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
