@@ -12,8 +12,8 @@ from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import place
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
-from stitch.measurement.torques import torques_of
-from stitch.measurement.views import Views, views_of
+from stitch.measurement.torques import PAYLOAD, Torques, torques_of
+from stitch.measurement.views import Views, no_torques, views_of
 from stitch.model.arm import ARM
 from stitch.model.bound import bound, in_unit
 from stitch.model.effects_covariance import EffectsCovariance
@@ -34,6 +34,8 @@ class ArmModel:
     length_unit: str
     joints: Array  # (V, n) rad, where the model was fitted
     elsewhere: tuple[str, ...] = ()  # effects of the model that are not the arm's
+    payload: float | None = None  # kg at the last view, where it is a column
+    torques_measured: bool = False
     covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # of all parameters together
 
     def at_rest(self) -> tuple["ArmModel", tuple[str, ...]]:
@@ -79,6 +81,8 @@ def arm_of(folder: Path, effects_file: Path | None = None, trust: bool = False) 
         robot=session.robot,
         terms=model.terms,
         covariance=model.effects_covariance,
+        payload=float(views.covariates[PAYLOAD][-1]) if PAYLOAD in views.covariates else None,
+        torques_measured=views.torques.measured,
         length_unit=session.length_unit,
         joints=views.joints,
         elsewhere=tuple(name for name in file.effects if name not in own),
@@ -95,13 +99,20 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
         previous=previous,
         approach=approach,
         velocity=None,
-        torques=torques_of(arm.robot, joints),
+        torques=_torques(arm, joints),
         covariates={},
         standoff=1.0,
         first={},
         number=np.arange(count),
     )
     return _bare(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
+
+
+def _torques(arm: ArmModel, joints: Array) -> Torques:
+    """Of gravity; none where the model follows what drives report: a program does not have that."""
+    if arm.torques_measured:
+        return no_torques(len(joints))
+    return torques_of(arm.robot, joints, None if arm.payload is None else np.full(len(joints), arm.payload))
 
 
 def _bare(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:

@@ -120,6 +120,15 @@ def unit_torques(robot: Robot, joints: Array) -> Array:
     return np.asarray(torque * robot.metres_per_unit * (np.arange(n)[None, :] >= np.arange(n)[:, None]))
 
 
+def payload_torques(robot: Robot, joints: Array) -> Array:
+    """(..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
+    flange = link_frames(robot, joints)[..., -1, :, :]
+    point, axis = joint_axes(robot, joints)
+    centre = (flange[..., :3, :3] @ robot.payload_com[:, None])[..., 0] + flange[..., :3, 3]
+    torque = np.einsum("...ij,...ij->...i", axis, np.cross(centre[..., None, :] - point, robot.gravity))
+    return np.asarray(torque * robot.metres_per_unit)
+
+
 def gravity_torques(robot: Robot, joints: Array) -> Array:
     """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
 

@@ -1,7 +1,7 @@
-"""Gravity torques of an arm at the joints of its views, with masses or without."""
+"""Torques that bend the joints of an arm at its views: measured, or of gravity with masses or without."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,29 +9,66 @@ from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.robot import Robot
 
+PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
 # Joint angles that show which torques of an arm differ.
 _ANYWHERE = 100
+_STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
 
 
 @dataclass(frozen=True)
 class Torques:
-    """Gravity torques of which joints sag: with masses one a joint, without them one a joint and a link beyond."""
+    """Torques under which joints sag: with masses one a joint, without them one a joint and a link beyond."""
 
     names: tuple[str, ...]
     joint: tuple[int, ...]  # that the torque bends
     values: Array  # (V, m) N·m about +z of that joint; of 1 kg at the link's frame where masses are unknown
+    measured: bool = False
 
 
-def torques_of(robot: Robot, joints: Array) -> Torques:
-    """Gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles."""
+def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
+    """Gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles.
+
+    Args:
+        payload: (V,) kg, in place of the mass in [robot] payload.
+    """
+    if payload is None:
+        return _each_joint(kinematics.gravity_torques(robot, joints)) if robot.has_masses else _by_link(robot, joints)
+    carried = payload[:, None] * kinematics.payload_torques(robot, joints)
+    if robot.mass.any():
+        return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
+    # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
+    links = _by_link(robot, joints)
+    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _everywhere(robot)), axis=0) > _STILL)
+    names = (*links.names, *(str(i + 1) for i in bent))
+    return Torques(names, (*links.joint, *(int(i) for i in bent)), np.hstack([links.values, carried[:, bent]]))
+
+
+def measured_torques(drives: Array) -> Torques:
+    """Of drives (V, n), N·m, as controllers report them: a drive holds the opposite of what bends its joint."""
+    return replace(_each_joint(-drives), measured=True)
+
+
+def torque_columns(covariates: Mapping[str, Array], joints: int) -> Array | None:
+    """(V, n) the columns jN_torque_nm of all joints, or None where one is missing."""
+    names = [f"j{i + 1}_torque_nm" for i in range(joints)]
+    whole = bool(names) and all(name in covariates for name in names)
+    return np.column_stack([covariates[name] for name in names]) if whole else None
+
+
+def _each_joint(values: Array) -> Torques:
+    n = values.shape[1]
+    return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
+
+
+def _everywhere(robot: Robot) -> Array:
+    """(N, n) joint angles from everywhere: a coefficient must mean the same in every session of an arm."""
+    return np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, robot.n_joints))
+
+
+def _by_link(robot: Robot, joints: Array) -> Torques:
+    """Of 1 kg at each link's frame, as far as they differ: without masses the geometry gives their shapes alone."""
     n = robot.n_joints
-    if robot.has_masses:
-        values = kinematics.gravity_torques(robot, joints)
-        return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
-    # Without masses the shape of every torque follows from the geometry: 1 kg at each link's frame. Angles from
-    # everywhere choose among them: a coefficient must mean the same in every session of an arm.
-    everywhere = np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, n))
-    shapes = kinematics.unit_torques(robot, everywhere)
+    shapes = kinematics.unit_torques(robot, _everywhere(robot))
     keep = [(i, k) for i in range(n) for k in _different(shapes[:, i], range(i, n))]
     unit = kinematics.unit_torques(robot, joints)
     values = np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep))
@@ -47,7 +84,7 @@ def _different(torques: Array, links: Sequence[int]) -> list[int]:
     for k in links:
         own = torques[:, k]
         rest = own - basis @ (basis.T @ own)
-        if np.ptp(own) > 1e-3 and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
+        if np.ptp(own) > _STILL and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
             chosen.append(k)
             basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
     return chosen

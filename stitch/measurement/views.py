@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stitch.frames import Array, Indices
+from stitch.measurement.robot import Robot
 from stitch.measurement.session import Session
-from stitch.measurement.torques import Torques, torques_of
+from stitch.measurement.torques import PAYLOAD, Torques, measured_torques, torque_columns, torques_of
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def views_of(session: Session) -> Views:
     moving = bool(speeds) and all(name in covariates for name in speeds)
     velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds])) if moving else None
     standoff = session.scanner.standoff or _median_range(session)
-    torques = torques_of(session.robot, joints) if use and session.robot else Torques((), (), np.zeros((count, 0)))
+    torques = _torques(session.robot, joints, covariates) if use and session.robot else no_torques(count)
     first = {name: float(course[0]) for name, course in covariates.items()}
     return Views(
         count=count,
@@ -129,6 +130,21 @@ def views_of(session: Session) -> Views:
         first=first,
         number=np.arange(count),
     )
+
+
+def no_torques(count: int) -> Torques:
+    """Of an arm that nobody knows."""
+    return Torques((), (), np.zeros((count, 0)))
+
+
+def _torques(robot: Robot, joints: Array, covariates: dict[str, Array]) -> Torques:
+    """As drives report them, where they do; else of gravity, with what the flange carries where that is a column."""
+    drives = torque_columns(covariates, joints.shape[1])
+    if drives is not None:
+        for i in range(joints.shape[1]):
+            del covariates[f"j{i + 1}_torque_nm"]
+        return measured_torques(drives)
+    return torques_of(robot, joints, covariates.get(PAYLOAD))
 
 
 def _median_range(session: Session) -> float:

@@ -12,7 +12,9 @@ from stitch.diagnosis.score import Score
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.measurement import Measurement
-from stitch.measurement.torques import torques_of
+from stitch.measurement.robot import Robot
+from stitch.measurement.torques import PAYLOAD, Torques, torques_of
+from stitch.measurement.views import Views
 from stitch.model.forward import moves_points, perturbed_frames
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
@@ -113,7 +115,7 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
     assert measurement.robot is not None
     views, count = measurement.views, len(joints)
     last = np.repeat(views.joints[-1:], count, axis=0)
-    torques = torques_of(measurement.robot, np.vstack([joints, views.joints]))
+    torques = _torques_there(measurement.robot, views, joints)
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
     # They would be taken at rest.
     velocity = None if views.velocity is None else np.zeros_like(joints)
@@ -125,7 +127,7 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
         approach=np.sign(joints - last),
         time=np.full(count, views.time[-1] + pause),
         velocity=velocity,
-        torques=replace(torques, values=torques.values[:count]),
+        torques=torques,
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
         number=np.full(count, views.number[-1] + 1),
     )
@@ -139,3 +141,12 @@ def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Arra
     carried = frames.adjoint(to_centre @ (np.broadcast_to(np.eye(4), T.shape) if measurement.eye_to_hand else T))
     variances = np.repeat(np.maximum(linear.null.variances[:2], 1e-300), 3)
     return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))
+
+
+def _torques_there(robot: Robot, views: Views, joints: Array) -> Torques:
+    """At joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all views."""
+    if views.torques.measured:
+        near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
+        return replace(views.torques, values=views.torques.values[near])
+    carried = views.covariates.get(PAYLOAD)
+    return torques_of(robot, joints, None if carried is None else np.full(len(joints), carried[-1]))
