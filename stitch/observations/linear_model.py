@@ -20,7 +20,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term
 from stitch.observations.error_model import ErrorModel
-from stitch.observations.response import PointSums, Response
+from stitch.observations.response import PointSums, Prior, Response
 from stitch.statistics.folds import JointEnd
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.variance_components import fit_variances
@@ -62,9 +62,9 @@ class Observation(Protocol):
         ...
 
     def trial(
-        self, linear: "LinearModel", response: Array, points: PointSums | None = None, precision: Array | None = None
+        self, linear: "LinearModel", response: Array, points: PointSums | None = None, prior: Prior | None = None
     ) -> Trial:
-        """A model with the columns of a response (·, k); `points` belong to its last ones; (k,) prior around zero."""
+        """A model with the columns of a response (·, k); `points` belong to its last ones; prior of k coefficients."""
         ...
 
     def touched(self, views: Indices) -> Mask:
@@ -92,6 +92,8 @@ class LinearModel(ErrorModel):
     model: Model
     observation: Observation
     design: Array  # (·, a) response to hand-eye, landmarks and effects in use
+    sizes: Array  # (a,) plausible ones of the effects' parameters; infinite for the rest
+    values: Array  # (a,) at which the parameters of effects in use stand; 0 for the rest
 
     def responses(self, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
@@ -126,18 +128,19 @@ class LinearModel(ErrorModel):
         white = self.whiten(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
-    def conditioned_on(self, columns: Array) -> "LinearModel":
-        """The linear model with further free columns (n, p) of the channel."""
+    def conditioned_on(self, columns: Array, sizes: Array) -> "LinearModel":
+        """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,)."""
         mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
         design = np.hstack([self.design, self.observation.expand(columns)])
-        out = replace(self, design=design, mixed=mixed, whole=None)
+        own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
+        out = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, whole=None)
         if self.pose_errors is None:
             return replace(out, null=fit_variances(mixed, start=self.null.variances))
         return out.refitted()
 
-    def trial(self, response: Array, points: PointSums | None = None, precision: Array | None = None) -> Trial:
+    def trial(self, response: Array, points: PointSums | None = None, prior: Prior | None = None) -> Trial:
         """A model with the columns of a response (·, k)."""
-        return self.observation.trial(self, response, points, precision)
+        return self.observation.trial(self, response, points, prior)
 
     @cached_property
     def present(self) -> Trial:

@@ -15,6 +15,14 @@ class PointSums(Protocol):
 
 
 @dataclass(frozen=True)
+class Prior:
+    """What is believed of k coefficients before anything is seen."""
+
+    precision: Array  # (k,) 0 where nothing is believed
+    middle: Array  # (k,)
+
+
+@dataclass(frozen=True)
 class Response:
     """Columns of P parameters in the coordinates of an observation: twists of the views, or rows of targets."""
 

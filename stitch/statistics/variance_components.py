@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 from stitch.frames import Array
 from stitch.statistics.inverse import inverted
-from stitch.statistics.variance_prior import NOISE, log_prior, usual_variances
+from stitch.statistics.variance_prior import NOISE, log_prior, prior_information, usual_variances
 
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 _ABSENT = 1e-300  # in place of a variance of zero, which has no logarithm
@@ -25,6 +25,9 @@ _FACTORS = (float(np.log(0.3)), float(np.log(1e8)))  # and of the factor on the 
 # Where further components may be absent, begun near the maximum, the third: their prior alone curves by 0.09, so that
 # the deviance is missed by less than slope²/(2·0.09), 0.005.
 _FLAT, _FLAT_AMONG_MANY, _FLAT_BEGUN, MANY_NUMBERS = 1e-4, 0.1, 0.03, 1_000
+# Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
+# (rounding alone moves that of thousands of numbers by a tenth of it), and the blocks from which they pay.
+_SCORINGS, _LEAP, _HALVINGS, _SETTLED, _MANY_BLOCKS = 10, 2.0, 4, 1e-3, 50
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,47 @@ def fit_variances(
     present = np.einsum("cbii->c", mixed.components) > 0
     bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
+    begin = [np.clip(s, *np.array(bounds).T) for s in begin]
+    near = _scored(problem, begin[0], flat) if len(begin) == 1 and present.all() else None
+    if near is not None:
+        return at_variances(mixed, np.exp(near), G, prior)
     search = partial(minimize, _deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    fits = [search(np.clip(s, *np.array(bounds).T)) for s in begin]
-    best = min(fits, key=lambda f: float(f.fun))
+    best = min((search(s) for s in begin), key=lambda f: float(f.fun))
     return at_variances(mixed, np.where(present, np.exp(best.x), 0.0), G, prior)
+
+
+def _scored(problem: "_Problem", begin: Array, flat: float) -> Array | None:
+    """(c,) log variances at the maximum by Fisher scoring, where it lies near; None where a search must look for it.
+
+    The expected curvature of the deviance is λ_iλ_j tr(V⁻¹C_iV⁻¹C_j), less what the mean takes. With thousands of
+    numbers in small blocks three steps do what a search without curvature needs sixteen for.
+    """
+    mixed = problem.mixed
+    if mixed.scales is not None or len(mixed.z) < _MANY_BLOCKS:
+        return None
+    x, (value, slope) = begin, _deviance(begin, problem)
+    for _ in range(_SCORINGS):
+        if np.abs(slope).max() < flat:
+            return x
+        variances = np.exp(x)
+        inverse, _ = inverted(mixed.covariance(variances))
+        shares = variances[:, None, None, None] * (inverse @ mixed.components)
+        curvature = np.einsum("cbij,dbji->cd", shares, shares, optimize=True)
+        # In the log of a variance that is hardly seen the likelihood curves by its slope.
+        curvature += np.diag(2 * prior_information(variances, None) + np.maximum(slope - log_prior(x, None)[1], 0.0))
+        step = -np.linalg.solve(curvature, slope)
+        if -0.5 * float(slope @ step) < _SETTLED:
+            return x
+        step *= min(1.0, _LEAP / float(np.abs(step).max()))
+        for _ in range(_HALVINGS):
+            lower, its_slope = _deviance(x + step, problem)
+            if lower <= value + _SETTLED:
+                break
+            step /= 2
+        else:
+            return None
+        x, value, slope = x + step, lower, its_slope
+    return None
 
 
 def at_variances(

@@ -27,9 +27,8 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
 
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
     effects are added one by one as long as one can be named beside those before; then each must hold its
-    place beside all the others. Of those that err beyond the measured poses the one without which the others err
-    least is left out, and the search goes on: what it imitated others may explain. For that choice nothing is
-    believed to be larger than found: beside an imitation the right effect is hardly known without an end.
+    place beside all the others. Of those that err beyond the measured poses the one that errs most is left out, and
+    the search goes on: what it imitated others may explain.
     """
     candidates = [c for c in candidates if not c.empirical]
     chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
@@ -40,7 +39,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         erring = {name: found for name, found in tried if found is not None and not found.helps}
         if not erring:
             return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
-        name = max(erring, key=lambda name: erring[name].believed)
+        name = max(erring, key=lambda name: erring[name].share)
         refused[name] = erring[name].objection(name)
         candidates = [c for c in candidates if c.name != name]
         chosen = _grown(linear, candidates, [r for r in chosen if r.name != name])
@@ -78,5 +77,7 @@ def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> Line
 
 
 def _conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
-    columns = [r.score.form.columns for r in chosen]
-    return linear.conditioned_on(np.hstack(columns)) if columns else linear
+    if not chosen:
+        return linear
+    forms = [r.score.form for r in chosen]
+    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]))

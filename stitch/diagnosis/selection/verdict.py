@@ -152,10 +152,10 @@ def _both(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) ->
     if second is None:
         return None
     others = [c for c in candidates if c.name != second.name and not c.empirical]
-    first, *rest = ranked_all(linear.conditioned_on(second.score.form.columns), others)[0]
+    first, *rest = ranked_all(linear.conditioned_on(second.score.form.columns, second.score.form.sizes), others)[0]
     if not certain(first) or any(contends(r) and r.log_posterior > first.log_posterior - ODDS for r in rest):
         return None
-    beside_first = linear.conditioned_on(first.score.form.columns)
+    beside_first = linear.conditioned_on(first.score.form.columns, first.score.form.sizes)
     again = ranked_one(beside_first, second.score.candidate, tests=len(others))
     return (first, again) if certain(again) else None
 
@@ -163,5 +163,5 @@ def _both(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) ->
 def _second(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
     """The effect that explains most beside the best one, if it is certain."""
     others = [c for c in candidates if c.name != best.name and not c.empirical]
-    ranked, _ = ranked_all(linear.conditioned_on(best.score.form.columns), others)
+    ranked, _ = ranked_all(linear.conditioned_on(best.score.form.columns, best.score.form.sizes), others)
     return next((r for r in ranked if certain(r)), None)

@@ -7,6 +7,7 @@ import numpy as np
 from stitch.diagnosis.score import Score, score
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel, Trial
+from stitch.observations.response import Prior
 
 # Of a plausible size: what was not found has some size, or its prior would have none.
 _NOTHING = 1e-6
@@ -75,8 +76,8 @@ def _left_out(linear: LinearModel, scored: Score) -> tuple[Trial, list[float], l
     return trial, shares, weights, scatter
 
 
-def believed_size(linear: LinearModel, scored: Score) -> Array:
-    """(k,) precision of a prior for model and candidate in fits without some views.
+def believed_size(linear: LinearModel, scored: Score) -> Prior:
+    """Prior for model and candidate in fits without some views.
 
     Views that carry most of an effect leave little to predict it from where they are left out. So without them the
     effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
@@ -84,7 +85,8 @@ def believed_size(linear: LinearModel, scored: Score) -> Array:
     """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
     size = np.maximum(size, _NOTHING * scored.form.sizes)
-    return np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
+    precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
+    return Prior(precision, np.zeros(len(precision)))
 
 
 def share_of(with_it: Array, without: Array) -> tuple[float, float]:

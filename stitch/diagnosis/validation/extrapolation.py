@@ -1,8 +1,9 @@
 """Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
 
 A wrong effect may imitate among the measured poses what is not known, and err beyond them; left-out neighbours in
-time or pose lie among the others and do not show it. It must help at all ends together, and must not make a single
-one worse by more than chance, however much it helps elsewhere.
+time or pose lie among the others and do not show it. The ends judge together. Where more than one thing is missing, a
+right effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many ends
+and is far off at others. So a further end must be likely to become better, the ends being samples of it.
 """
 
 from dataclasses import dataclass
@@ -10,10 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.validation.cross_validation import believed_size, share_of
+from stitch.diagnosis.validation.cross_validation import share_of
+from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.response import Prior
 from stitch.statistics.folds import JointEnd
-from stitch.statistics.tails import normal_limit, normal_tail
+from stitch.statistics.tails import normal_tail
+
+# Odds of three to one that an end of which nobody knows would be predicted better.
+_LIKELY = 0.75
+# Of Student's t, and a prior so wide that all views find what they can see.
+_FREEDOM, _WIDE = 4.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -25,37 +33,50 @@ class Extrapolation:
     worst: JointEnd
     worst_share: float  # the same at the end that is made worse most clearly
     worst_sigma: float  # standard error of `worst_share`, views as samples
-    count: int  # of ends
-    believed: float  # `share` where the other views are not believed to know a larger effect than all views do
+    likely: float  # probability that a further end is predicted better
 
     @property
     def helps(self) -> bool:
-        """True if the ends are predicted better by more than a standard error, and none is worse by more than chance.
-
-        Of many ends one is worse by a standard error sooner than a single one is (Bonferroni).
-        """
-        chance = normal_limit(normal_tail(1.0) / self.count)
-        return self.share <= 1 - self.sigma and self.worst_share <= 1 + chance * self.worst_sigma
+        """True if the ends together are predicted better by more than a standard error, and a further one probably."""
+        return self.share <= 1 - self.sigma and self.likely >= _LIKELY
 
     def objection(self, name: str) -> str:
         """What speaks against an effect that explains much."""
         return (
             f"{name} would help among the poses that were measured, but not beyond: at ends of joints' ranges that are "
             f"left out it leaves {self.share:.2f} ± {self.sigma:.2f} of the mean square error, "
-            f"{self.worst_share:.2f} ± {self.worst_sigma:.2f} in {self.worst.name}"
+            f"{self.worst_share:.2f} ± {self.worst_sigma:.2f} in {self.worst.name}; a further end would become better "
+            f"with a probability of {self.likely:.0%}"
         )
 
 
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     """The best form of a candidate at the ends; None where the views are too few to leave one out."""
-    X = np.hstack([linear.design, scored.form.response])
-    trials = linear.trial(X), linear.present, linear.trial(X, None, believed_size(linear, scored))
     ends = linear.observation.ends(linear.measurement.views.joints)
     if not ends:
         return None
+    a, X = linear.design.shape[1], np.hstack([linear.design, scored.form.response])
+    prior = _plausible(linear, X, np.append(linear.sizes, scored.form.sizes))
+    trials = linear.trial(X, None, prior), linear.trial(X[:, :a], None, Prior(prior.precision[:a], prior.middle[:a]))
     squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]
-    shares = [share_of(with_it, without) for with_it, without, _ in squares]
+    shares = [share_of(with_it, without) for with_it, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
-    with_it, without, believed = np.array([[own.sum() for own in row] for row in squares]).T
-    total = share_of(with_it, without)
-    return Extrapolation(*total, ends[worst], *shares[worst], len(ends), float(believed.sum() / without.sum()))
+    total = share_of(*np.array([[own.sum() for own in row] for row in squares]).T)
+    logs = np.log([max(share, 1e-300) for share, _ in shares])
+    spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
+    likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
+    return Extrapolation(*total, ends[worst], *shares[worst], likely)
+
+
+def _plausible(linear: LinearModel, X: Array, sizes: Array) -> Prior:
+    """A prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
+
+    What the other views hardly see would otherwise be anything, and the end would judge that instead of the effect. The
+    normal prior that stands for t with ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1)
+    (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
+    """
+    middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
+    free = 1 / (_WIDE * sizes) ** 2
+    found = linear.trial(X, None, Prior(free, middle)).solve() - middle
+    known = np.where(np.isfinite(sizes), found, 0.0)
+    return Prior((_FREEDOM + 1) / (_FREEDOM * sizes**2 + known**2), middle)

@@ -13,7 +13,7 @@ from stitch.model.term import Term, stacked
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import pose_errors
-from stitch.observations.response import PointSums, Response
+from stitch.observations.response import PointSums, Prior, Response
 from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.pose_channel import PoseChannel, mixed_model, pose_channel
@@ -52,10 +52,10 @@ class Surfaces:
         return np.asarray(np.linalg.pinv(self.channel.reduction) @ columns)
 
     def trial(
-        self, linear: LinearModel, response: Array, points: PointSums | None = None, precision: Array | None = None
+        self, linear: LinearModel, response: Array, points: PointSums | None = None, prior: Prior | None = None
     ) -> SurfaceTrial:
         """A model with the columns of twists (6V, k)."""
-        return SurfaceTrial(linear, self.freed, response, points, precision)
+        return SurfaceTrial(linear, self.freed, response, points, prior)
 
     def touched(self, views: Indices) -> Mask:
         """(pairs,) with one of the views."""
@@ -99,6 +99,15 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
         errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
         mixed = with_errors(mixed, errors)
     null = fit_variances(mixed, both_starts=True)
+    values = np.array([p.value for p in stacked(model.terms)])
     return LinearModel(
-        measurement, model, Surfaces(capture, freed, channel), design, mixed=mixed, null=null, pose_errors=errors
+        measurement,
+        model,
+        Surfaces(capture, freed, channel),
+        design,
+        sizes=np.append(np.full(6, np.inf), sizes[seen]),
+        values=np.append(np.zeros(6), values[seen]),
+        mixed=mixed,
+        null=null,
+        pose_errors=errors,
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch.frames import Array, Indices
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.response import PointSums
+from stitch.observations.response import PointSums, Prior
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.gram import pair_squares
 from stitch.observations.surfaces.point_gram import PointGram
@@ -21,13 +21,14 @@ class SurfaceTrial:
     freed: FreePoses
     X: Array
     points: PointSums | None = None
-    precision: Array | None = None  # (k,) of a prior around zero
+    prior: Prior | None = None
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) by generalised least squares without some views."""
         white, z = self._white(self.X), self.linear.white_z
-        if self.precision is not None:
-            white, z = np.vstack([white, np.diag(np.sqrt(self.precision))]), np.append(z, np.zeros(self.X.shape[1]))
+        if self.prior is not None:
+            half = np.sqrt(self.prior.precision)
+            white, z = np.vstack([white, np.diag(half)]), np.append(z, half * self.prior.middle)
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
             free = self._white(self._twists_of(left_out))

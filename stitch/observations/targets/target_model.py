@@ -11,7 +11,7 @@ from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import Term, stacked
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.response import PointSums, Response
+from stitch.observations.response import PointSums, Prior, Response
 from stitch.observations.targets.landmarks import Drawing, Landmarks, initial_landmarks
 from stitch.observations.targets.rows import Rows, effect_columns, effect_rows, mixed_model_of_rows, rows_of
 from stitch.observations.targets.target_trial import TargetTrial
@@ -42,10 +42,10 @@ class Targets:
         return columns
 
     def trial(
-        self, linear: LinearModel, response: Array, points: PointSums | None = None, precision: Array | None = None
+        self, linear: LinearModel, response: Array, points: PointSums | None = None, prior: Prior | None = None
     ) -> TargetTrial:
         """A model with the columns of rows (n, k)."""
-        return TargetTrial(self.rows, linear.covariance, linear.in_blocks(response), precision)
+        return TargetTrial(self.rows, linear.covariance, linear.in_blocks(response), prior)
 
     def touched(self, views: Indices) -> Mask:
         """(V,) the views themselves."""
@@ -90,4 +90,14 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     A = np.concatenate([base, extra[..., seen]], axis=2)
     mixed = mixed_model_of_rows(rows, A)
     null = fit_variances(mixed, both_starts=True)
-    return LinearModel(measurement, model, Targets(rows, landmarks), A.reshape(n, -1), mixed=mixed, null=null)
+    values = np.array([p.value for p in parameters])
+    return LinearModel(
+        measurement,
+        model,
+        Targets(rows, landmarks),
+        A.reshape(n, -1),
+        sizes=np.append(np.full(base.shape[2], np.inf), sizes[seen]),
+        values=np.append(np.zeros(base.shape[2]), values[seen]),
+        mixed=mixed,
+        null=null,
+    )

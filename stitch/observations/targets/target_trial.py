@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from stitch.frames import Array, Indices
+from stitch.observations.response import Prior
 from stitch.observations.targets.rows import Rows
 from stitch.statistics.block_least_squares import Blocks
 
@@ -20,13 +21,13 @@ class TargetTrial:
     rows: Rows
     covariance: Array  # (B, m, m)
     X: Array
-    precision: Array | None = None  # (k,) of a prior around zero
+    prior: Prior | None = None
 
     @cached_property
     def blocks(self) -> Blocks:
         zero = np.zeros(self.X.shape[2])
-        prior = zero if self.precision is None else self.precision
-        return Blocks(-self.rows.residual, self.X, self.covariance, prior, zero)
+        precision, middle = (zero, zero) if self.prior is None else (self.prior.precision, self.prior.middle)
+        return Blocks(-self.rows.residual, self.X, self.covariance, precision, precision * middle)
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) without some views."""
