@@ -14,7 +14,7 @@ PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
 
 export RERUN_ANALYTICS ?= off
 
-.PHONY: install demo test lint check lock clean
+.PHONY: install demo test lint check docs lock clean
 
 install: $(STAMP)
 
@@ -53,12 +53,25 @@ check: lint
 	$(PYTHON) -m pytest -m "slow or not slow" --cov
 	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=90
 
+# The pages as a site in build/site, which needs no server: open index.html. A warning or a dead link ends it.
+docs: install
+ifdef UV
+	uv pip install --quiet --python $(PYTHON) --require-hashes -r constraints.txt -r constraints-docs.txt
+else
+	$(PIP) install --require-hashes -r constraints.txt -r constraints-docs.txt
+endif
+	$(PYTHON) -m bench.docs_site
+	$(VENV)/bin/zensical build --clean --strict --config-file mkdocs.yml
+
 # Pins every package with hashes. What other indexes or settings of this machine might write into it is refused.
 lock:
 	@command -v uv >/dev/null || { echo "make lock needs uv" >&2; exit 2; }
 	uv pip compile pyproject.toml constraints.in --extra dev --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints.txt
-	@! grep -nE '://| @ |^-' constraints.txt || { echo "constraints.txt names an address" >&2; exit 1; }
+	uv pip compile pyproject.toml --extra docs --universal --python-version 3.11 --generate-hashes --constraint constraints.txt \
+		$$(sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' constraints.txt) \
+		--no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints-docs.txt
+	@! grep -nE '://| @ |^-' constraints.txt constraints-docs.txt || { echo "they name an address" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage .cache build *.egg-info

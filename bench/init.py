@@ -3,7 +3,7 @@
 The five objects of RegHEC, nine views each. Twelve orders of Euler angles × poses inverted or not, 24 tables an object;
 axes that turn along or stand still, degrees or radians, mm or m, angles or positions first are drawn for each. Right:
 order, direction, unit and mount as they were; wrong: told, but otherwise than they were. --tables writes the table of
-docs/own-data.md.
+docs/conventions-told.md.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from stitch.measurement.capture import Capture
 from stitch.reading.clouds import read_cloud
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "own-data.md"
+PAGE = ROOT / "docs" / "conventions-told.md"
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
 OBJECTS = dict.fromkeys(("david", "cone", "sphere", "rubik"), "eye_in_hand") | {"gripperopen": "eye_to_hand"}
 BEGIN, END = "<!-- scrambled: begin -->\n", "<!-- scrambled: end -->"
@@ -87,7 +87,7 @@ class Cell:
 def main() -> None:
     """Print a line a table and the counts; with --tables write them into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tables", action="store_true", help="write the table of docs/own-data.md")
+    parser.add_argument("--tables", action="store_true", help="write the table of docs/conventions-told.md")
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--views", type=int, default=9, help="the first so many of nine")

@@ -31,7 +31,6 @@ LONGEST = (
     "test_blade_diagnosis.py",
     "test_diagnosis_commands.py",
     "test_admission.py",
-    "test_readme_example.py",
     "test_run_folder.py",
     "test_window.py",
     "test_surface_stages.py",

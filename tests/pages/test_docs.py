@@ -6,15 +6,11 @@ import threading
 from pathlib import Path
 
 import pytest
-import typer
 
 import stitch
-from stitch.cli.main import build
-from stitch.effects import EFFECTS
-from stitch.effects.user_file import load
 from stitch.writing.run_folder import write_run
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FOLDERS = ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
 # Files of somebody's own, of sessions and of run folders.
@@ -78,50 +74,6 @@ def test_pages_use_the_field_s_words(page):
     assert not [found.group() for found in PRIVATE.finditer(text)]
 
 
-@pytest.fixture(scope="module")
-def options() -> dict[str, set[str]]:
-    """Every command of `stitch`, those of `calibrate` by both words, with its options."""
-    group = typer.main.get_command(build())
-    found = dict(group.commands)
-    found |= {f"calibrate {name}": command for name, command in found.pop("calibrate").commands.items()}
-    return {name: {o for p in command.params for o in (*p.opts, *p.secondary_opts)} for name, command in found.items()}
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_of_a_page_has_the_options_that_it_shows(page, options):
-    text = page.read_text(encoding="utf-8")
-    lines = [*re.findall(r"^(?:\$ |    )?(?:\.venv/bin/)?stitch (.+)$", text, re.MULTILINE)]
-    lines += [text.removeprefix("stitch ") for text in quoted(page) if text.startswith("stitch ")]
-    known = {"--help", "--version", "--tables", "--seeds", "--scheduler"}.union(*options.values())
-    assert not [o for text in quoted(page) for o in re.findall(r"^--[a-z][\w-]*", text) if o not in known]
-    for line in lines:
-        command = next((c for c in sorted(options, key=len, reverse=True) if re.match(rf"{c}\b", line)), None)
-        assert command or re.match(r"(calibrate$|[A-Z]|--(help|version)$)", line), line
-        asked = re.findall(r"(?<![\w-])--?[a-z][\w-]*", line.split("#")[0])
-        assert command is None or not {o for o in asked if o not in options[command] and o != "--help"}, line
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_python_of_a_page_names_what_there_is(page):
-    for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
-        compile(block, page.name, "exec")
-        imports = [line for line in block.splitlines() if re.match(r"(from|import) ", line)]
-        exec("\n".join(imports), {})
-        assert not [name for name in re.findall(r"\bstitch\.(\w+)\(", block) if name not in stitch.__all__]
-
-
-def test_the_effect_of_the_page_is_a_file_that_loads(tmp_path):
-    before, file = dict(EFFECTS), tmp_path / "mine.py"
-    page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-    file.write_text(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], encoding="utf-8")
-    try:
-        assert load(file) == ["humidity_bias"]
-        assert EFFECTS["humidity_bias"].parameters(6, (), "mm")[0].unit == "mm"
-    finally:
-        EFFECTS.clear()
-        EFFECTS.update(before)
-
-
 def test_every_function_and_form_of_the_walks_is_in_the_file_that_it_links_to():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     for name, file in re.findall(r"\[`(\w+)`\]\(\.\./([\w/]+\.py)\)", text):
@@ -135,9 +87,8 @@ def test_rooms_of_the_pages_are_those_of_the_tree():
         path.name for path in (ROOT / "stitch").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }
     architecture = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8").split("## How it works")[1]
     for room in rooms - {"__init__.py"}:
-        assert f"(../stitch/{room})" in architecture and re.search(rf"\b{re.escape(room)}(?![\w.])", readme), room
+        assert f"(../stitch/{room})" in architecture, room
 
 
 def test_a_cloud_walks_as_the_page_says(session, tmp_path):

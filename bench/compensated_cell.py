@@ -1,19 +1,12 @@
-"""Run the example of docs/back-into-the-cell.md and write what it prints: python -m bench.back_into_the_cell_output.
-
-A blade cell whose arm gives way under load is simulated and run with that effect in the model; the page's commands
-take its results back into the cell.
-"""
+"""The cell of docs/back-into-the-cell.md: an arm that gives way under load, a program, what the true arm does."""
 
 import json
 import os
-import re
-import tempfile
 from contextlib import redirect_stderr
 from pathlib import Path
 
 import numpy as np
 
-from bench.readme_output import BEGIN, END, commands, printed, shown
 from data_synth import kinematics
 from data_synth.commands import synth
 from data_synth.fixtures.true_arm import true_flanges
@@ -23,8 +16,6 @@ from stitch.controllers.program import read_program
 from stitch.frames import Array
 
 BASE, TOOL = "0,0,0,0,0,0", "0,0,150,0,0,0"
-TRUTH = re.compile(r"(?<=<!-- truth: begin -->\n).*?(?=\n<!-- truth: end -->)", re.DOTALL)
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "back-into-the-cell.md"
 PROGRAM = """DEF SCAN ( )
 ;FOLD SPTP home
 PTP {A1 11.0,A2 -68.0,A3 108.0,A4 -17.0,A5 56.0,A6 -70.0}
@@ -36,22 +27,13 @@ END
 """
 
 
-def prepare(folder: Path) -> None:
+def write_cell(folder: Path) -> None:
     """A run `found` of a cell, and a program `scan.src`, in `folder`."""
     synth("blade", folder / "cell", hide=["joint_compliance=3"], views=10, seed=4)
     with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
         try:
-            stitch(
-                [
-                    "run",
-                    str(folder / "cell"),
-                    "-o",
-                    str(folder / "found"),
-                    "--effects",
-                    "joint_compliance",
-                    "--no-recording",
-                ]
-            )
+            words = ["--effects", "joint_compliance", "--no-recording"]
+            stitch(["run", str(folder / "cell"), "-o", str(folder / "found"), *words])
         except SystemExit as ended:
             if ended.code:
                 raise RuntimeError("the run of the example failed") from None
@@ -90,19 +72,7 @@ def truth(folder: Path) -> str:
     )
 
 
-def main() -> None:
-    """Write the example into the page, and what the true arm does."""
-    example, text = shown(PAGE), PAGE.read_text(encoding="utf-8")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        prepare(folder)
-        anew = printed(commands(example), folder)
-        told = truth(folder)
-        line = next(x for x in (folder / "scan-compensated.src").read_text().splitlines() if "; along" in x)
-    text = text.replace(BEGIN + example + END, BEGIN + anew + END)
-    text = re.sub(r"(?m)^LIN .*; along$", line, text)
-    PAGE.write_text(TRUTH.sub(told, text), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+def moved_line(folder: Path) -> str:
+    """One of the program's targets, as the copy has it."""
+    copy = (folder / "scan-compensated.src").read_text(encoding="utf-8")
+    return next(line for line in copy.splitlines() if "; along" in line)

@@ -7,13 +7,13 @@ from stitch.intake.found_files import PROGRAMS
 from stitch.intake.raw_poses import STRUCTURED, TABLES
 from stitch.reading.clouds import CLOUD_SUFFIXES
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "own-data.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 BAGS = (".bag", ".db3", ".mcap")
 
 
 def rows():
-    table = PAGE.read_text(encoding="utf-8").split("## Formats")[1].split("##")[0]
-    return [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("|")][2:]
+    table = PAGE.read_text(encoding="utf-8").split("\n| file ")[1]
+    return [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
 
 
 def test_every_kind_of_file_stands_in_the_table():
@@ -21,7 +21,10 @@ def test_every_kind_of_file_stands_in_the_table():
     assert {*CLOUD_SUFFIXES, *TABLES, *STRUCTURED, *PROGRAMS, *BAGS} <= named
 
 
-def test_every_row_has_its_test():
+def test_every_row_has_its_tests():
     for row in rows():
-        tests = re.findall(r"\]\(([^)]+)\)", row[3])
-        assert tests and all((PAGE.parent / test).is_file() for test in tests), row[0]
+        tests = re.findall(r"\[`(\w+)`\]\(([^)]+)\)", row[3])
+        assert tests, row[0]
+        for name, file in tests:
+            text = (PAGE.parent / file).read_text(encoding="utf-8")
+            assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file} has no {name}"

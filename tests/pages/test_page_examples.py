@@ -1,0 +1,58 @@
+"""The commands and the Python of every page, run in the folder that the page speaks of: they print what it shows."""
+
+import re
+from contextlib import chdir
+
+import pytest
+
+from bench.compensated_cell import PROGRAM, moved_line, tool_errors
+from bench.page_blocks import PAGES, blocks, examples
+from bench.page_examples import differences, printed
+from stitch.effects import EFFECTS
+
+# A second or two each; the others simulate, run and diagnose.
+CHEAP = {"base-to-base", "drilling", "effects", "session"}
+RUN = [page for page in PAGES if any(b.language in ("console", "python") and not b.not_run for b in blocks(page))]
+
+
+@pytest.fixture
+def same_library():
+    """Effects of one's own are gone afterwards."""
+    before = dict(EFFECTS)
+    yield
+    EFFECTS.clear()
+    EFFECTS.update(before)
+
+
+@pytest.mark.usefixtures("no_drawing", "same_library")
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=p.name, marks=() if p.stem in CHEAP else pytest.mark.slow) for p in RUN]
+)
+def test_a_page_prints_what_it_shows(page, tmp_path):
+    for anew, shown in zip(printed(page, tmp_path), examples(page), strict=True):
+        assert not differences(anew, shown), f"to fix: python -m bench.page_examples docs/{page.name}"
+    own = {}
+    with chdir(tmp_path):
+        for block in blocks(page):
+            if block.language == "python" and not block.not_run:
+                exec(compile(block.text, page.name, "exec"), own)
+    if page.stem == "back-into-the-cell":
+        the_copy_is_right(tmp_path, page.read_text(encoding="utf-8"))
+
+
+def the_copy_is_right(folder, page):
+    """Only numbers differ from the program, as the page shows; the true arm shares no code with the model."""
+    number = re.compile(r"-?\d[\d,.e-]*")
+    copy = (folder / "scan-compensated.src").read_text()
+    assert copy != PROGRAM and number.sub("#", copy) == number.sub("#", PROGRAM)
+    assert not differences(moved_line(folder), re.search(r"(?m)^LIN .*; along$", page)[0])
+    before, after = (tool_errors(folder, name) for name in ("scan.src", "scan-compensated.src"))
+    assert after.max() < 0.1 * before.min()
+
+
+def test_another_number_and_another_word_are_seen():
+    shown = "held-out 40.4 µm, p = 8e-18, 1,200 points"
+    assert not differences("held-out 40.5 µm, p = 7e-18, 1,199 points", shown)
+    assert differences("held-out 40.6 µm, p = 8e-18, 1,200 points", shown)
+    assert differences("held out 40.4 µm, p = 8e-18, 1,200 points", shown)
+    assert differences(shown + " more", shown)
