@@ -174,12 +174,12 @@ def hand_eye_rows(document: dict[str, Any], unit: str) -> list[tuple[str, str]]:
     return [
         ("translation", f"{_row(T[:3, 3], unit)} ± {_row(document['translation_sigma_mount'], unit)} {unit}"),
         ("rotation", "\n".join(" ".join(f"{x:+.6f}" for x in row) for row in T[:3, :3])),
-        ("sigma of rotation", f"{_row(np.degrees(sigma[:3]))} ° about scanner x, y, z"),
+        ("sigma of rotation", f"{', '.join(f'{1e3 * x:.2g}' for x in sigma[:3])} mrad about scanner x, y, z"),
         ("sigma of translation", f"{_row(sigma[3:], unit)} {unit} along scanner x, y, z"),
     ]
 
 
 def _row(values: Any, unit: str = "mm") -> str:
-    """Numbers to a micrometre, or to a thousandth of a degree."""
+    """Lengths to a micrometre."""
     digits = 6 if unit == "m" else 3
     return ", ".join(f"{x:.{digits}f}" for x in values)

@@ -47,13 +47,23 @@ def gltf():
     })  # fmt: skip
 
 
+def glb():
+    """The same as one binary file: a header, the JSON padded with blanks, no further chunk."""
+    text = gltf().encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sII", b"glTF", 2, 20 + len(text)) + struct.pack("<I4s", len(text), b"JSON") + text
+
+
 def as_sets(points):
     return {tuple(np.round(p, 4)) for p in points}
 
 
-@pytest.mark.parametrize(("name", "text"), [("s.stl", STL), ("s.obj", OBJ), ("s.off", OFF), ("s.gltf", gltf())])
-def test_meshes_are_their_vertices_each_once_with_normals(tmp_path, name, text):
-    (tmp_path / name).write_text(text, encoding="utf-8")
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("s.stl", STL), ("s.obj", OBJ), ("s.off", OFF), ("s.gltf", gltf()), ("s.glb", glb())],
+)
+def test_meshes_are_their_vertices_each_once_with_normals(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     cloud = read_cloud(tmp_path / name)
     assert len(cloud.points) == 4 and as_sets(cloud.points) == as_sets(CORNERS)
     assert np.allclose(cloud.normals, [0, 0, 1])
