@@ -3,8 +3,10 @@
 import re
 
 import pytest
+import typer
 
 from bench.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
+from stitch.cli.main import build
 
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
@@ -39,6 +41,11 @@ def test_every_form_of_a_command_parses(page):
             path = module[1] if module[1].endswith(".py") else module[1].replace(".", "/") + ".py"
             assert (ROOT / path).is_file(), line
     assert not wrong
+
+
+def test_every_command_stands_on_the_page_of_commands():
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert not [name for name in typer.main.get_command(build()).commands if f"stitch {name}" not in page]
 
 
 @pytest.mark.parametrize(
