@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK, PICTURE = ROOT / "docs" / "error-falls.ipynb", ROOT / "docs" / "pictures" / "error-falls.png"
-_DPI = 110
+_DPI, _COLOURS = 110, 256
 
 
 def cells(file: Path) -> list[dict[str, Any]]:
@@ -67,10 +68,11 @@ def _outputs(count: int, text: str, value: Any) -> list[dict[str, Any]]:
     if text:
         found.append({"name": "stdout", "output_type": "stream", "text": text.splitlines(keepends=True)})
     if isinstance(value, Figure):
-        drawn = io.BytesIO()
+        drawn, small = io.BytesIO(), io.BytesIO()
         value.savefig(drawn, format="png", dpi=_DPI)
-        PICTURE.write_bytes(drawn.getvalue())
-        data = {"image/png": base64.b64encode(drawn.getvalue()).decode()}
+        Image.open(drawn).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        PICTURE.write_bytes(small.getvalue())
+        data = {"image/png": base64.b64encode(small.getvalue()).decode()}
         found.append({"data": data, "execution_count": count, "metadata": {}, "output_type": "execute_result"})
     return found
 

@@ -59,4 +59,4 @@ def _bars(axes: Axes, run: Run, um: float) -> None:
     axes.set_xticks(place, [change_of(run.ledger, i) for i in place])
     axes.set_ylabel("rms between views (µm)")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0))
