@@ -23,7 +23,7 @@ FORMAT = "stitch-session/1"
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
     "scanner": {"pose", "noise", "standoff", "optical_axis", "kind"},
-    "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity"},
+    "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
 }
