@@ -7,8 +7,9 @@ import numpy as np
 
 from bench.page_blocks import ROOT, blocks
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
-from stitch.pipeline import run
+from stitch.pipeline import diagnose, run
 from stitch.reading.session_folder import load_session
+from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.result_document import ledger, result_document
 
 PAGE = ROOT / "docs" / "session.md"
@@ -31,5 +32,8 @@ def test_the_session_of_the_page_is_read(session):
 def test_every_key_that_a_run_writes_stands_on_the_page(few_effects):
     cell, *_ = labelled_cell(1, views=12)
     found = run(cell)
+    diagnosed = diagnosis_document(diagnose(found))
+    candidates = [row | {"candidates": None} for row in diagnosed.pop("candidates")]
     named = set(re.findall(r"`([\w]+)`", PAGE.read_text(encoding="utf-8")))
-    assert not {key for document in (result_document(found), *ledger(found)) for key in document} - named
+    documents = (result_document(found), *ledger(found), diagnosed, *candidates)
+    assert not {key for document in documents for key in document} - named
