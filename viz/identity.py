@@ -1,19 +1,17 @@
 """What a page is about: object, time, arm, scanner, versions, and a hash that tells one session from another."""
 
-import csv
-import hashlib
 import platform
 from datetime import UTC, datetime
 from importlib.metadata import version
 
 from stitch.measurement.session import Session
+from stitch.reading.session_hash import session_hash
 from stitch.runs.run import Run
 
-_TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
-_BLOCK = 1 << 20
+Row = tuple[str, str]
 
 
-def identity(run: Run) -> list[tuple[str, str]]:
+def identity(run: Run) -> list[Row]:
     """Rows of label and text; nothing that the session does not state."""
     session = run.session
     scanner = "fixed in the cell, part on the flange" if session.mount == "eye_to_hand" else "on the flange, part fixed"
@@ -24,34 +22,23 @@ def identity(run: Run) -> list[tuple[str, str]]:
     return [
         ("Session", session.name),
         ("Views", f"{len(session.views)}{of}, {_points(session)}"),
-        ("Page written", datetime.now(UTC).strftime("%Y-%m-%d")),
+        page_written(),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
         ("Scanner", scanner + stated),
         ("Model", ", ".join(["hand-eye", *run.effects])),
-        ("stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"),
+        versions(),
         ("SHA-256 of the session", session_hash(session)),
     ]
 
 
-def session_hash(session: Session) -> str:
-    """SHA-256 over the session's tables and the clouds that they name, in this order; first 16 digits.
+def page_written() -> Row:
+    """The day, UTC."""
+    return "Page written", datetime.now(UTC).strftime("%Y-%m-%d")
 
-    A dash where the session does not lie on disk any more.
-    """
-    found = hashlib.sha256()
-    try:
-        files = [session.path / name for name in _TABLES if (session.path / name).is_file()]
-        with open(session.path / "views.csv", encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-        files += [session.path / row["cloud"].strip() for row in rows if row.get("cloud")]
-        for path in files:
-            found.update(path.relative_to(session.path).as_posix().encode() + b"\0")
-            with open(path, "rb") as file:
-                while block := file.read(_BLOCK):
-                    found.update(block)
-    except (OSError, ValueError, csv.Error):
-        return "–"
-    return found.hexdigest()[:16]
+
+def versions() -> Row:
+    """What computed it."""
+    return "stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"
 
 
 def _points(session: Session) -> str:

@@ -7,12 +7,12 @@ from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory, model_history
 from stitch.comparison.plain_verdict import judged, plain_verdict
 from stitch.runs.run import Run
-from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
-from viz.filled_templates import render, script_json
+from viz.filled_templates import script_json
 from viz.history_figures import waterfall
 from viz.identity import identity
+from viz.page_head import Head, write_page
 from viz.page_parts import png, svg
 from viz.page_tables import effect_rows, hand_eye_rows, matrix, note_rows, target_rows, view_rows
 from viz.part_camera import camera_for
@@ -30,21 +30,30 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    page = render("report.html.j2", **_content(run, tolerance))
-    with whole(path) as file:
-        file.write_text(page, encoding="utf-8")
+    history = model_history(run)
+    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history))
 
 
-def _content(run: Run, tolerance: float | None) -> dict[str, object]:
-    history, unit = model_history(run), run.session.length_unit
+def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
+    unit = run.session.length_unit
+    gone = [f"View {item.view} does not belong and was left out: {item.why}." for item in run.left_out]
+    hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
+    return Head(
+        title=run.session.name,
+        verdict=run.verdict if history is None else plain_verdict(history, unit),
+        identities=[("", identity(run))],
+        lights=[] if history is None or tolerance is None else [judged(history, tolerance, unit)],
+        evidence="" if history is None else run.verdict,
+        notes=[*gone, *hidden],
+    )
+
+
+def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
+    unit = run.session.length_unit
     rows = view_rows(run, history)
     return {
         "run": run,
         "um": MICROMETRES[unit],
-        "headline": run.verdict if history is None else plain_verdict(history, unit),
-        "evidence": "" if history is None else run.verdict,
-        "light": None if history is None or tolerance is None else judged(history, tolerance, unit),
-        "identity": identity(run),
         "part": None if history is None else _part(run, history),
         "first": rows[:_FIRST],
         "rest": rows[_FIRST:],

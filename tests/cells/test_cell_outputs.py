@@ -1,6 +1,7 @@
 """What the cells' commands hand out beside their results: sessions that close, pages and recordings that are whole."""
 
 import csv
+import hashlib
 import re
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from stitch.cells import outputs
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
+from viz.cells.job_identity import job_identity
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 JOBS = {
@@ -179,6 +181,32 @@ def test_page_needs_nothing_beside_it(handed_out, command, wanted):
     page = (handed_out / f"{command}.html").read_text()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)
     assert wanted in page
+
+
+def test_all_pages_have_the_block_of_a_run(handed_out):
+    """Job in place of session; the light is there where the job or the command states what is allowed."""
+    for command in JOBS:
+        page = (handed_out / f"{command}.html").read_text()
+        labels = re.findall(r"<dt>(.*?)</dt>", page)
+        assert {"Job", "Measured", "Page written", "Arm", "stitch", "SHA-256 of the job"} <= set(labels)
+        assert f"<dd>{JOBS[command].name}</dd>" in page
+        assert ('class="light' in page) == (command != "drill")
+
+
+def test_the_hash_of_a_job_is_that_of_all_it_names(tmp_path):
+    """A cloud that a table names counts, and so does nothing that lies beside it unnamed."""
+    (tmp_path / "job.toml").write_text('[tables]\nscans = "scans.csv"\nname = "other"')
+    (tmp_path / "scans.csv").write_text("file,x\na.xyz,1\n")
+    (tmp_path / "a.xyz").write_text("0 0 0")
+    first = dict(job_identity(tmp_path / "job.toml", [("Measured", "")]))["SHA-256 of the job"]
+    (tmp_path / "b.xyz").write_text("0 0 0")
+    same = dict(job_identity(tmp_path / "job.toml", [("Measured", "")]))["SHA-256 of the job"]
+    (tmp_path / "a.xyz").write_text("0 0 1")
+    other = dict(job_identity(tmp_path / "job.toml", [("Measured", "")]))["SHA-256 of the job"]
+    by_hand = hashlib.sha256()
+    for name in ("job.toml", "scans.csv", "a.xyz"):
+        by_hand.update(name.encode() + b"\0" + (tmp_path / name).read_bytes())
+    assert first == same != other == by_hand.hexdigest()[:16]
 
 
 def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monkeypatch, capsys):

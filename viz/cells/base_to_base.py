@@ -8,11 +8,13 @@ from stitch import frames
 from stitch.cells.base_to_base.contradiction import compare_distances
 from stitch.cells.base_to_base.stand import Stand
 from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult, describe
+from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.cells import stage
 from viz.cells.base_to_base_figures import contradictions, plan, rods
 from viz.cells.page import Page, Picture, Table, write
+from viz.identity import Row
 
 
 def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
@@ -25,12 +27,33 @@ def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
     pictures = [Picture("Do the readings contradict each other?", contradictions(comparisons), caption)]
     tables = [Table("Distances", ("comparison",), [(describe(c, stand.length_unit),) for c in comparisons])]
     verdict, notes = "The readings contradict each other; no transform is given.", []
+    worst = max((c.sigmas for c in comparisons), default=0.0)
+    light = Judged("bad", f"Readings that should agree differ by {worst:.1f} sigmas; {LIMIT:g} are allowed.")
     if result is not None:
         verdict = sentence(stand, result)
+        light = _agreement(worst, len(comparisons))
         notes = [f"No projection: {result.no_projection}."] if result.no_projection else []
         pictures.insert(0, Picture("The stand and both bases", plan(stand, result), _PLAN))
         tables.insert(0, _transforms(stand, result))
-    write(Page("Base to base", verdict, pictures, tables, notes), path)
+    page = Page("Base to base", verdict, stand.file, _about(stand), pictures, tables, notes=notes, light=light)
+    write(page, path)
+
+
+def _agreement(worst: float, count: int) -> Judged:
+    if not count:
+        return Judged("check", "No reading is there twice: nothing tests the transform.")
+    return Judged("good", f"What is read twice agrees: {worst:.1f} sigmas at most, {LIMIT:g} are allowed.")
+
+
+def _about(stand: Stand) -> list[Row]:
+    unit = stand.length_unit
+    slide, length, angle = stand.sigma_slide, stand.sigma_length, np.degrees(stand.sigma_angle)
+    stated = f"sigma {slide:g} {unit} of the slide, {length:g} {unit} of the length, {angle:.2g}° of the angle"
+    return [
+        ("Measured", f"{len(stand.rail.names)} points of the rail, {len(stand.rod.names)} settings of the rod"),
+        ("Arm", "two: robot 1 touches the rail, robot 2 the cup of the rod"),
+        ("Sensor", f"stand with a measuring rod; {stated}"),
+    ]
 
 
 _PLAN = (
@@ -64,7 +87,9 @@ def _transforms(stand: Stand, result: BaseResult) -> Table:
 
 
 def _row(T: Array) -> list[str]:
-    return [*(f"{x:.5f}" for x in T[:3, 3]), *(f"{x:.6f}" for x in frames.log(T)[:3])]
+    # Adding zero takes the sign of a zero away.
+    turn = np.round(frames.log(T)[:3], 6) + 0.0
+    return [*(f"{x:.5f}" for x in T[:3, 3]), *(f"{x:.6f}" for x in turn)]
 
 
 _LEGEND = (

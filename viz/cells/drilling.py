@@ -10,6 +10,7 @@ from stitch.frames import transform
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
 from viz.cells.page import Page, Picture, Table, write
+from viz.identity import Row
 
 
 def write_page(job: Job, result: JobResult, path: Path) -> None:
@@ -23,8 +24,19 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     if len(result.leave_one_out_errors):
         caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
         pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
-    page = Page("Drilling", sentence(job, result), pictures, _tables(job, result), _notes(result))
-    write(page, path)
+    words = (sentence(job, result), job.file, _about(job))
+    write(Page("Drilling", *words, pictures, _tables(job, result), notes=_notes(result)), path)
+
+
+def _about(job: Job) -> list[Row]:
+    references = sum(hole.reference for hole in job.holes)
+    groups = len({hole.group for hole in job.holes})
+    rangers = f", {len(job.rangers)} range sensors" if job.rangers else ""
+    return [
+        ("Measured", f"{len(job.holes)} holes in {groups} groups, {references} of them references that were seen"),
+        ("Arm", "not stated"),
+        ("Sensor", f"camera on the flange, by a plate of {len(job.plate_uv)} holes{rangers}"),
+    ]
 
 
 def sentence(job: Job, result: JobResult) -> str:

@@ -29,7 +29,9 @@ def holes(job: Job, result: JobResult) -> Figure:
         axes[1, column].set_xlabel(f"along the panel ({job.length_unit})")
     axes[0, 0].set_ylabel(f"from above ({job.length_unit})")
     axes[1, 0].set_ylabel(f"from the side ({job.length_unit})")
-    axes[0, 1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    style = {"frameon": False, "fontsize": 8, "loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+    axes[0, 1].legend(shown.values(), shown.keys(), **style)
     return figure
 
 
@@ -52,7 +54,7 @@ def _panel_axes(job: Job) -> tuple[Array, Array]:
 def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Array, after: bool) -> None:
     """One panel of `holes`; `side` (2, 3) holds the axes that are drawn."""
     colour = _AFTER if after else _BEFORE
-    label = f"error, {magnified(job, result):g} times larger"
+    label = f"error {'after' if after else 'before'}, {magnified(job, result):g} times larger"
     for name, c in result.groups.items():
         references = references_of(job, name)
         nominal = np.array([hole.position for hole in references])

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from viz.filled_templates import render
+from stitch.comparison.plain_verdict import Judged
+from viz.cells.job_identity import job_identity
+from viz.identity import Row
+from viz.page_head import Head, write_page
 from viz.page_parts import png, svg
 
 # Beyond so many marks a drawing of lines is larger than one of pixels.
@@ -44,11 +46,17 @@ class Page:
 
     system: str
     verdict: str
+    file: Path | None  # of the job
+    about: Sequence[Row]  # what was measured, arm, sensor
     pictures: Sequence[Picture]
     tables: Sequence[Table]
     notes: Sequence[str] = ()
+    light: Judged | None = None  # where the job states what is allowed
 
 
 def write(page: Page, path: Path) -> None:
     """Render the page."""
-    path.write_text(render("cell.html.j2", page=page, version=version("stitch")), encoding="utf-8")
+    lights = [] if page.light is None else [page.light]
+    about = [("", job_identity(page.file, page.about))]
+    head = Head(page.system, page.verdict, about, lights=lights, notes=page.notes)
+    write_page(path, "cell.html.j2", head, page=page)

@@ -8,12 +8,14 @@ from stitch import frames
 from stitch.cells.panel.panel_job import Job
 from stitch.cells.panel.panel_sentences import leg_sentence, shape_sentence
 from stitch.cells.panel.panel_solution import JobResult
+from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.cells.panel_error_figures import errors_figure
 from viz.cells.panel_figures import deviation_before, expected_after, forces, misfit, shape
 from viz.colours import signed_colours
+from viz.identity import Row
 
 # mm of arrow for a newton, and for a millimetre out of shape, beside a panel of three metres.
 _PER_NEWTON, _PER_MM = 4.0, 60.0
@@ -38,7 +40,34 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     caption = "What the uncertainty of the model does to the slaves when the master moves."
     figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
     pictures.append(Picture("Errors to expect along a motion", figure, caption))
-    write(Page("Panel held by robots", sentence(job, result), pictures, _tables(job, result), _notes(result)), path)
+    words = (sentence(job, result), job.file, _about(job))
+    tables, notes, light = _tables(job, result), _notes(result), _light(job, result)
+    write(Page("Panel held by robots", *words, pictures, tables, notes=notes, light=light), path)
+
+
+def _light(job: Job, result: JobResult) -> Judged | None:
+    """Of the shape, against the job's tolerance."""
+    if result.shape_largest is None:
+        return None
+    worst, beyond = float(result.shape_largest.max()), int((result.shape_largest > job.tolerance).sum())
+    if not beyond:
+        return Judged("good", f"The shape is within {job.tolerance:g} mm at all clamps: {worst:.2f} mm at most.")
+    return Judged(
+        "bad",
+        f"The shape is not within {job.tolerance:g} mm at {beyond} of {len(job.robots)} clamps: {worst:.2f} mm at "
+        "most, before the commanded motion.",
+    )
+
+
+def _about(job: Job) -> list[Row]:
+    readings = sum(own.reflectors.shape[0] * own.reflectors.shape[1] for own in job.calibration)
+    control = "" if job.control is None else f", {len(job.control.nominal)} control points of the panel"
+    tracker, legs = job.tracker, "" if job.legs is None else " of six legs each"
+    return [
+        ("Measured", f"{readings:,} readings of reflectors on the robots{control}"),
+        ("Arm", f"{len(job.robots)} robots{legs}: {', '.join(job.robots)}; master {job.robots[job.master]}"),
+        ("Sensor", f"laser tracker, sigma {tracker.constant * 1e3:g} µm and {tracker.per_length * 1e6:g} µm a metre"),
+    ]
 
 
 def sentence(job: Job, result: JobResult) -> str:

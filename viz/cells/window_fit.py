@@ -10,10 +10,12 @@ from stitch import frames
 from stitch.cells.window.deviation import Deviations
 from stitch.cells.window.window_jobs import FitJob
 from stitch.cells.window.window_solution import Part
+from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import SIGNED, signed_colours
+from viz.identity import Row
 
 _MAP_POINTS, _RECORDED_POINTS, _WORST = 40_000, 400_000, 10
 
@@ -31,7 +33,28 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
         pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
         caption = "All points with a place on the CAD. What lies far out is a deformed place, and did not pull the fit."
         pictures.append(Picture(f"Distances{of}", histogram(part), caption))
-    write(Page("Scan onto CAD", sentence(parts), pictures, _tables(parts)), path)
+    words = (sentence(parts), job.file, _about(job))
+    write(Page("Scan onto CAD", *words, pictures, _tables(parts), light=_light(job, parts)), path)
+
+
+def _light(job: FitJob, parts: list[Part]) -> Judged:
+    bad, cells = (sum(int(x) for x in own) for own in zip(*map(_counts, parts), strict=True))
+    if not bad:
+        return Judged("good", f"Within {job.tolerance:g}: all {cells} cells of the map.")
+    return Judged("bad", f"Not within {job.tolerance:g}: {bad} of {cells} cells of the map are beyond it.")
+
+
+def _counts(part: Part) -> tuple[int, int]:
+    return int(part.deviations.outside.sum()), len(part.deviations.outside)
+
+
+def _about(job: FitJob) -> list[Row]:
+    return [
+        ("Measured", f"{len(job.placed.names)} scans, {len(job.scan.points):,} points"),
+        ("Arm", "not stated"),
+        ("Scanner", f"noise {job.scan.noise:.2g} as the scans show it"),
+        ("CAD", f"{job.cad_file.name}, {job.cad.size:.4g} across, {job.instances} in the scan"),
+    ]
 
 
 def sentence(parts: list[Part]) -> str:

@@ -9,9 +9,11 @@ from matplotlib.figure import Figure
 from stitch import frames
 from stitch.cells.window.seam import Limits, Seam, Station
 from stitch.cells.window.window_jobs import SeamJob
+from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
+from viz.identity import Row
 
 VERDICTS = {"good": "#4f9a4f", "bad": "#c43c28", "open": "#d9a400", "not measured": "#8a8a8a"}
 # Half width of a cut along the seam and half its extent across and down, mm.
@@ -35,18 +37,41 @@ def write_page(job: SeamJob, seams: list[Seam], path: Path) -> None:
         (s.station, f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}", s.verdict, s.reason)
         for s in seams
     ]
-    tables = [Table("Stations", ("station", "flush (mm)", "gap (mm)", "verdict", ""), rows)]
-    write(Page("Seam", sentence(job.limits, seams), pictures, tables), path)
+    tables = [Table("Stations", ("station", "flush (mm)", "gap (mm)", "verdict", "reason"), rows)]
+    words = (sentence(job.limits, seams), job.file, _about(job))
+    write(Page("Seam", *words, pictures, tables, light=_light(seams)), path)
+
+
+def _light(seams: list[Seam]) -> Judged:
+    """Red where a station is bad, amber where one is open or was not measured."""
+    good, bad = (sum(s.verdict == verdict for s in seams) for verdict in ("good", "bad"))
+    told = f"{good} of {len(seams)} stations are within the limits with their two sigmas"
+    if bad:
+        return Judged("bad", f"Not within the limits: {bad} of {len(seams)} stations are beyond them.")
+    if good < len(seams):
+        return Judged("check", f"Nothing is beyond the limits, but only {told}.")
+    return Judged("good", f"Within the limits: {told}.")
+
+
+def _about(job: SeamJob) -> list[Row]:
+    return [
+        ("Measured", f"{len(job.stations)} stations, {len(job.placed.names)} scans, {len(job.scan.points):,} points"),
+        ("Arm", "not stated"),
+        ("Scanner", f"noise {job.scan.noise:.2g} mm as the scans show it"),
+        ("Limits", _limits(job.limits)),
+    ]
+
+
+def _limits(limits: Limits) -> str:
+    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
+    return f"flush {flush} mm, gap {gap} mm"
 
 
 def sentence(limits: Limits, seams: list[Seam]) -> str:
     """How many stations are good."""
     counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
     found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    return (
-        f"{len(seams)} stations: {found}. Allowed: flush {limits.flush:g} ± {limits.flush_tolerance:g} mm, gap "
-        f"{limits.gap:g} ± {limits.gap_tolerance:g} mm."
-    )
+    return f"{len(seams)} stations: {found}. Allowed: {_limits(limits)}."
 
 
 def values(limits: Limits, seams: list[Seam]) -> Figure:

@@ -5,6 +5,7 @@ At angle 0 the rod lies on the rail and points back to P1, towards −x.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class Stand:
     sigma_length: float
     sigma_level_stand: float  # how well the rod's swing is horizontal across the rail
     sigma_level_base: float | None  # how well the two bases are parallel in tilt; None: not known
+    file: Path | None = None  # that was read
 
 
 def cylinder_points(joint1: Array, radius: Array, height: Array) -> Array:

@@ -53,6 +53,7 @@ def read_stand(file: Path | str) -> Stand:
         sigma_length=_sigma(file, "rod", settings, "sigma_length", _LENGTH / unit),
         sigma_level_stand=_sigma(file, "level", level, "stand", _LEVEL / to_rad) * to_rad,
         sigma_level_base=None if base is None else base * to_rad,
+        file=file,
     )
     _check_geometry(file, stand)
     return stand

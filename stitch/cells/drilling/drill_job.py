@@ -55,6 +55,7 @@ class Job:
     rangers: dict[str, tuple[Array, Array]]  # planes (M, 4), readings (M,)
     marker_paths: tuple[Array, Array] | None  # joint 6, joint 1, in the measuring system
     checks: Observations | None  # plate and check holes together
+    file: Path | None = None  # that was read
 
 
 def read_job(file: Path | str) -> Job:
@@ -81,6 +82,7 @@ def read_job(file: Path | str) -> Job:
         rangers=_rangers(paths.get("rangers")),
         marker_paths=_marker_paths(file, paths),
         checks=_checks(file, document, paths, plate),
+        file=file,
     )
 
 

@@ -40,6 +40,7 @@ class Job:
     targets: Points | None
     control: Points | None
     forces: Array | None  # (N, 6) change of torques and forces
+    file: Path | None = None  # that was read
 
 
 def read_job(file: Path | str) -> Job:
@@ -78,6 +79,7 @@ def read_job(file: Path | str) -> Job:
         targets=read_points(paths["targets"], None, T_world_tracker) if "targets" in paths else None,
         control=read_points(paths["control"], names, T_world_tracker) if "control" in paths else None,
         forces=read_per_robot(paths["forces"], names, "tx ty tz fx fy fz") if "forces" in paths else None,
+        file=file,
     )
 
 

@@ -39,6 +39,7 @@ class FitJob:
     coverage: float  # share of every expected region that must be seen
     T_base_part_nominal: Array | None  # (4, 4)
     path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
+    file: Path | None = None  # that was read
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class SeamJob:
     stations: tuple[Station, ...]
     limits: Limits
     pose_sigma: float
+    file: Path | None = None  # that was read
 
 
 def read_fit_job(file: Path | str) -> FitJob:
@@ -85,6 +87,7 @@ def read_fit_job(file: Path | str) -> FitJob:
         coverage=finite(file, "coverage", document.get("coverage", 0.5)),
         T_base_part_nominal=nominal,
         path=path,
+        file=file,
     )
 
 
@@ -110,6 +113,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
         stations=_stations(file_beside(file, "stations", document.get("stations"))),
         limits=Limits(**values),
         pose_sigma=abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
+        file=file,
     )
 
 
