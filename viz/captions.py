@@ -37,3 +37,7 @@ STICKS = (
     "Where each view puts every target against the place they share; sticks that all point one way in a region repeat."
 )
 TARGETS = "The farthest target of every view, in the order of views, and how the distances are distributed."
+TWO_FIELDS = (
+    "Per place of the part, how far each view puts the surface from where the others put it, by the model of each run; "
+    "one scale of colours for both. Drag to turn: both turn. Grey: seen by one view only."
+)

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.comparison.model_history import change_of
-from stitch.runs.run import LedgerStep
+from stitch.runs.run import LedgerStep, Run
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN
 from viz.drawing import above, plain
@@ -23,6 +23,25 @@ def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
     floors = np.array([s.noise_floor * um for s in ledger])
     axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
     axes.set_xticks(place, [change_of(ledger, i).replace(", ", "\n") for i in place])
+    axes.set_ylabel("rms between views (µm)")
+    above(axes)
+    return plain(figure)
+
+
+def two_bars(a: Run, b: Run) -> Figure:
+    """Residual, held-out residual and noise floor of two runs."""
+    um = MICROMETRES[a.session.length_unit]
+    figure = Figure(figsize=(5.2, 2.7), layout="constrained")
+    axes = figure.subplots()
+    for shift, values, colour, label in (
+        (-0.2, [a.residual_rms, b.residual_rms], BLUE, "in the fit"),
+        (0.2, [a.heldout_rms, b.heldout_rms], GREEN, "on views left out"),
+    ):
+        bars = axes.bar(np.arange(2) + shift, np.array(values) * um, 0.38, color=colour, label=label)
+        axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
+    floors = np.array([a.noise_floor, b.noise_floor]) * um
+    axes.hlines(floors, np.arange(2) - 0.45, np.arange(2) + 0.45, color="k", ls="--", lw=1.2, label="noise floor")
+    axes.set_xticks([0, 1], ["A", "B"])
     axes.set_ylabel("rms between views (µm)")
     above(axes)
     return plain(figure)

@@ -8,7 +8,14 @@ from stitch.comparison.plain_verdict import Judged
 from stitch.system.whole_file import whole
 from viz.filled_templates import render
 
-Rows = Sequence[tuple[str, str]]
+
+@dataclass(frozen=True)
+class Subject:
+    """One of the things that a page is about."""
+
+    identity: Sequence[tuple[str, str]]  # label and text
+    name: str = ""  # where they are several
+    found: Sequence[str] = ()  # sentences
 
 
 @dataclass(frozen=True)
@@ -17,7 +24,7 @@ class Head:
 
     title: str
     verdict: str
-    identities: Sequence[tuple[str, Rows]]  # of each thing that the page is about, with its name where they are several
+    subjects: Sequence[Subject]
     lights: Sequence[Judged] = ()  # against what is allowed, where somebody said what is
     evidence: str = ""
     notes: Sequence[str] = ()

@@ -20,8 +20,7 @@ def view_rows(run: Run, history: ModelHistory | None) -> list[dict[str, Any]]:
     um = MICROMETRES[run.session.length_unit]
     apart = np.full(len(run.poses), np.nan)
     if history is not None:
-        values = np.abs(history.models[-1].field.values)
-        apart = np.array([v[np.isfinite(v)].mean() if np.isfinite(v).any() else np.nan for v in values])
+        apart = history.models[-1].field.by_view
     by_view = zip(run.session.views, apart, run.view_rms, view_shifts(run), run.corrections, strict=True)
     rows = [
         {

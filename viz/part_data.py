@@ -1,6 +1,6 @@
 """What the viewer of the page needs, packed: the surface once, the field of every step of the model's history."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -19,18 +19,44 @@ _VIEWS = 24
 _STOPS = 17
 
 
-def part_data(surface: PartSurface, camera: Camera, history: ModelHistory, names: list[str], length_unit: str) -> Any:
+class Extent(NamedTuple):
+    """What a viewer shows at first, in the camera's axes."""
+
+    centre: Array  # (3,)
+    sides: Array  # (3,)
+
+    @property
+    def size(self) -> float:
+        """The longest side."""
+        return float(self.sides.max()) or 1.0
+
+
+def extent_of(points: Array, camera: Camera) -> Extent:
+    """Of points (N, 3) in the reference frame."""
+    flat = points @ camera.axes.T
+    return Extent((flat.max(axis=0) + flat.min(axis=0)) / 2, np.ptp(flat, axis=0))
+
+
+def part_data(
+    surface: PartSurface,
+    camera: Camera,
+    history: ModelHistory,
+    names: list[str],
+    length_unit: str,
+    extent: Extent | None = None,
+) -> dict[str, Any]:
     """Plain data for JSON; lengths of the field in µm.
 
     Args:
         names: of the views (V,).
+        extent: shown at first, the part's own if None.
     """
     um = MICROMETRES[length_unit]
     own = [step.field.values * um for step in history.steps]
     first = history.models[0].field
     worst = np.argsort(-np.nan_to_num(np.array([_mean_abs(v) for v in own[-2]])), kind="stable")[:_VIEWS]
     return {
-        **packed_surface(surface, camera, history.patches.points),
+        **packed_surface(surface, camera, history.patches.points, extent or extent_of(surface.vertices, camera)),
         "facing": packed_floats(history.patches.normals @ camera.axes.T),
         "patchRadius": history.patches.radius,
         "steps": [
@@ -55,11 +81,10 @@ def part_data(surface: PartSurface, camera: Camera, history: ModelHistory, names
     }
 
 
-def packed_surface(surface: PartSurface, camera: Camera, patches: Array) -> dict[str, Any]:
+def packed_surface(surface: PartSurface, camera: Camera, patches: Array, extent: Extent) -> dict[str, Any]:
     """Vertices in the camera's axes within a box, 16 bits a coordinate."""
     flat = surface.vertices @ camera.axes.T
-    low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
-    centre = (flat.max(axis=0) + low) / 2
+    centre, size = extent.centre, extent.size
     return {
         "vertices": packed(np.round((flat - centre) / size * 32767).astype("<i2")),
         "normals": packed(np.round(surface.normals @ camera.axes.T * 127).astype("i1")),
@@ -70,7 +95,7 @@ def packed_surface(surface: PartSurface, camera: Camera, patches: Array) -> dict
         "axes": camera.axes.tolist(),
         "centre": centre.tolist(),
         "size": size,
-        "box": (np.ptp(flat, axis=0) / size).tolist(),
+        "box": (extent.sides / size).tolist(),
     }
 
 

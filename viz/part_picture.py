@@ -8,6 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from stitch.comparison.model_history import ModelStep
 from stitch.frames import Array, Indices
 from viz.colours import FIELD, unsigned_colours
 from viz.part_camera import Camera
@@ -27,6 +28,11 @@ class Seen(NamedTuple):
     pixel: Indices  # (P,) numbers of the pixels that show the part
     corner: Indices  # (P, 3) vertices about the place
     weight: Array  # (P, 3) theirs
+
+
+def step_shown(step: ModelStep, um: float) -> tuple[str, Array]:
+    """Title and values of a still picture; µm."""
+    return f"{step.name}\n{step.field.mean_abs * um:.3g} µm on average", step.field.overall * um
 
 
 def part_picture(

@@ -12,12 +12,12 @@ from viz import captions, run_figures, target_figures
 from viz.filled_templates import script_json
 from viz.history_figures import waterfall
 from viz.identity import identity
-from viz.page_head import Head, write_page
+from viz.page_head import Head, Subject, write_page
 from viz.page_parts import png, svg
 from viz.page_tables import effect_rows, hand_eye_rows, matrix, note_rows, target_rows, view_rows
 from viz.part_camera import camera_for
 from viz.part_data import part_data
-from viz.part_picture import part_picture
+from viz.part_picture import part_picture, step_shown
 from viz.part_surface import part_surface
 
 # Views that are listed before the others are folded.
@@ -41,7 +41,7 @@ def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> He
     return Head(
         title=run.session.name,
         verdict=run.verdict if history is None else plain_verdict(history, unit),
-        identities=[("", identity(run))],
+        subjects=[Subject(identity(run))],
         lights=[] if history is None or tolerance is None else [judged(history, tolerance, unit)],
         evidence="" if history is None else run.verdict,
         notes=[*gone, *hidden],
@@ -77,7 +77,7 @@ def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
     names = [view.name for view in run.session.views]
     data = part_data(surface, camera, history, names, run.session.length_unit)
     # Coarse is so far off that all would be red.
-    shown = [(f"{s.name}\n{s.field.mean_abs * um:.3g} µm on average", s.field.overall * um) for s in steps[1:]]
+    shown = [step_shown(step, um) for step in steps[1:]]
     still = part_picture(surface, camera, shown[-4:], full_colour(history.models[0].field) * um, "µm")
     return {"data": script_json(data), "still": png(still, 110), "caption": captions.FIELD}
 

@@ -29,6 +29,13 @@ class Field:
         """(K,) mean of |value| over the views that see a patch; NaN where they are fewer than two."""
         return _mean(np.abs(self.values))
 
+    @cached_property
+    def by_view(self) -> Array:
+        """(V,) mean of |value| over the patches that a view sees; NaN where it sees none with others."""
+        seen = np.isfinite(self.values)
+        count = seen.sum(axis=1)
+        return np.where(count > 0, np.where(seen, np.abs(self.values), 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
+
     @property
     def mean_abs(self) -> float:
         """Mean of |value| over the part."""

@@ -19,6 +19,8 @@ FILES = {
     "recording.rrd",
     "report.html",
     "report.pdf",
+    "two-runs.html",
+    "two-runs.pdf",
     "compare.json",
     "diagnosis.json",
     "diagnosis.rrd",

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from stitch.comparison.plain_verdict import Judged
 from viz.cells.job_identity import job_identity
 from viz.identity import Row
-from viz.page_head import Head, write_page
+from viz.page_head import Head, Subject, write_page
 from viz.page_parts import png, svg
 
 # Beyond so many marks a drawing of lines is larger than one of pixels.
@@ -57,6 +57,6 @@ class Page:
 def write(page: Page, path: Path) -> None:
     """Render the page."""
     lights = [] if page.light is None else [page.light]
-    about = [("", job_identity(page.file, page.about))]
-    head = Head(page.system, page.verdict, about, lights=lights, notes=page.notes)
+    about = Subject(job_identity(page.file, page.about))
+    head = Head(page.system, page.verdict, [about], lights=lights, notes=page.notes)
     write_page(path, "cell.html.j2", head, page=page)

@@ -133,12 +133,12 @@ function showPart(root, data, more, eye) {
       panX += x; panY -= y;
     } else if (e.shiftKey || e.buttons === 4 || e.buttons === 2) { panX += 2 * x; panY -= 2 * y; }
     else { yaw += 4 * x; pitch = Math.min(1.6, Math.max(-1.6, pitch + 3 * y)); }
-    fingers.set(e.pointerId, e); draw();
+    fingers.set(e.pointerId, e); turnedTo();
   });
   canvas.addEventListener("contextmenu", e => e.preventDefault());
   canvas.addEventListener("wheel", e => {
     if (document.activeElement !== canvas && !e.ctrlKey) return;  // the page scrolls until the part is clicked
-    e.preventDefault(); zoom = Math.min(12, Math.max(0.5, zoom * Math.exp(-e.deltaY / 500))); draw();
+    e.preventDefault(); zoom = Math.min(12, Math.max(0.5, zoom * Math.exp(-e.deltaY / 500))); turnedTo();
   }, { passive: false });
   canvas.addEventListener("keydown", e => {
     const step = 0.12;
@@ -146,8 +146,9 @@ function showPart(root, data, more, eye) {
     else if (e.key === "ArrowUp") pitch -= step; else if (e.key === "ArrowDown") pitch += step;
     else if (e.key === "+") zoom *= 1.15; else if (e.key === "-") zoom /= 1.15;
     else if (e.key === "Home") { yaw = pitch = panX = panY = 0; zoom = 1; } else return;
-    e.preventDefault(); draw();
+    e.preventDefault(); turnedTo();
   });
+  function turnedTo() { draw(); root.dispatchEvent(new CustomEvent("eye")); }  // somebody turned the part
   const turned = () => {
     const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
     return [a, b * d, -b * c, 0, c, d, b, -a * d, a * c];
@@ -180,6 +181,7 @@ function showPart(root, data, more, eye) {
     glide,
     learn,
     eye: () => ({ yaw, pitch, zoom, panX, panY }),
+    look(eye) { ({ yaw, pitch, zoom, panX, panY } = eye); draw(); },
     jump(to) { cancelAnimationFrame(gliding); slider.value = to; label(); draw(); },
     stop() { cancelAnimationFrame(gliding); },
     show(value) {  // "all", "v3", "c0", "s"
