@@ -13,9 +13,12 @@ from matplotlib.figure import Figure
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
 from data_synth.write import write_session
 from stitch.cli.main import main
+from stitch.cli.printing import printing_browser
 from stitch.diagnosis import candidates
 from stitch.effects import EFFECTS
+from stitch.errors import InputError
 from stitch.system.threads import library_threads_off
+from tests.in_browser import DRAWN
 
 # Two test processes that each use all cores would fight for them.
 if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):
@@ -72,6 +75,21 @@ def stitch_command():
         return out.getvalue()
 
     return call
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A Chromium that is on the path, driven by playwright."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
+    try:
+        path = printing_browser()
+    except InputError:
+        pytest.skip("no Chromium is on the path")
+    root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=path, args=[*root, *DRAWN])
+        yield opened
+        opened.close()
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from stitch.cells import outputs
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
+from tests.in_browser import WAYS, require_for_everybody
 from viz.cells.job_identity import job_identity
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -191,6 +192,13 @@ def test_all_pages_have_the_block_of_a_run(handed_out):
         assert {"Job", "Measured", "Page written", "Arm", "stitch", "SHA-256 of the job"} <= set(labels)
         assert f"<dd>{JOBS[command].name}</dd>" in page
         assert ('class="light' in page) == (command != "drill")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("command", JOBS)
+def test_everybody_can_read_and_reach_a_page(browser, handed_out, command, way):
+    require_for_everybody(browser, handed_out / f"{command}.html", way)
 
 
 def test_the_hash_of_a_job_is_that_of_all_it_names(tmp_path):

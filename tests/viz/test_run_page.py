@@ -11,14 +11,15 @@ from markupsafe import escape
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import judged, plain_verdict
 from stitch.writing.result_document import result_document
+from tests.in_browser import require_for_everybody
 from viz.filled_templates import render
 from viz.run_page import write_report
 
 LARGEST = 8_000_000  # bytes that can be mailed
 
 
-class Elements(HTMLParser):
-    """Tags of a page with their attributes."""
+class Addresses(HTMLParser):
+    """What a page names: pictures, scripts, links."""
 
     def __init__(self, page):
         super().__init__()
@@ -26,17 +27,19 @@ class Elements(HTMLParser):
         self.feed(page)
 
     def handle_starttag(self, tag, attributes):
-        self.found.append((tag, dict(attributes)))
-
-    def of(self, *tags):
-        return [own for tag, own in self.found if tag in tags]
+        self.found += [text for name, text in attributes if name in ("src", "href", "data", "action") and text]
 
 
 @pytest.fixture(scope="module")
-def page(recorded, tmp_path_factory):
+def file(recorded, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "r.html"
     write_report(recorded[0], path, tolerance=0.1)
-    return path.read_text(encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(file):
+    return file.read_text(encoding="utf-8")
 
 
 def test_the_page_says_what_the_result_says(recorded, page):
@@ -54,19 +57,16 @@ def test_the_page_says_what_the_result_says(recorded, page):
 
 
 def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):
-    elements = Elements(page)
-    addresses = [own[key] for _, own in elements.found for key in ("src", "href", "data", "action") if own.get(key)]
-    assert all(address.startswith("data:") for address in addresses)
+    assert all(address.startswith("data:") for address in Addresses(page).found)
     assert not re.search(r"https?:|@import|url\((?!data:)|fetch\(|XMLHttpRequest|WebSocket|sendBeacon|import\(", page)
     assert len(page.encode()) < LARGEST
 
 
-def test_everything_on_the_page_has_a_name(page):
-    elements = Elements(page)
-    assert all(own.get("alt") for own in elements.of("img"))
-    assert all(own.get("aria-label") for own in elements.of("canvas", "input", "select"))
-    assert len(elements.of("main")) == len(elements.of("h1")) == 1
-    assert dict(elements.found)["html"]["lang"] == "en"
+@pytest.mark.parametrize(
+    "way", ["light", pytest.param("dark", marks=pytest.mark.slow), pytest.param("phone", marks=pytest.mark.slow)]
+)
+def test_everybody_can_read_and_reach_it(browser, file, way):
+    require_for_everybody(browser, file, way)
 
 
 def test_words_can_be_read_on_light_and_dark():

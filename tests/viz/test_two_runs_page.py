@@ -13,6 +13,7 @@ from stitch.cli.main import main
 from stitch.comparison.model_history import model_history
 from stitch.comparison.two_runs import hand_eye_change, sentence, two_runs
 from stitch.errors import InputError
+from tests.in_browser import WAYS, require_for_everybody, shown
 from viz.two_runs_page import write_two_runs
 from viz.two_runs_tables import facts, view_change_rows
 
@@ -29,10 +30,15 @@ def pair(recorded):
 
 
 @pytest.fixture(scope="module")
-def page(pair, tmp_path_factory):
+def file(pair, tmp_path_factory):
     path = tmp_path_factory.mktemp("two") / "two.html"
     write_two_runs(two_runs(pair, ("before", "after <2>")), path, tolerance=0.1)
-    return path.read_text(encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(file):
+    return file.read_text(encoding="utf-8")
 
 
 def test_the_difference_of_two_hand_eyes_scatters_as_its_covariance_says(pair):
@@ -103,6 +109,30 @@ def test_the_page_needs_nothing_beside_it_and_has_one_scale(page):
     assert data[0]["full"] == data[1]["full"]
     assert (data[0]["size"], data[0]["centre"]) == (data[1]["size"], data[1]["centre"])
     assert data[0]["steps"][-2]["mean"] < data[1]["steps"][-2]["mean"]
+
+
+def test_what_turns_the_one_part_turns_the_other(browser, file):
+    page, asked, wrong = shown(browser, file, "light")
+    one, other = page.locator("#part-a canvas"), page.locator("#part-b canvas")
+    before = other.screenshot()
+    one.focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowLeft")
+    page.wait_for_function(
+        "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+    )
+    assert other.screenshot() != before
+    page.locator("#part-a select").select_option(index=1)
+    names = [page.locator(f"#part-{x} select option:checked").inner_text() for x in "ab"]
+    assert names[0] == names[1] != "all views together"
+    assert (asked, wrong) == ([], [])
+    page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_everybody_can_read_and_reach_it(browser, file, way):
+    require_for_everybody(browser, file, way)
 
 
 def test_bad_folders_end_in_one_line(tmp_path, capsys):

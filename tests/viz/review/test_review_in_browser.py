@@ -1,35 +1,17 @@
 """The whole story in a browser: where it fails, what is missing, add it, the error falls, undo it."""
 
-import itertools
 import json
-import os
 import re
 
 import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
-from stitch.cli.printing import printing_browser
-from stitch.errors import InputError
+from tests.in_browser import barriers
 from tests.viz.review.conftest import compare_without_picture, served
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-# A software renderer draws the part where there is no graphics card.
-DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 LONG = 120_000  # ms that a command may take on a busy machine
-
-
-@pytest.fixture(scope="module")
-def browser():
-    try:
-        path = printing_browser()
-    except InputError:
-        pytest.skip("no Chromium is on the path")
-    root = ["--no-sandbox"] if os.geteuid() == 0 else []
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=path, args=[*root, *DRAWN])
-        yield opened
-        opened.close()
 
 
 class Story:
@@ -76,46 +58,13 @@ def address(soft_joint):
         yield server.address
 
 
-# Every text that is seen, with its contrast to what lies behind it, by the definition of WCAG 2.2; a check by hand of
-# what a colour that is partly clear lies on.
-CONTRASTS = """() => {
-  const paint = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
-  const rgba = text => { paint.clearRect(0, 0, 1, 1); paint.fillStyle = text; paint.fillRect(0, 0, 1, 1);
-    return [...paint.getImageData(0, 0, 1, 1).data]; };
-  const light = ([r, g, b]) => [r, g, b].map(v => v / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
-    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-  const behind = e => { for (let p = e; p; p = p.parentElement) { const c = rgba(getComputedStyle(p).backgroundColor);
-    if (c[3] === 255) return c; } return rgba(getComputedStyle(document.body).backgroundColor); };
-  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
-  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
-    const e = node.parentElement;
-    if (!node.data.trim() || !e.checkVisibility() || e.closest("script, style, option, :disabled")) continue;
-    const [a, b] = [light(rgba(getComputedStyle(e).color)), light(behind(e))].sort((x, y) => y - x);
-    found.push([(a + 0.05) / (b + 0.05), node.data.trim()]);
-  }
-  return found;
-}"""
-NAMELESS = """() => [...document.querySelectorAll("button, input, select, textarea, canvas, iframe, summary, section")]
-  .filter(e => e.checkVisibility() && !(e.innerText || "").trim() && !e.getAttribute("aria-label") && !e.title
-    && !(e.labels && e.labels.length)).map(e => e.outerHTML.slice(0, 200))"""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("colours", ["light", "dark"])
 def test_everybody_can_read_and_reach_it(browser, address, colours):
     story = Story(browser, address, color_scheme=colours)
     page = story.page
     story.says("#plots", "signed mean")
-    page.evaluate("() => document.querySelectorAll('details').forEach(details => { details.open = true; })")
-    read = page.evaluate(CONTRASTS)
-    assert len(read) > 60
-    assert [pair for pair in read if pair[0] < 4.5] == []
-    assert page.evaluate(NAMELESS) == []
-    assert page.locator("main").count() == page.locator("h1").count() == 1
-    levels = [
-        int(tag[1]) for tag in page.evaluate("() => [...document.querySelectorAll('h1,h2,h3')].map(e => e.tagName)")
-    ]
-    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
+    assert barriers(page) == []
     # By the keyboard alone: a bar is reached and chosen.
     page.locator("#plots .bins button").first.focus()
     page.keyboard.press("Tab")
