@@ -6,12 +6,10 @@ from functools import partial
 
 import numpy as np
 
-from stitch import frames
-from stitch.errors import InputError, NoResultError
+from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import (
     beyond_any_arm,
-    contradicted_by,
     contradicts,
     judged_by_size,
     stands_off,
@@ -19,6 +17,7 @@ from stitch.integrity.arm_limits import (
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
+from stitch.integrity.refusals import refuse, require_own_model, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
@@ -26,15 +25,9 @@ from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.free_poses import free_poses
-from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
-from stitch.statistics.tails import chi2_limit
-
-# A hand-eye that differs by chance alone is refused once in a million.
-_CHANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,15 +64,17 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     """
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
-        _require_own_model(session, correction, index)
+        require_own_model(session, correction, index)
     usual = partial(usual_twists, measurement, correction.model)
     found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index], usual)
     found = judged_by_size(session, found)
     if contradicts(session, found):
         refuse(session, deep_check(session))
-        raise _unexplained(session, found)
+        raise unexplained(session, found)
     size = length_problem(found.model, own.T_reference_mount, found.found.further)
     if size is not None:
+        # Other mistakes look like a factor on lengths too.
+        refuse(session, deep_check(session))
         refuse(session, [size])
     if found.block is not None and not _beyond_any_slip(session, found):
         # A slip of the part, or a knock of the mount, within what a model can hold: the diagnosis names it.
@@ -120,48 +115,6 @@ def _beyond_any_slip(session: Session, found: Snooping) -> bool:
     lever = found.freed.overlaps.gram.lever if found.block.what == "part" else 1.0
     turn, shift = (float(np.linalg.norm(x)) for x in (found.block.estimate[:3] / lever, found.block.estimate[3:]))
     return beyond_any_arm(session, turn, shift)
-
-
-def _require_own_model(session: Session, correction: Correction, index: int) -> None:
-    """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
-    own, T_mount = correction.captures[index], correction.model.T_mount
-    fitted = fit_hand_eye([own], [correction.freed[index]], T_mount)
-    turn, shift = _apart(own, T_mount, fitted.T_mount)
-    if not beyond_any_arm(session, turn, shift):
-        return
-    # Views freed from far off are only on their way, and what they lack would count as scatter: once more from there.
-    freed = free_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
-    fitted = fit_hand_eye([own], [freed], fitted.T_mount)
-    turn, shift = _apart(own, T_mount, fitted.T_mount)
-    xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
-    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2_limit(_CHANCE, 6)
-    if clear and beyond_any_arm(session, turn, shift):
-        raise NoResultError(
-            f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
-            "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
-        )
-
-
-def _apart(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
-    """Angle (rad) between two hand-eyes, and how far they put the part from each other."""
-    xi = frames.log(frames.inverse(T_mount) @ other)
-    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
-    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
-
-
-def _unexplained(session: Session, found: Snooping) -> NoResultError:
-    off = contradicted_by(session, found)
-    return NoResultError(
-        f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
-        "it; to fix: check that rows and clouds belong together and how the poses were converted"
-    )
-
-
-def refuse(session: Session, problems: Sequence[Problem]) -> None:
-    """Raise what a deep check found; nothing where it found nothing certain."""
-    for problem in (p for p in problems if p.certain):
-        kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
-        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
 
 
 def _not_belonging(

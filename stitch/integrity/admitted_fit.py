@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from stitch.errors import NoResultError
 from stitch.integrity.admission import Admission, admission, admission_of_targets
+from stitch.integrity.refusals import require_majority
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.stages.fitted import Fitted
@@ -46,6 +47,8 @@ def admitted_fit(
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
         if keep or not any(a.left_out for a in found):
             break
+        for session, a in zip(sessions, taken, strict=True):
+            require_majority(session, a.left_out)
         measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
         own = [s.without(a.names) for s, a in zip(own, found, strict=True)]
         short = next((s for s in own if len(s.views) < 2), None)

@@ -1,0 +1,93 @@
+"""Sessions that no run may use: poses that contradict the scans, another mount's model, too few views that belong."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch import frames
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.integrity.arm_limits import beyond_any_arm, contradicted_by
+from stitch.integrity.deep_check import deep_check
+from stitch.integrity.problems import Problem
+from stitch.integrity.snooping import Snooping
+from stitch.measurement.capture import Capture
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.runs.run import LeftOut
+from stitch.stages.correction import Correction
+from stitch.statistics.tails import chi2_limit
+
+# A hand-eye that differs by chance alone is refused once in a million.
+_CHANCE = 1e-6
+# From this share of the views on, a mistake of the whole session is looked for; a part that was clamped anew, or scans
+# that changed places, leave many views out and a good rest.
+_MANY = 1 / 3
+_OF_VIEWS = ("displaced", "disconnected", "foreign", "duplicate_scan", "duplicate_pose")
+_LEAVE_A_REST = ("reclamped", "exchanged")
+
+
+def refuse(session: Session, problems: Sequence[Problem]) -> None:
+    """Raise what a deep check found; nothing where it found nothing certain."""
+    for problem in (p for p in problems if p.certain):
+        kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
+        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
+
+
+def require_majority(session: Session, left_out: Sequence[LeftOut]) -> None:
+    """Refuse a session of which so many views do not belong that the rest cannot say which of them are wrong.
+
+    Args:
+        session: with all its views.
+
+    Raises:
+        InputError: a usual mistake explains it.
+        NoResultError: none does, and half of the views or more do not belong.
+    """
+    if len(left_out) < _MANY * len(session.views):
+        return
+    found = deep_check(session)
+    refuse(session, [p for p in found if p.kind not in (*_OF_VIEWS, *_LEAVE_A_REST)])
+    if 2 * len(left_out) >= len(session.views) and not any(p.kind in _LEAVE_A_REST for p in found):
+        names = ", ".join(item.view for item in left_out)
+        raise NoResultError(
+            f"{session.path}: {len(left_out)} of {len(session.views)} views ({names}) do not belong to the others, and "
+            "which half is right nobody can say; to fix: check that rows and clouds belong together and how the poses "
+            "were converted"
+        )
+
+
+def require_own_model(session: Session, correction: Correction, index: int) -> None:
+    """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
+    own, T_mount = correction.captures[index], correction.model.T_mount
+    fitted = fit_hand_eye([own], [correction.freed[index]], T_mount)
+    turn, shift = _apart(own, T_mount, fitted.T_mount)
+    if not beyond_any_arm(session, turn, shift):
+        return
+    # Views freed from far off are only on their way, and what they lack would count as scatter: once more from there.
+    freed = free_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
+    fitted = fit_hand_eye([own], [freed], fitted.T_mount)
+    turn, shift = _apart(own, T_mount, fitted.T_mount)
+    xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
+    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2_limit(_CHANCE, 6)
+    if clear and beyond_any_arm(session, turn, shift):
+        raise NoResultError(
+            f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
+            "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
+        )
+
+
+def unexplained(session: Session, found: Snooping) -> NoResultError:
+    off = contradicted_by(session, found)
+    return NoResultError(
+        f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
+        "it; to fix: check that rows and clouds belong together and how the poses were converted"
+    )
+
+
+def _apart(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
+    """Angle (rad) between two hand-eyes, and how far they put the part from each other."""
+    xi = frames.log(frames.inverse(T_mount) @ other)
+    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
