@@ -25,6 +25,7 @@ _OWN = {
     "drop": "stitch.cli.change:drop",
     "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
+    "explain": "stitch.cli.explain:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",
     "batch": "stitch.cli.batch:batch",

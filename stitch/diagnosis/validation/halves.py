@@ -65,7 +65,7 @@ def halves(scored: Score) -> Halves | None:
     gains, p_values, shares = [], [], []
     ways = halves_of(surfaces.capture.T_reference_mount, surfaces.freed.overlaps.gram.lever)
     for way in ways:
-        bases = [_explained(base, surfaces, other) for other in reversed(way)]
+        bases = [explained_beside(base, surfaces, other) for other in reversed(way)]
         gains.append(sum(_predicted(base, scored.candidate.forms, *pair) for pair in (bases, bases[::-1])))
         a, b = (_seen(base, U, scored.form) for U in bases)
         p_values.append(_same_size(a, b, scored.form.sizes))
@@ -73,7 +73,7 @@ def halves(scored: Score) -> Halves | None:
     return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)), min(shares))
 
 
-def _explained(base: LinearModel, surfaces: Surfaces, out: Indices) -> Array:
+def explained_beside(base: LinearModel, surfaces: Surfaces, out: Indices) -> Array:
     """(n, r) orthonormal basis of what the model, and the views that are left out moving freely, explain."""
     free = np.eye(surfaces.channel.reduction.shape[1])[:, (6 * out[:, None] + np.arange(6)).ravel()]
     return column_space(np.hstack([base.white_design, base.whiten(surfaces.reduce(free))]))

@@ -1,0 +1,113 @@
+"""Columns that a formula may be made of: where in the chain something is displaced, times what it may follow."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from stitch.effects.contract import Effect
+from stitch.effects.specs import per_joint, twist
+from stitch.explanation.quantities import Quantity
+from stitch.frames import Array
+from stitch.model.term import Term, term_of
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.observations.targets.target_model import Targets
+
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+
+@dataclass(frozen=True)
+class Ingredient:
+    """One addend: a place, its joint or axis, and the quantity that it is a multiple of."""
+
+    place: str  # robot | mount | part
+    index: int  # joint or axis of the twist, counted from 0
+    quantity: Quantity
+
+    @property
+    def unit(self) -> str:
+        """Of the coefficient, in mm where it is a length."""
+        own = "mm" if self.place != "robot" and self.index >= 3 else "rad"
+        return f"{own}/({self.quantity.unit})" if self.quantity.unit else own
+
+    @property
+    def what(self) -> str:
+        """What is displaced."""
+        return f"q*{self.index + 1}" if self.place == "robot" else f"{self.place} {_AXES[self.index]}"
+
+
+def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ingredient], Array]:
+    """All M ingredients, and the response (·, M) of the observation to one of each.
+
+    A joint may follow any quantity, and its own angle or direction times any other joint's angle; mount and part what
+    does not turn with the arm.
+    """
+    joints = linear.measurement.views.joints.shape[1]
+    of_arm = [Ingredient("robot", i, q) for i in range(joints) for q in _for_joint(i, found)]
+    elsewhere = [q for q in found if q.kind in ("time", "covariate", "torque")]
+    places = [Ingredient(p, axis, q) for p in ("mount", "part") for axis, q in product(range(6), elsewhere)]
+    ingredients = of_arm + places
+    if not ingredients:
+        return [], np.zeros((len(linear.design), 0))
+    bases = {
+        place: linear.responses([_everywhere(linear, place)])[0].columns for place in {i.place for i in ingredients}
+    }
+    rows = _rows_per_view(linear)
+    columns = [
+        _modulated(bases[i.place][:, i.index], i.quantity.values, rows) / _scale(i.quantity) for i in ingredients
+    ]
+    return ingredients, np.column_stack(columns)
+
+
+def _for_joint(i: int, found: Sequence[Quantity]) -> list[Quantity]:
+    own = [q for q in found if q.joint == i and q.kind in ("angle", "direction")]
+    others = [q for q in found if q.joint != i and q.kind == "angle"]
+    slow = [q for q in found if q.kind in ("time", "covariate")]
+    return [*found, *(a.times(b) for a in own for b in (*others, *slow))]
+
+
+def _scale(quantity: Quantity) -> float:
+    """Makes columns of quantities in any unit comparable; undone in the formula."""
+    return max(float(np.abs(quantity.values).max()), 1e-300)
+
+
+def coefficient(ingredient: Ingredient, scaled: float) -> float:
+    """In the ingredient's unit, of one for its scaled column."""
+    return scaled / _scale(ingredient.quantity)
+
+
+def _everywhere(linear: LinearModel, place: str) -> Term:
+    """A displacement of the same size in every view, one parameter a joint or axis."""
+    if place == "robot":
+        effect = Effect("each_joint", place, {"d": per_joint("rad", 1e-3, 1.0)}, _joints, ("joints",), (), "user")
+    else:
+        effect = Effect("each_axis", place, {"xi": twist("", 1e-3, 0.3, 1.0, 100.0)}, _twists, (), (), "user")
+    return term_of(linear.measurement, effect)
+
+
+def _joints(joints: Array, views: object, d: Array) -> Array:
+    """q* = q + d"""
+    return joints + d
+
+
+def _twists(views: object, xi: Array) -> Array:
+    """The same twist in every view."""
+    return np.tile(xi, (views.count, 1))  # type: ignore[attr-defined]
+
+
+def _rows_per_view(linear: LinearModel) -> int:
+    observation = linear.observation
+    if isinstance(observation, Surfaces):
+        return 6
+    assert isinstance(observation, Targets)
+    return int(observation.rows.residual.shape[1])
+
+
+def _modulated(column: Array, values: Array, rows: int) -> Array:
+    """A response (·,) times a number of each view; blocks beyond the views (a drawing) know nothing of them."""
+    blocks = column.reshape(-1, rows)
+    factors = np.zeros(len(blocks))
+    factors[: len(values)] = values
+    return np.asarray((blocks * factors[:, None]).ravel())

@@ -1,0 +1,57 @@
+"""A formula as a Python file of effects that a person can read, doubt, edit and add."""
+
+from collections.abc import Sequence
+
+from stitch.explanation.dictionary import Ingredient
+from stitch.units import METRES
+
+_LIMIT = 10.0  # sizes: beyond that nobody would believe it
+_NAMES = "abcd"
+
+
+def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
+    """The formula for people: what is displaced, and by what."""
+    parts = [f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in zip(ingredients, coefficients, strict=True)]
+    targets = list(dict.fromkeys(i.what for i in ingredients))
+    return "; ".join(
+        f"{t} = {t.replace('*', '') + ' ' if '*' in t else ''}"
+        + " ".join(p for p, i in zip(parts, ingredients, strict=True) if i.what == t)
+        for t in targets
+    )
+
+
+def effect_source(
+    name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], length_unit: str, origin: str
+) -> str:
+    """The file; all ingredients stand at one place.
+
+    Args:
+        coefficients: in each ingredient's unit, lengths in length_unit.
+        origin: where the formula comes from, for the first line of the file.
+    """
+    place = ingredients[0].place
+    to_mm = METRES[length_unit] / METRES["mm"]
+    letters = _NAMES[: len(ingredients)]
+    specs = ", ".join(
+        f'{a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g})'
+        for a, i, size in (
+            (a, i, abs(c) * (to_mm if i.unit.startswith("mm") else 1.0))
+            for a, i, c in zip(letters, ingredients, coefficients, strict=True)
+        )
+    )
+    told = "; ".join(f"{i.what} {a}·{i.quantity.text}" for a, i in zip(letters, ingredients, strict=True))
+    arguments = ", ".join(letters)
+    needs = '("joints",)' if place == "robot" else "()"
+    head = (
+        f'"""{origin}"""\n\nimport numpy as np\n\nfrom stitch.effects import effect, number\n\n\n'
+        f'@effect("{place}", needs={needs}, {specs})\n'
+    )
+    if place == "robot":
+        body = [f"def {name}(joints, views, {arguments}):", f'    """{told}"""', "    true = np.array(joints, float)"]
+        body += [
+            f"    true[:, {i.index}] += {a} * {i.quantity.code}" for a, i in zip(letters, ingredients, strict=True)
+        ]
+        return head + "\n".join([*body, "    return true", ""])
+    body = [f"def {name}(views, {arguments}):", f'    """{told}"""', "    twist = np.zeros((views.count, 6))"]
+    body += [f"    twist[:, {i.index}] += {a} * {i.quantity.code}" for a, i in zip(letters, ingredients, strict=True)]
+    return head + "\n".join([*body, "    return twist", ""])

@@ -1,0 +1,95 @@
+"""From unknown to a formula: what a model lacks, as a sum of products of what the cell knows of its views."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.score import score
+from stitch.diagnosis.validation.cross_validation import cross_validate
+from stitch.effects.contract import EFFECTS
+from stitch.effects.user_file import load
+from stitch.explanation.dictionary import coefficient, dictionary
+from stitch.explanation.effect_source import effect_source, formula_text
+from stitch.explanation.quantities import quantities
+from stitch.explanation.search import Chosen, fitted, search
+from stitch.observations.linear_model import LinearModel
+from stitch.system.threads import library_threads_off
+
+NAME = "explained"
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A formula that a half of the views which took no part in finding it wants too; or none."""
+
+    found: bool
+    why: str  # in one sentence
+    formula: str = ""
+    place: str = ""  # robot | mount | part
+    heldout_share: float = float("nan")  # mean square on views left out over that of the present model
+    p_value: float = float("nan")
+    source: str = ""  # a Python file of effects
+
+
+def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> Explanation:
+    """Look for a formula of the displacements that a model leaves unexplained.
+
+    Args:
+        origin: first line of the file of effects.
+    """
+    with library_threads_off():
+        ingredients, responses = dictionary(linear, quantities(linear.measurement.views))
+        slow = np.array([i.quantity.slow for i in ingredients], bool)
+        chosen = search(linear, responses, slow) if ingredients else None
+        if chosen is None:
+            return Explanation(False, "Nothing that the cell knows of its views explains what is left.")
+        place = _place(chosen, [i.place for i in ingredients])
+        numbers = [k for k in chosen.numbers if ingredients[k].place == place]
+        if not chosen.holds or len(numbers) < len(chosen.numbers):
+            return Explanation(False, _not_held(chosen, formula_of(linear, ingredients, responses, chosen.numbers)))
+        own = [ingredients[k] for k in numbers]
+        scaled = fitted(linear, responses, numbers)
+        values = [coefficient(i, float(s)) for i, s in zip(own, scaled, strict=True)]
+        text = formula_text(own, values)
+        source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
+        share, helps = _on_views_left_out(linear, source)
+        if not helps:
+            return Explanation(
+                False, f"{text} explains much, but not in views that are left out with their neighbours."
+            )
+        why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
+        return Explanation(True, why, text, place, share, chosen.p_value, source)
+
+
+def formula_of(linear: LinearModel, ingredients: list, responses: np.ndarray, numbers: tuple[int, ...]) -> str:  # type: ignore[type-arg]
+    """The text of some ingredients with their sizes from all views."""
+    own = [ingredients[k] for k in numbers]
+    scaled = fitted(linear, responses, numbers)
+    return formula_text(own, [coefficient(i, float(s)) for i, s in zip(own, scaled, strict=True)])
+
+
+def _place(chosen: Chosen, places: list[str]) -> str:
+    own = [places[k] for k in chosen.numbers]
+    return max(set(own), key=own.count)
+
+
+def _not_held(chosen: Chosen, text: str) -> str:
+    return (
+        f"No formula holds: {text}, found in one half of the views, is not what the other shows "
+        f"(p = {chosen.p_value:.2g})."
+    )
+
+
+def _on_views_left_out(linear: LinearModel, source: str) -> tuple[float, bool]:
+    """Share of the mean square error that the file's effect leaves on views left out, and whether these are helped."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "found.py"
+        file.write_text(source, encoding="utf-8")
+        load(file)
+        candidate = candidate_of(linear, EFFECTS[NAME])
+        assert candidate is not None
+        found = cross_validate(linear, score(linear, candidate))
+    return found.heldout, found.helps and found.heldout < 1

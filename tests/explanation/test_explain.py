@@ -1,0 +1,98 @@
+"""A law that no library has, found as a formula; nothing found where there is nothing; a file that can be added."""
+
+import json
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from stitch.cli.main import main
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.explanation.dictionary import dictionary
+from stitch.explanation.explain import explain
+from stitch.explanation.quantities import quantities
+from stitch.measurement.views import views_of
+from stitch.pipeline import run
+from stitch.runs.state import state_of
+
+SIZE = 3e-4  # rad
+
+
+def coupling(q):
+    """Joints 2 and 3 drag each other."""
+    return SIZE * np.array([0, 0, np.sin(q[2]) * np.sin(2 * q[1]), 0, 0, 0])
+
+
+def evidence(seed, gears=None, views=60, **options):
+    session, *_ = labelled_cell(seed, views=views, targets=TARGETS[:2], gears=gears, **options)
+    return linear_model_of(state_of(run(session)))
+
+
+def test_a_coupling_of_two_joints_is_found_with_its_size():
+    found = explain(evidence(1, coupling))
+    assert found.found and found.place == "robot" and "sin q3·sin 2q2" in found.formula
+    size = float(found.formula.split("q3 ")[1].split(" rad")[0])
+    assert size == pytest.approx(SIZE, rel=0.1)
+    assert found.p_value < 1e-6 and found.heldout_share < 0.6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scatter_alone_gets_no_formula(seed):
+    assert not explain(evidence(50 + seed)).found
+
+
+def test_codes_of_quantities_give_their_values():
+    session, *_ = labelled_cell(3, views=12, payload=np.linspace(1, 4, 12))
+    views = views_of(session)
+    for quantity in quantities(views):
+        np.testing.assert_allclose(
+            eval(quantity.code, {"np": np, "views": views}),
+            quantity.values,
+            rtol=1e-5,
+            atol=1e-7,
+            err_msg=quantity.text,
+        )
+
+
+def test_columns_are_what_the_displacement_does():
+    """One ingredient put into the joints of the simulated arm moves the targets as its column says."""
+    linear = evidence(4, views=20)
+    ingredients, columns = dictionary(linear, quantities(linear.measurement.views))
+    k = next(i for i, x in enumerate(ingredients) if x.what == "q*3" and x.quantity.text == "sin q3·sin 2q2")
+    scale = np.abs(ingredients[k].quantity.values).max()
+    rows = linear.observation.rows.residual.ravel()
+    moved = evidence(4, coupling, views=20).observation.rows.residual.ravel()
+    # The fit of each session takes what hand-eye and targets can of it; what remains must be the column's remainder.
+    free = linear.design
+    left = moved - rows - columns[:, k] * scale * -SIZE
+    rest = left - free @ np.linalg.lstsq(free, left, rcond=None)[0]
+    whole = moved - rows
+    whole = whole - free @ np.linalg.lstsq(free, whole, rcond=None)[0]
+    assert np.linalg.norm(rest) < 0.05 * np.linalg.norm(whole)
+
+
+def test_the_file_that_is_written_can_be_added(tmp_path, stitch_command, monkeypatch, no_drawing):
+    monkeypatch.chdir(tmp_path)
+    session, *_ = labelled_cell(1, views=60, targets=TARGETS[:2], gears=coupling)
+    stitch_command("run", write_labelled(tmp_path / "s", session), "-o", "r", "--no-recording")
+    told = json.loads(stitch_command("explain", "r", "-o", "mine.py", "--json"))
+    assert told["found"] and told["place"] == "robot"
+    before = json.loads((tmp_path / "r" / "result.json").read_text())["heldout_rms"]
+    stitch_command("add", "r", "explained", "--effects-file", "mine.py", "--no-recording")
+    after = json.loads((tmp_path / "r" / "result.json").read_text())
+    assert after["heldout_rms"] < 0.8 * before
+    assert after["heldout_rms"] == pytest.approx(told["heldout_rms"], rel=0.15)
+    assert after["effects"]["explained"]["a"]["value"] == pytest.approx(SIZE, rel=0.1)
+
+
+@pytest.mark.parametrize(("output", "told"), [("mine.txt", "mine.py"), ("there.py", "there is such a file")])
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch, capsys, output, told):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.py").write_text("# mine\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["explain", "r", "-o", output])
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert told in line and line.count("\n") == 1
+    assert (tmp_path / "there.py").read_text() == "# mine\n"
