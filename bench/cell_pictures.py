@@ -1,12 +1,14 @@
-"""Pictures of the cells' pages, from the jobs in examples/: writes docs/pictures/*.png.
+"""Figures and pages of the cells, from the jobs in examples/: writes docs/pictures/*.png.
 
-Run: python bench/cell_pictures.py
+Run: python -m bench.cell_pictures. The pages need a Chromium on the path.
 """
 
+import tempfile
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from bench.report_pictures import call, keep, shot
 from stitch.cells.base_to_base import read_stand, solve
 from stitch.cells.drilling.drill_job import read_job as read_drilling
 from stitch.cells.drilling.drill_solution import solve_job as solve_drilling
@@ -31,7 +33,19 @@ def figures() -> dict[str, Figure]:
     }
 
 
+def pages() -> None:
+    """The top of every cell's page, half as large as it is shown."""
+    jobs = {"base": "base_to_base.toml", "drill": "drilling/job.toml", "panel": "panel/job.toml"}
+    jobs |= {"fit": "window/fit.toml", "seam": "window/seam.toml"}
+    with tempfile.TemporaryDirectory() as folder:
+        for command, job in jobs.items():
+            page = Path(folder) / f"{command}.html"
+            call([command, EXAMPLES / job, "--report", page])
+            keep(shot(page, 1000, 1000).reduce(2), f"cell-{command}")
+
+
 def main() -> None:
+    pages()
     for name, figure in figures().items():
         figure.savefig(PICTURES / f"{name}.png", dpi=95)
         print(PICTURES / f"{name}.png")

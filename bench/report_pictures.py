@@ -1,11 +1,13 @@
-"""Pictures of page and recording of the demo's cell, as people see them: python bench/report_pictures.py.
+"""Pictures of pages and recording of the demo's cell, as people see them: python bench/report_pictures.py.
 
-Writes docs/pictures/report-*.png (light, dark, phone, paper) and recording-*.png (tabs, five moments of `model`).
+Writes docs/pictures/report-*.png (light, dark, phone, paper), two-runs.png (the run before and after an effect was
+added) and recording-*.png (tabs, five moments of `model`).
 Needs a Chromium on the path, a software renderer for Rerun (Mesa's Vulkan drivers), and pypdfium2 for paper.
 """
 
 import argparse
 import io
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,29 +35,37 @@ MOMENTS = (0, 10, 15, 20, 30)  # of the timeline `model`: a step every 10
 def demo_run(folder: Path) -> Path:
     """A blade cell with two joints that give way, what is missing found and added."""
     session, run = folder / "blade", folder / "run"
-    commands = (
+    call(
         ["synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3"],
         ["run", session, "-o", run, "--no-recording"],
-        ["add", run, "--suggested"],
     )
+    shutil.copytree(run, folder / "before")
+    call(["add", run, "--suggested"])
+    return run
+
+
+def call(*commands: list[object]) -> None:
+    """Run commands of stitch."""
     for command in commands:
         try:
             stitch([str(word) for word in command])
         except SystemExit as ended:
             if ended.code:
                 raise
-    return run
+
+
+def two(before: Path, run: Path) -> None:
+    """The page of a run and of what became of it."""
+    page = run / "two-runs.html"
+    call(["report", before, run, "-o", page])
+    keep(shot(page, 1100, 1500), "two-runs")
 
 
 def pages(run: Path) -> None:
     """The page in a browser: light, dark, on a phone, on paper."""
     browser, page = printing_browser(), run / "report.html"
     for name, (width, height, *more) in _PAGES.items():
-        shot = run / f"{name}.png"
-        options = [f"--window-size={width},{height}", "--virtual-time-budget=6000", f"--screenshot={shot}", *more]
-        command = [browser, "--headless=new", "--no-sandbox", *_DRAWN, *options, page.resolve().as_uri()]
-        subprocess.run(command, check=True, capture_output=True, timeout=180)
-        keep(Image.open(shot), name)
+        keep(shot(page, width, height, *more), name)
     print_page(browser, page, run / "report.pdf")
     try:
         from pypdfium2 import PdfDocument
@@ -63,6 +73,16 @@ def pages(run: Path) -> None:
         print("report-print.png: not made, pypdfium2 is not installed")
         return
     keep(PdfDocument(run / "report.pdf")[0].render(scale=1.4).to_pil(), "report-print")
+
+
+def shot(page: Path, width: int, height: int, *more: str) -> Image.Image:
+    """The top of a page, so many pixels wide and high."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "shot.png"
+        options = [f"--window-size={width},{height}", "--virtual-time-budget=6000", f"--screenshot={file}", *more]
+        command = [printing_browser(), "--headless=new", "--no-sandbox", *_DRAWN, *options, page.resolve().as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=180)
+        return Image.open(file).convert("RGB")
 
 
 def recording(run: Path) -> None:
@@ -120,6 +140,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = given or demo_run(Path(folder))
         pages(run)
+        if given is None:
+            two(Path(folder) / "before", run)
         recording(run)
 
 

@@ -1,0 +1,112 @@
+"""docs/gallery.md as text, and its pictures out of the pages of runs."""
+
+import base64
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+_WIDE, _COLOURS = 760, 128
+
+_VERDICTS = {
+    "adequate": "nothing is missing",
+    "missing_effect": "an effect is missing",
+    "cannot_tell": "something is missing; these views cannot tell what",
+    "unknown_effect": "something unknown is missing",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene with what is hidden in it, or a measured object (None)."""
+
+    name: str
+    hidden: str | None
+    told: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """What its commands gave."""
+
+    codes: dict[str, int]  # of the exits, by command
+    seconds: dict[str, float]  # of one core
+    sentence: str
+    verdict: str
+    effects: list[str]
+    diagnosis: str
+    views: int
+    points: int
+    recording: int  # bytes
+
+
+def picture_of(report: Path, path: Path) -> int:
+    """The still picture of a report, in few colours; its bytes, 0 where the report has none."""
+    found = re.search(r'class="still"[^>]*src="data:image/png;base64,([^"]+)"', _text(report))
+    if found is None:
+        return 0
+    shot = Image.open(io.BytesIO(base64.b64decode(found[1]))).convert("RGB")
+    shot.thumbnail((_WIDE, _WIDE))
+    shot.quantize(_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    return path.stat().st_size
+
+
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8") if file.is_file() else ""
+
+
+def page(made: dict[Case, Made]) -> str:
+    """The whole page."""
+    synthetic = {case: own for case, own in made.items() if case.hidden is not None}
+    measured = {case: own for case, own in made.items() if case.hidden is None}
+    parts = [_HEAD, _table(made), "## Scenes of the simulator\n", _SCENES, *_sections(synthetic)]
+    if measured:
+        parts += ["## Measured objects\n", _OBJECTS, *_sections(measured)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _table(made: dict[Case, Made]) -> str:
+    rows = ["| case | hidden | what `stitch diagnose` says | exits | seconds of one core |", "|---|---|---|---|---:|"]
+    for case, own in made.items():
+        hidden = "measured" if case.hidden is None else case.hidden.partition("=")[0] or "nothing"
+        named = f": {', '.join(own.effects)}" if own.effects else ""
+        told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}"
+        exits = ", ".join(f"{name} {code}" for name, code in own.codes.items())
+        spent = sum(seconds for name, seconds in own.seconds.items() if name != "synth")
+        rows.append(f"| [{case.name}](#{case.name}) | {hidden} | {told} | {exits} | {spent:.0f} |")
+    return "\n".join([*rows, ""])
+
+
+def _sections(made: dict[Case, Made]) -> list[str]:
+    return [_section(case, own) for case, own in made.items()]
+
+
+def _section(case: Case, own: Made) -> str:
+    size = f"{own.recording / 1e6:.1f} MB" if own.recording else "none"
+    pictured = f"![{case.name}](pictures/gallery-{case.name}.png)\n\n" if own.sentence and own.recording else ""
+    told = " ".join(text for text in (own.sentence, f"**{own.diagnosis}**" if own.diagnosis else "") if text)
+    return (
+        f"### {case.name}\n\n{case.told} {own.views} views, {own.points:,} points. Recording: "
+        f"`{case.name}/run/recording.rrd`, {size}.\n\n{pictured}{told}\n"
+    )
+
+
+_HEAD = """# Gallery
+
+Every scene of the simulator and five measured objects, run and diagnosed by the command line. Made by
+`python -m bench.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in the
+stitched cloud, light where the views agree, dark red where they do not, each with a scale of its own
+([how to read them](report.md)).
+
+Recordings are not kept in the project; `python -m bench.gallery --keep FOLDER` makes them, then
+`stitch view FOLDER/blade/run` shows one.
+"""
+
+_SCENES = """Twelve views each, seed 3. What is hidden is one law of nature ([scenes and laws](synth.md)) beside the
+arm's own scatter and quiet laws; the diagnosis knows nothing of it.
+"""
+
+_OBJECTS = """Scans of the RegHEC data set (Shiyu Xing, MIT licence), nine views each, no hand-eye given.
+"""
