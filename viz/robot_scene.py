@@ -7,6 +7,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.robot import link_frames
 from stitch.runs.run import Run
+from viz.arm_meshes import log_meshes
 from viz.colours import view_colours
 from viz.run_figures import shown_points
 
@@ -53,6 +54,7 @@ def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
     else:
         chains = link_frames(robot, joints)[..., :3, 3]
         shown = chains.reshape(-1, 3)
+        log_meshes(recording, robot, joints[0])
         recording.log("robot/arm", rr.LineStrips3D(chains, colors=[_GREY], radii=_THIN), static=True)
         recording.log(
             "robot/joints", rr.Points3D(chains[0], colors=[_GREY], radii=rr.Radius.ui_points(2.5)), static=True

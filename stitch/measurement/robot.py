@@ -6,10 +6,21 @@ before = origin with the joint axis turned to z and after = its inverse turn.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class LinkMesh:
+    """How a link looks, for pictures alone."""
+
+    link: int  # 0 is the base, i what joint i moves: its frame is that of `link_frames`, the flange's for the last
+    T_link_mesh: Array  # (4, 4) length_unit
+    file: Path
+    scale: Array  # (3,) length_unit in a unit of the file
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,7 @@ class Robot:
     a: Array | None = None  # (n,) DH parameters, None for URDF
     alpha: Array | None = None
     d: Array | None = None
+    meshes: tuple[LinkMesh, ...] = ()
 
     @property
     def n_joints(self) -> int:

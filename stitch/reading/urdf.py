@@ -6,17 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot
-from stitch.reading.dh_rows import LARGEST, gravity_of, payload_of
+from stitch.reading.dh_rows import gravity_of, payload_of
 from stitch.reading.text_file import require_file
+from stitch.reading.urdf_elements import Element, end, fixed_to, origin, values
+from stitch.reading.urdf_meshes import link_meshes
 from stitch.units import METRES
-
-Element = ElementTree.Element
 
 
 def robot_from_urdf(
@@ -42,7 +41,8 @@ def robot_from_urdf(
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
-        before, after, mass, com = _serial_chain(robot, base_link, flange_link, 1 / METRES[length_unit])
+        scale, chain = 1 / METRES[length_unit], _chain(robot, base_link, flange_link)
+        before, after, mass, com, T_last_flange = _serial_chain(robot, chain, scale)
         payload_mass, payload_com = payload_of(payload)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -58,47 +58,49 @@ def robot_from_urdf(
         payload_com=payload_com,
         gravity=gravity_of(gravity),
         metres_per_unit=METRES[length_unit],
+        meshes=link_meshes(robot, chain, path.parent, scale, frames.inverse(T_last_flange)),
     )
 
 
-def _serial_chain(
-    root: Element, base_link: str | None, flange_link: str | None, scale: float
-) -> tuple[Array, Array, Array, Array]:
-    """What stands before and behind the turn of every joint (n, 4, 4), and what it moves: mass (n,), com (n, 3)."""
+def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
+    """What stands before and behind the turn of every joint (n, 4, 4), what it moves: mass (n,), com (n, 3).
+
+    And T_last_flange (4, 4): the flange's frame in that of the last link.
+    """
     before: list[Array] = []
     after: list[Array] = []
     mass, com = [], []
     pending = np.eye(4)
-    for joint in _chain(root, base_link, flange_link):
-        pending = pending @ _origin(joint, scale)
+    for joint in chain:
+        pending = pending @ origin(joint, scale)
         if joint.get("type") == "fixed":
             continue
         _require_turning(joint)
         turn = _turn_to_z(joint)
         before.append(pending @ turn)
         after.append(frames.inverse(turn))
-        body = list(_rigid_body(root, _end(joint, "child"), scale))
+        body = list(_rigid_body(root, end(joint, "child"), scale))
         mass.append(sum(m for m, _ in body))
         com.append(sum((m * c for m, c in body), np.zeros(3)) / (mass[-1] or 1.0))
         pending = np.eye(4)
     if not before:
-        raise InputError(f"no revolute joint between {base_link} and {flange_link}")
+        raise InputError("no revolute joint between base_link and flange_link; to fix: name the ends of the arm")
     # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
     after[-1] = after[-1] @ pending
     com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
-    return np.array(before), np.array(after), np.array(mass), np.array(com)
+    return np.array(before), np.array(after), np.array(mass), np.array(com), pending
 
 
 def _chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
     """Joints from base to flange; walked backwards, because a link has one parent."""
     parent_of: dict[str, Element] = {}
     for joint in root.findall("joint"):
-        child = _end(joint, "child")
+        child = end(joint, "child")
         if child in parent_of:
             raise InputError(f"link {child} hangs on two joints; a URDF is a tree")
         parent_of[child] = joint
     if not base_link or not flange_link:
-        parents = {_end(joint, "parent") for joint in parent_of.values()}
+        parents = {end(joint, "parent") for joint in parent_of.values()}
         roots, ends = (", ".join(sorted(names)) for names in (parents - set(parent_of), set(parent_of) - parents))
         raise InputError(
             "robot.urdf needs base_link and flange_link in session.toml; the tree starts at "
@@ -110,15 +112,8 @@ def _chain(root: Element, base_link: str | None, flange_link: str | None) -> lis
         if link not in parent_of or parent_of[link] in chain:
             raise InputError(f"no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
         chain.append(parent_of[link])
-        link = _end(chain[-1], "parent")
+        link = end(chain[-1], "parent")
     return chain[::-1]
-
-
-def _end(joint: Element, kind: str) -> str:
-    element = joint.find(kind)
-    if element is None or not element.get("link"):
-        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>; to fix: write it")
-    return str(element.get("link"))
 
 
 def _require_turning(joint: Element) -> None:
@@ -131,43 +126,18 @@ def _require_turning(joint: Element) -> None:
 
 def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
     """Mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
-    waiting = [(link, np.eye(4))]
-    while waiting:
-        name, T = waiting.pop()
-        element = next((e for e in root.findall("link") if e.get("name") == name), None)
-        inertial = None if element is None else element.find("inertial")
+    for element, T in fixed_to(root, link, scale):
+        name, inertial = element.get("name"), element.find("inertial")
         if inertial is not None and inertial.find("mass") is not None:
-            mass = _values(inertial.find("mass"), "value", "0", f"link {name}")
+            mass = values(inertial.find("mass"), "value", "0", f"link {name}")
             if len(mass) != 1 or mass[0] < 0:
                 raise InputError(f"link {name}: mass is not a positive number")
-            yield float(mass[0]), (T @ _origin(inertial, scale, f"link {name}"))[:3, 3]
-        for joint in root.findall("joint"):
-            if joint.get("type") == "fixed" and _end(joint, "parent") == name:
-                waiting.append((_end(joint, "child"), T @ _origin(joint, scale)))
-
-
-def _origin(owner: Element, scale: float, where: str = "") -> Array:
-    where = where or f"joint {owner.get('name')}"
-    element = owner.find("origin")
-    xyz, rpy = (_values(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
-    return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
-
-
-def _values(element: Element | None, key: str, default: str, where: str) -> Array:
-    """The numbers of an attribute, as many as its default has."""
-    text = default if element is None else element.get(key) or default
-    try:
-        values = np.array(text.split(), float)
-    except ValueError:
-        values = np.array([np.nan])
-    if len(values) != len(default.split()) or not (np.abs(values) < LARGEST).all():
-        raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
-    return values
+            yield float(mass[0]), (T @ origin(inertial, scale, f"link {name}"))[:3, 3]
 
 
 def _turn_to_z(joint: Element) -> Array:
     """A rotation whose z axis is the joint's axis; URDF's default axis is x."""
-    direction = _values(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
+    direction = values(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
     length = np.linalg.norm(direction)
     if length < 1e-9:
         raise InputError(f"axis of joint {joint.get('name')} has no direction; to fix: write its axis")
