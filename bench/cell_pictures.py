@@ -1,4 +1,4 @@
-"""Figures and pages of the cells, from the jobs in examples/: writes docs/pictures/*.png.
+"""Figures and pages of the cells, from the jobs in examples/: writes docs/pictures/*.png and cell-*.webp.
 
 Run: python -m bench.cell_pictures. The pages need a Chromium on the path.
 """
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from bench.report_pictures import call, keep, shot
+from bench.report_pictures import call, shot
 from stitch.cells.base_to_base import read_stand, solve
 from stitch.cells.drilling.drill_job import read_job as read_drilling
 from stitch.cells.drilling.drill_solution import solve_job as solve_drilling
@@ -41,7 +41,9 @@ def pages() -> None:
         for command, job in jobs.items():
             page = Path(folder) / f"{command}.html"
             call([command, EXAMPLES / job, "--report", page])
-            keep(shot(page, 1000, 1000).reduce(2), f"cell-{command}")
+            path = PICTURES / f"cell-{command}.webp"
+            shot(page, 1000, 1000).reduce(2).save(path, quality=90, method=6)
+            print(path)
 
 
 def main() -> None:

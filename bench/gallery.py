@@ -117,9 +117,9 @@ def main() -> None:
                 shown[case] = make(case, folder)
             else:
                 continue
-            size = picture_of(folder / "run" / "report.html", DOCS / "pictures" / f"gallery-{case.name}.png")
+            size = picture_of(folder / "run" / "report.html", DOCS / "pictures" / f"gallery-{case.name}.webp")
             print(f"{case.name}: {shown[case].verdict or shown[case].codes}, picture {size / 1000:.0f} kB", flush=True)
-        (DOCS / "gallery.md").write_text(page(shown), encoding="utf-8")
+            (DOCS / "gallery.md").write_text(page(shown), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-_WIDE, _COLOURS = 760, 128
+_WIDE, _QUALITY = 760, 85
 
 _VERDICTS = {
     "adequate": "nothing is missing",
@@ -43,13 +43,13 @@ class Made:
 
 
 def picture_of(report: Path, path: Path) -> int:
-    """The still picture of a report, in few colours; its bytes, 0 where the report has none."""
+    """The still picture of a report, small; its bytes, 0 where the report has none."""
     found = re.search(r'class="still"[^>]*src="data:image/png;base64,([^"]+)"', _text(report))
     if found is None:
         return 0
     shot = Image.open(io.BytesIO(base64.b64decode(found[1]))).convert("RGB")
     shot.thumbnail((_WIDE, _WIDE))
-    shot.quantize(_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    shot.save(path, quality=_QUALITY, method=6)
     return path.stat().st_size
 
 
@@ -85,7 +85,7 @@ def _sections(made: dict[Case, Made]) -> list[str]:
 
 def _section(case: Case, own: Made) -> str:
     size = f"{own.recording / 1e6:.1f} MB" if own.recording else "none"
-    pictured = f"![{case.name}](pictures/gallery-{case.name}.png)\n\n" if own.sentence and own.recording else ""
+    pictured = f"![{case.name}](pictures/gallery-{case.name}.webp)\n\n" if own.sentence and own.recording else ""
     told = " ".join(text for text in (own.sentence, f"**{own.diagnosis}**" if own.diagnosis else "") if text)
     return (
         f"### {case.name}\n\n{case.told} {own.views} views, {own.points:,} points. Recording: "
