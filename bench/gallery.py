@@ -94,6 +94,10 @@ def _json(file: Path) -> dict[str, object]:
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
+def _others(shown: dict[Case, Made]) -> list[str]:
+    return [case.name for case in CASES if case not in shown]
+
+
 def _cpu() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
@@ -119,7 +123,7 @@ def main() -> None:
                 continue
             size = picture_of(folder / "run" / "report.html", DOCS / "pictures" / f"gallery-{case.name}.webp")
             print(f"{case.name}: {shown[case].verdict or shown[case].codes}, picture {size / 1000:.0f} kB", flush=True)
-            (DOCS / "gallery.md").write_text(page(shown), encoding="utf-8")
+            (DOCS / "gallery.md").write_text(page(shown, _others(shown)), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -57,14 +57,19 @@ def _text(file: Path) -> str:
     return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
-def page(made: dict[Case, Made]) -> str:
-    """The whole page."""
+def page(made: dict[Case, Made], others: list[str]) -> str:
+    """The whole page.
+
+    Args:
+        others: names of the cases that were not made.
+    """
     synthetic = {case: own for case, own in made.items() if case.hidden is not None}
     measured = {case: own for case, own in made.items() if case.hidden is None}
-    parts = [_HEAD, _table(made), "## Scenes of the simulator\n", _SCENES, *_sections(synthetic)]
+    missing = f"Not on this page: {', '.join(others)}; `python -m bench.gallery` adds them.\n" if others else ""
+    parts = [_HEAD, missing, _table(made), "## Scenes of the simulator\n", _SCENES, *_sections(synthetic)]
     if measured:
         parts += ["## Measured objects\n", _OBJECTS, *_sections(measured)]
-    return "\n".join(parts).rstrip() + "\n"
+    return "\n".join(part for part in parts if part).rstrip() + "\n"
 
 
 def _table(made: dict[Case, Made]) -> str:
@@ -95,7 +100,7 @@ def _section(case: Case, own: Made) -> str:
 
 _HEAD = """# Gallery
 
-Every scene of the simulator and five measured objects, run and diagnosed by the command line. Made by
+Scenes of the simulator and measured objects, run and diagnosed by the command line. Made by
 `python -m bench.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in the
 stitched cloud, light where the views agree, dark red where they do not, each with a scale of its own
 ([how to read them](report.md)).
