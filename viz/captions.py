@@ -41,3 +41,7 @@ TWO_FIELDS = (
     "Per place of the part, how far each view puts the surface from where the others put it, by the model of each run; "
     "one scale of colours for both. Drag to turn: both turn. Grey: seen by one view only."
 )
+WATCHED = (
+    "Dots: what the sessions found. Blue: smoothed, with two sigmas. Green: the calibration in use, dotted how far a "
+    "parameter may be off. Red: something happened, a line for a step, dashes for a drift."
+)

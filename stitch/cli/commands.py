@@ -28,6 +28,7 @@ _OWN = {
     "explain": "stitch.cli.explain:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",
+    "watch": "stitch.cli.watch_command:watch",
     "batch": "stitch.cli.batch:batch",
     "import": "stitch.cli.import_file:import_command",
     "export": "stitch.cli.export_run:export_run",

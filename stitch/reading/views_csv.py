@@ -56,7 +56,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     if not lines:
         raise InputError(f"{file}: no views; write one row per scan")
     cells = [(line, _row_cells(header, row)) for line, row in lines]
-    covariates = _covariate_names(header, cells)
+    covariates = covariate_names(header, cells)
     joints = [_joints(file, line, row, header) for line, row in cells]
     rows: list[Row] = []
     seen: dict[str, int] = {}
@@ -117,7 +117,8 @@ def _row_cells(header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
     return {name: cell.strip() for name, cell in zip(header, row, strict=True)}
 
 
-def _covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
+def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
+    """Columns of numbers that are neither poses nor joints: what errors may follow."""
     known = {"view", "cloud", "time_s", *_POSE}
     rest = [n for n in header if n not in known and not _JOINT.match(n) and not _APPROACH.match(n)]
     return [name for name in rest if any(is_number(row[name]) for _, row in cells)]

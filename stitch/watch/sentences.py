@@ -1,0 +1,105 @@
+"""What moves in a cell, in one sentence an event."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+
+from stitch.units import angle_text, length_text
+from stitch.watch.cell_report import CellReport, ParameterReport
+from stitch.watch.changes import Change
+
+# Steps of several parameters that begin within so many seconds are one event.
+_TOGETHER = 12 * 3600.0
+# Sessions that scatter by more than so many stated sigmas are remarked.
+_WIDE = 2.0
+_PLACES = {"hand_eye": "the mount"}
+
+
+def headline(report: CellReport) -> str:
+    """The verdict on a cell in one line."""
+    told = event_sentences(report)
+    if not told:
+        return f"{report.name}: nothing moves in {report.sessions:,} sessions; {_recalibrate(report)}."
+    return f"{report.name}: {'; '.join(told)}; {_recalibrate(report)}."
+
+
+def event_sentences(report: CellReport) -> list[str]:
+    """One for every event that stands."""
+    left, out = report.alarms, list[str]()
+    while left:
+        own, change = left[0]
+        group = [item for item in left if _one_event(report, change, item[1], own, item[0])]
+        left = [item for item in left if item not in group]
+        out.append(_event(report, group))
+    return out
+
+
+def notes(report: CellReport) -> list[str]:
+    """What to know before trusting the verdict."""
+    wide = [p for p in report.parameters if p.scatter > _WIDE]
+    if not wide:
+        return []
+    worst = max(wide, key=lambda p: p.scatter)
+    return [
+        f"Sessions scatter up to {worst.scatter:.1f} times as much as their runs state ({worst.name}): something "
+        "changes from session to session that the model does not know, or the runs' sigmas are too small."
+    ]
+
+
+def size_text(value: float, unit: str, sigma: float | None = None) -> str:
+    """A value with its unit for people: lengths in µm or mm, angles in mrad."""
+    told = value if sigma is None or not np.isfinite(sigma) else float(f"{value:.{_digits(value, sigma)}g}")
+    if unit in ("mm", "m"):
+        return length_text(told, unit)
+    if unit == "rad":
+        return angle_text(told)
+    return f"{told:.4g} {unit}"
+
+
+def day_text(time: float | None) -> str:
+    """A time (s since 1970, UTC) for people."""
+    return "–" if time is None else datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def _digits(value: float, sigma: float) -> int:
+    if not value or sigma <= 0:
+        return 3
+    return int(np.clip(np.floor(np.log10(abs(value))) - np.floor(np.log10(sigma)) + 2, 1, 6))
+
+
+def _one_event(report: CellReport, a: Change, b: Change, p: ParameterReport, q: ParameterReport) -> bool:
+    near = abs(report.run_times[a.since] - report.run_times[b.since]) <= _TOGETHER
+    return p.name == q.name or (near and a.kind == b.kind == "step" and _effect(p) == _effect(q))
+
+
+def _effect(parameter: ParameterReport) -> str:
+    return parameter.name.partition(".")[0]
+
+
+def _event(report: CellReport, group: Sequence[tuple[ParameterReport, Change]]) -> str:
+    clearest = min(group, key=lambda item: item[1].p_value if np.isfinite(item[1].p_value) else 1.0)[1]
+    since = f"{report.run_names[clearest.since]} ({day_text(report.run_times[clearest.since])})"
+    effect = _effect(group[0][0])
+    if clearest.kind == "step":
+        sizes = ", ".join(f"{p.name.partition('.')[2]} {size_text(c.size, p.unit, c.sigma)}" for p, c in group)
+        return f"{_PLACES.get(effect, effect)} jumped before session {since}: {sizes}"
+    parameter, change = group[0]
+    if change.channel is not None:
+        per = size_text(change.size, parameter.unit, change.sigma)
+        return f"{parameter.name} follows {change.channel} since session {since}, {per} per unit"
+    per_day = size_text(change.size, parameter.unit, change.sigma)
+    share = change.size / parameter.in_use if parameter.in_use and effect != "hand_eye" else float("nan")
+    rate = f"{100 * share:+.2g} % a day" if np.isfinite(share) else f"{per_day} a day"
+    return f"{parameter.name} drifts since session {since}, {rate}"
+
+
+def _recalibrate(report: CellReport) -> str:
+    end = report.recalibrate_before
+    if end is None:
+        return "the calibration in use holds"
+    return (
+        "the calibration in use does not hold: recalibrate now"
+        if end <= report.last
+        else f"recalibrate before {day_text(end)}"
+    )

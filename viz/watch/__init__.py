@@ -1,0 +1,1 @@
+"""Pages of cells over days, and of the plant that they stand in."""

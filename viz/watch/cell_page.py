@@ -1,0 +1,117 @@
+"""The page of a cell over days: one sentence, until when the calibration holds, every parameter over time."""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.system.whole_file import whole
+from stitch.units import rounded
+from stitch.watch.cell_course import CellCourse
+from stitch.watch.cell_report import CellReport, ParameterReport
+from stitch.watch.sentences import day_text, event_sentences, notes, size_text
+from viz import captions
+from viz.drawing import covariate
+from viz.filled_templates import render
+from viz.watch.small_multiples import channel_drawing, drawings, unit_of
+
+# Parameters that are drawn before the others are folded.
+_FIRST = 6
+
+
+def write_page(course: CellCourse, path: Path) -> None:
+    """Write the page of a cell; it needs nothing beside it."""
+    report = course.report
+    order = sorted(range(len(report.parameters)), key=lambda p: _urgency(report, report.parameters[p]))
+    moved = sum(p.alarm is not None for p in report.parameters)
+    first = max(min(_FIRST, len(order)), moved)
+    page = render(
+        "watch.html.j2",
+        report=report,
+        light=light(report),
+        events=event_sentences(report),
+        notes=notes(report),
+        identity=_identity(report),
+        rows=[_row(report, report.parameters[p]) for p in order],
+        first=drawings(course, order[:first]),
+        rest=drawings(course, order[first:]),
+        channels=[
+            (covariate(name), channel_drawing(course.times, values, name))
+            for name, values in course.channels.items()
+            if np.isfinite(values).any()
+        ],
+        past=_past(report),
+        shown=len(course.times),
+        caption=captions.WATCHED,
+    )
+    with whole(path) as file:
+        file.write_text(page, encoding="utf-8")
+
+
+def light(report: CellReport) -> tuple[str, str]:
+    """Colour of a light, and what it says."""
+    end = report.recalibrate_before
+    if end is not None and end <= report.last:
+        return "bad", "The calibration in use does not hold any more: recalibrate now."
+    if report.alarms:
+        until = "" if end is None else f" Recalibrate before {day_text(end)}."
+        return "check", f"Something moves; the calibration in use still holds.{until}"
+    if end is not None:
+        return "good", f"Nothing moves. Recalibrate before {day_text(end)}."
+    return "good", "Nothing moves; the calibration in use holds for half a year at least."
+
+
+def _urgency(report: CellReport, p: ParameterReport) -> tuple[bool, float, float]:
+    """Alarms first, by their onset; then what leaves its limits first."""
+    since = np.inf if p.alarm is None else report.run_times[p.alarm.since]
+    return p.alarm is None, since, np.inf if p.valid_until is None else p.valid_until
+
+
+def _identity(report: CellReport) -> list[tuple[str, str]]:
+    return [
+        ("Cell", report.name),
+        ("Sessions", f"{report.sessions:,}"),
+        ("First", f"{day_text(report.first)} UTC"),
+        ("Last", f"{day_text(report.last)} UTC"),
+        ("Calibration in use", report.in_use),
+        ("False alarms", f"one of the whole cell in {report.run_length:,.0f} sessions, or fewer"),
+        ("stitch", version("stitch")),
+    ]
+
+
+def _row(report: CellReport, p: ParameterReport) -> dict[str, Any]:
+    factor, unit = unit_of(p.unit, report.length_unit)
+    moves = abs(p.drift_per_day) > 3 * p.drift_sigma
+    until = "holds" if p.valid_until is None else "over" if p.valid_until <= report.last else day_text(p.valid_until)
+    return {
+        "name": p.name,
+        "unit": unit,
+        "value": rounded(factor * p.value, factor * p.sigma / 10),
+        "sigma": f"{factor * p.sigma:.2g}",
+        "drift": rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–",
+        "follows": "; ".join(f"{covariate(f.channel)}: {factor * f.per_unit:.2g} per unit" for f in p.follows),
+        "limit": f"{factor * p.limit:.3g}" if np.isfinite(p.limit) else "–",
+        "until": until,
+        "scatter": f"{p.scatter:.2f}",
+        "alarm": p.alarm is not None,
+    }
+
+
+def _past(report: CellReport) -> list[dict[str, str]]:
+    """Every change, latest first."""
+    own = [(p, c) for p in report.parameters for c in p.changes]
+    own.sort(key=lambda item: -report.run_times[item[1].since])
+    return [
+        {
+            "name": p.name,
+            "since": f"{report.run_names[c.since]}, {day_text(report.run_times[c.since])}",
+            "raised": report.run_names[c.raised],
+            "kind": c.kind if c.channel is None else f"follows {c.channel}",
+            "size": size_text(c.size, p.unit, c.sigma) + (" a day" if c.kind == "drift" and c.channel is None else ""),
+            "sigma": size_text(float(f"{c.sigma:.2g}"), p.unit),
+            "chart": c.chart,
+            "stands": "stands" if c is p.alarm else "",
+        }
+        for p, c in own
+    ]
