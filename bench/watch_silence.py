@@ -16,7 +16,7 @@ _CHANNELS = ["air_temperature_c"]
 
 def silence() -> list[str]:
     """False alarms in so many cell-months, by how large the thermal cycle is."""
-    lines = ["**Nothing happens**: false alarms at the limits for one in 100 cell-months (600 sessions each)", ""]
+    lines = ["**Nothing happens**: false alarms in months of 600 sessions; the limits are for one in 200", ""]
     lines += ["| thermal cycle, sigmas | cell-months | false alarms | in 100 cell-months | 95 % interval |"]
     lines += ["|---:|---:|---:|---:|---|"]
     for k, thermal in enumerate((1.0, 4.0)):

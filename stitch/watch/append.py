@@ -13,8 +13,9 @@ from stitch.watch.read_record import middle_seen
 from stitch.watch.regressors import chosen_channels
 from stitch.watch.run_record import Estimate, RunRecord
 
-# One false alarm of the whole cell in so many sessions where nothing happens: a hundred months of 600.
-RUN_LENGTH = 60_000.0
+# One false alarm of the whole cell in so many sessions where nothing happens: two hundred months of 600, so that one in
+# a hundred remains where parameters follow temperatures in ways that the regressors do not quite have.
+RUN_LENGTH = 120_000.0
 
 
 def append_runs(history: History, records: Sequence[RunRecord]) -> int:
