@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from stitch.system.console import console
+from stitch.units import rounded
 from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.sentences import day_text, headline, notes, size_text
+from stitch.watch.table_units import unit_of
 
 
 def show(reports: Sequence[CellReport], folders: Sequence[Path], added: int | None, pages: bool) -> None:
@@ -16,13 +18,15 @@ def show(reports: Sequence[CellReport], folders: Sequence[Path], added: int | No
     terminal = console()
     if added is not None:
         terminal.print(f"{added} new {'run' if added == 1 else 'runs'} in {folders[0]}", soft_wrap=True)
-    for report in reports:
+    # Of a plant the verdicts are enough; its page has the rest.
+    for report in reports if len(reports) == 1 else ():
         terminal.print(_table(report))
         for p in report.parameters:
             if p.follows:
                 terminal.print(f"{p.name} follows {follows_text(p)}", soft_wrap=True)
+    for report in reports:
         for note in notes(report):
-            terminal.print(note, soft_wrap=True)
+            terminal.print(f"{report.name}: {note}", soft_wrap=True)
     for folder in folders if pages else ():
         terminal.print(f"  {folder / 'watch.html'}", soft_wrap=True)
     if pages and len(folders) > 1:
@@ -34,19 +38,20 @@ def show(reports: Sequence[CellReport], folders: Sequence[Path], added: int | No
 def _table(report: CellReport) -> Table:
     span = f"{day_text(report.first)} to {day_text(report.last)}"
     title = f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use"
-    table = Table(title=title, title_justify="left")
-    for heading in ("parameter", "value", "sigma", "a day", "valid until", "moved"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "moved") else "right", no_wrap=True)
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for heading in ("parameter", "unit", "value", "sigma", "a day", "valid", "moved"):
+        words = heading in ("parameter", "unit", "moved")
+        table.add_column(heading, justify="left" if words else "right", no_wrap=heading != "moved")
     for p in report.parameters:
-        table.add_row(p.name, *numbers_of(p), valid_text(report, p), moved_text(report, p))
+        factor, unit = unit_of(p.unit, report.length_unit)
+        # A drift that is not known to be one is a dash.
+        moves = abs(p.drift_per_day) > 3 * p.drift_sigma
+        drift = rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–"
+        value = rounded(factor * p.value, factor * p.sigma / 10)
+        table.add_row(
+            p.name, unit, value, f"{factor * p.sigma:.2g}", drift, valid_text(report, p), moved_text(report, p)
+        )
     return table
-
-
-def numbers_of(p: ParameterReport) -> tuple[str, str, str]:
-    """Value, sigma and drift a day; a drift that is not known to be one is a dash."""
-    moves = np.isfinite(p.drift_sigma) and abs(p.drift_per_day) > 3 * p.drift_sigma
-    drift = size_text(p.drift_per_day, p.unit, p.drift_sigma) if moves else "–"
-    return size_text(p.value, p.unit, p.sigma), size_text(p.sigma, p.unit), drift
 
 
 def follows_text(p: ParameterReport) -> str:
@@ -59,11 +64,11 @@ def moved_text(report: CellReport, p: ParameterReport) -> str:
     if p.alarm is None:
         return "–"
     beside = f" with {p.alarm.channel}" if p.alarm.channel else ""
-    return f"{p.alarm.kind}{beside} since {report.run_names[p.alarm.since]}"
+    return f"{p.alarm.kind}{beside}, {report.run_names[p.alarm.since]}"
 
 
 def valid_text(report: CellReport, p: ParameterReport) -> str:
     """Until when the calibration in use holds for it."""
     if p.valid_until is None:
         return "holds"
-    return "over" if p.valid_until <= report.last else day_text(p.valid_until)
+    return "over" if p.valid_until <= report.last else day_text(p.valid_until)[:10]

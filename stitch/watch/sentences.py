@@ -10,10 +10,11 @@ from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.changes import Change
 
 # Steps of several parameters that begin within so many seconds are one event.
-_TOGETHER = 12 * 3600.0
+_TOGETHER = 24 * 3600.0
 # Sessions that scatter by more than so many stated sigmas are remarked.
 _WIDE = 2.0
 _PLACES = {"hand_eye": "the mount"}
+_Alarmed = tuple[ParameterReport, Change]
 
 
 def headline(report: CellReport) -> str:
@@ -25,14 +26,13 @@ def headline(report: CellReport) -> str:
 
 
 def event_sentences(report: CellReport) -> list[str]:
-    """One for every event that stands."""
-    left, out = report.alarms, list[str]()
+    """One for every event that stands, in the order of their onsets."""
+    left, groups = sorted(report.alarms, key=lambda item: _doubt(item[1])), list[list[_Alarmed]]()
     while left:
-        own, change = left[0]
-        group = [item for item in left if _one_event(report, change, item[1], own, item[0])]
-        left = [item for item in left if item not in group]
-        out.append(_event(report, group))
-    return out
+        # Small steps are dated by the large one beside them.
+        groups.append([item for item in left if _one_event(report, left[0], item)])
+        left = [item for item in left if item not in groups[-1]]
+    return [_event(report, group) for group in sorted(groups, key=lambda group: report.run_times[group[0][1].since])]
 
 
 def notes(report: CellReport) -> list[str]:
@@ -68,7 +68,13 @@ def _digits(value: float, sigma: float) -> int:
     return int(np.clip(np.floor(np.log10(abs(value))) - np.floor(np.log10(sigma)) + 2, 1, 6))
 
 
-def _one_event(report: CellReport, a: Change, b: Change, p: ParameterReport, q: ParameterReport) -> bool:
+def _doubt(change: Change) -> tuple[float, float]:
+    """The clearest first; beyond the smallest number that there is, by size in sigmas."""
+    return (change.p_value if np.isfinite(change.p_value) else 1.0, -abs(change.size) / max(change.sigma, 1e-300))
+
+
+def _one_event(report: CellReport, clearest: _Alarmed, other: _Alarmed) -> bool:
+    (p, a), (q, b) = clearest, other
     near = abs(report.run_times[a.since] - report.run_times[b.since]) <= _TOGETHER
     return p.name == q.name or (near and a.kind == b.kind == "step" and _effect(p) == _effect(q))
 
@@ -77,8 +83,8 @@ def _effect(parameter: ParameterReport) -> str:
     return parameter.name.partition(".")[0]
 
 
-def _event(report: CellReport, group: Sequence[tuple[ParameterReport, Change]]) -> str:
-    clearest = min(group, key=lambda item: item[1].p_value if np.isfinite(item[1].p_value) else 1.0)[1]
+def _event(report: CellReport, group: Sequence[_Alarmed]) -> str:
+    clearest = group[0][1]
     since = f"{report.run_names[clearest.since]} ({day_text(report.run_times[clearest.since])})"
     effect = _effect(group[0][0])
     if clearest.kind == "step":

@@ -11,10 +11,11 @@ from stitch.units import rounded
 from stitch.watch.cell_course import CellCourse
 from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.sentences import day_text, event_sentences, notes, size_text
+from stitch.watch.table_units import unit_of
 from viz import captions
 from viz.drawing import covariate
 from viz.filled_templates import render
-from viz.watch.small_multiples import channel_drawing, drawings, unit_of
+from viz.watch.small_multiples import channel_drawing, drawings
 
 # Parameters that are drawn before the others are folded.
 _FIRST = 6
@@ -30,7 +31,7 @@ def write_page(course: CellCourse, path: Path) -> None:
         "watch.html.j2",
         report=report,
         light=light(report),
-        events=event_sentences(report),
+        events=[told[0].upper() + told[1:] if told.startswith("the ") else told for told in event_sentences(report)],
         notes=notes(report),
         identity=_identity(report),
         rows=[_row(report, report.parameters[p]) for p in order],

@@ -9,9 +9,9 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.units import MICROMETRES
 from stitch.watch.cell_course import CellCourse
 from stitch.watch.sentences import day_text
+from stitch.watch.table_units import unit_of
 from viz.watch.time_axis import time_marks, value_marks
 
 Array = NDArray[np.float64]
@@ -124,13 +124,6 @@ def channel_drawing(times: Array, values: Array, name: str) -> str:
     axes.marks()
     axes.line("channel", times, values)
     return axes.svg(f"{name} over time")
-
-
-def unit_of(unit: str, length_unit: str) -> tuple[float, str]:
-    """Factor and name of the unit in which a parameter is drawn."""
-    if unit == length_unit:
-        return MICROMETRES[length_unit], "µm"
-    return (1e3, "mrad") if unit == "rad" else (1.0, unit)
 
 
 def drawings(course: CellCourse, parameters: Sequence[int]) -> list[tuple[str, str, bool]]:
