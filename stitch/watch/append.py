@@ -50,6 +50,8 @@ def _store(history: History, record: RunRecord) -> float | None:
     _know_parameters(history, record, estimates)
     known = dict(history.sql("SELECT name, id FROM parameters"))
     rows = [(run, known[e.name], e.value, e.sigma) for e in estimates if np.isfinite(e.sigma) and e.sigma > 0]
+    if not rows:
+        raise InputError(f"{record.path}: states no sigma of anything; to fix: run its session again")
     history.many("INSERT INTO estimates VALUES (?, ?, ?, ?)", rows)
     history.many("INSERT INTO covariates VALUES (?, ?, ?)", [(run, *item) for item in record.covariates.items()])
     if _channels_changed(history, record):
