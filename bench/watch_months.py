@@ -12,7 +12,7 @@ from stitch.watch.cell_course import cell_course
 from stitch.watch.cell_report import CellReport, cell_report
 from stitch.watch.history import opened
 
-CELLS = 14
+CELLS = 8
 _Z95 = 1.96
 _WORN = "joint_compliance.c2"
 

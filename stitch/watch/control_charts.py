@@ -17,6 +17,10 @@ from stitch.watch.state_bank import WILD
 REFERENCES = (0.25, 2.0)
 WEIGHT = 0.05
 NAMES = ("CUSUM 0.25", "CUSUM 2", "EWMA 0.05")
+# Beside the charts: odds of a slope since the first session, for what moves from the beginning on, when no chart has
+# seen the parameter still. With this probability a cell ever alarms falsely by them.
+ODDS = "odds of a slope"
+_EVER = 0.0025
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,11 @@ def limits(sessions: float, parameters: int) -> tuple[float, ...]:
     """
     own = sessions * parameters * len(NAMES)
     return (*(cusum_limit(k, own) for k in REFERENCES), ewma_limit(WEIGHT, own))
+
+
+def odds_limit(parameters: int) -> float:
+    """Log odds of a slope from which on a parameter alarms."""
+    return float(np.log(max(parameters, 1) / _EVER))
 
 
 def beyond(charts: Charts, limit: tuple[float, ...]) -> Array:

@@ -11,9 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
-from stitch.watch.control_charts import NAMES, Charts, beyond, charted, limits, no_charts, restarted, with_rows
+from stitch.watch.control_charts import (
+    NAMES,
+    ODDS,
+    Charts,
+    beyond,
+    charted,
+    limits,
+    no_charts,
+    odds_limit,
+    restarted,
+    with_rows,
+)
 from stitch.watch.onset import find_onset
-from stitch.watch.state_bank import Bank, empty_bank, freed, predicted, updated, with_parameters
+from stitch.watch.state_bank import Bank, empty_bank, freed, predicted, slope_odds, updated, with_parameters
 
 
 @dataclass(frozen=True)
@@ -84,8 +95,11 @@ def _beginning(sessions: Sessions, known: int) -> tuple[Array, Array]:
 
 def alarmed(state: State, run_length: float) -> list[tuple[int, str]]:
     """Parameters whose charts are beyond their limits, with the chart that is farthest."""
-    share = beyond(state.charts, limits(run_length, len(state.bank.origin)))
-    return [(int(p), NAMES[int(np.argmax(share[p]))]) for p in np.flatnonzero(share.max(axis=1) >= 1)]
+    parameters = len(state.bank.origin)
+    share = np.column_stack(
+        [beyond(state.charts, limits(run_length, parameters)), slope_odds(state.bank) / odds_limit(parameters)]
+    )
+    return [(int(p), (*NAMES, ODDS)[int(np.argmax(share[p]))]) for p in np.flatnonzero(share.max(axis=1) >= 1)]
 
 
 def raise_alarm(sessions: Sessions, k: int, parameter: int, chart: str, before: Sequence[Alarm]) -> Alarm:

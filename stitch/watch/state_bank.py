@@ -38,6 +38,8 @@ MEMBERS = (
     (0.0, 1.0, 0.3),
     (0.3, 1.0, 0.1),
 )
+# The members that believe that nothing moves, and in a steady slope.
+STILL, STEADY = 0, 5
 # Variance of what is not known at all, and above which an innovation only says where that is.
 _UNKNOWN, _STARTS = 1e8, 1e5
 # A session farther off than so many sigmas counts as so many: one wild session must not carry the level away.
@@ -174,6 +176,15 @@ def updated(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tupl
         log_likelihood=bank.log_likelihood + np.where(told, _log_density(e_calm, spread, freedom[:, None]), 0.0),
     )
     return after, _normal(np.where(told, e / spread, np.nan)[:, 0], freedom)
+
+
+def slope_odds(bank: Bank, still: int = STILL, steady: int = STEADY) -> Array:
+    """(P,) log odds of a steady slope since the first session over no motion; −inf after something has happened.
+
+    Where nothing moves they exceed log(1/α) with probability α at most, however long one watches (Ville's inequality).
+    """
+    untouched = bank.covariance[:, still, SLOPE, SLOPE] == 0
+    return np.where(untouched, bank.log_likelihood[:, steady] - bank.log_likelihood[:, still], -np.inf)
 
 
 def _log_density(e: Array, spread: Array, freedom: Array) -> Array:
