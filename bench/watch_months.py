@@ -8,8 +8,9 @@ import numpy as np
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
+from stitch.watch.cell_assessment import cell_report
 from stitch.watch.cell_course import cell_course
-from stitch.watch.cell_report import CellReport, cell_report
+from stitch.watch.cell_report import CellReport
 from stitch.watch.history import opened
 
 CELLS = 8

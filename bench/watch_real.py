@@ -17,7 +17,8 @@ from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
 from stitch.units import length_text
 from stitch.watch.append import append_runs
-from stitch.watch.cell_report import CellReport, cell_report
+from stitch.watch.cell_assessment import cell_report
+from stitch.watch.cell_report import CellReport
 from stitch.watch.history import opened
 from stitch.watch.read_record import read_record
 from stitch.writing.result_document import model_of

@@ -7,7 +7,8 @@ from data_synth.cell_history import CellPlan, cell_history
 from stitch.watch.append import RUN_LENGTH
 from stitch.watch.control_charts import beyond, charted, limits, no_charts, odds_limit
 from stitch.watch.regressors import DAY, believed, regressors
-from stitch.watch.state_bank import MEMBERS, STEADY, STILL, empty_bank, predicted, slope_odds, updated, with_parameters
+from stitch.watch.slope_odds import STEADY, STILL, slope_odds
+from stitch.watch.state_bank import MEMBERS, empty_bank, predicted, updated, with_parameters
 
 HALLS, CELLS = 12, 50
 _PARAMETERS = 12

@@ -10,8 +10,8 @@ import numpy as np
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
+from stitch.watch.cell_assessment import cell_report
 from stitch.watch.cell_course import cell_course
-from stitch.watch.cell_report import cell_report
 from stitch.watch.history import FILE, opened
 from viz.watch.cell_page import write_page
 

@@ -13,8 +13,9 @@ from stitch.errors import InputError
 from stitch.system.steps import steps
 from stitch.system.whole_file import whole
 from stitch.watch.append import append_runs
+from stitch.watch.cell_assessment import cell_report
 from stitch.watch.cell_course import cell_course
-from stitch.watch.cell_report import CellReport, cell_report
+from stitch.watch.cell_report import CellReport
 from stitch.watch.dfq import dfq_text
 from stitch.watch.history import History, opened
 from stitch.watch.openmetrics import openmetrics

@@ -24,7 +24,8 @@ from stitch.watch.control_charts import (
     with_rows,
 )
 from stitch.watch.onset import find_onset
-from stitch.watch.state_bank import Bank, empty_bank, freed, predicted, slope_odds, updated, with_parameters
+from stitch.watch.slope_odds import slope_odds
+from stitch.watch.state_bank import Bank, empty_bank, freed, predicted, updated, with_parameters
 
 
 @dataclass(frozen=True)

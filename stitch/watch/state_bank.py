@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.special import gammaln, ndtri, stdtr
 
 from stitch.frames import Array, Indices, Mask
+from stitch.watch.student_t import as_normal, log_density
 
 LEVEL, SLOPE, COVARIATES = 0, 1, 2
 # Process noise of the members: of the level per √day, of the slope at the start per day, of the slope per day and
@@ -38,8 +38,6 @@ MEMBERS = (
     (0.0, 1.0, 0.3),
     (0.3, 1.0, 0.1),
 )
-# The members that believe that nothing moves, and in a steady slope.
-STILL, STEADY = 0, 5
 # Variance of what is not known at all, and above which an innovation only says where that is.
 _UNKNOWN, _STARTS = 1e8, 1e5
 # A session farther off than so many sigmas counts as so many: one wild session must not carry the level away.
@@ -173,26 +171,6 @@ def updated(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tupl
         covariance=(covariance + np.swapaxes(covariance, -1, -2)) / 2,
         squares=bank.squares + np.where(told, e_calm**2 / F, 0.0),
         count=bank.count + told[:, 0],
-        log_likelihood=bank.log_likelihood + np.where(told, _log_density(e_calm, spread, freedom[:, None]), 0.0),
+        log_likelihood=bank.log_likelihood + np.where(told, log_density(e_calm, spread, freedom[:, None]), 0.0),
     )
-    return after, _normal(np.where(told, e / spread, np.nan)[:, 0], freedom)
-
-
-def slope_odds(bank: Bank, still: int = STILL, steady: int = STEADY) -> Array:
-    """(P,) log odds of a steady slope since the first session over no motion; −inf after something has happened.
-
-    Where nothing moves they exceed log(1/α) with probability α at most, however long one watches (Ville's inequality).
-    """
-    untouched = bank.covariance[:, still, SLOPE, SLOPE] == 0
-    return np.where(untouched, bank.log_likelihood[:, steady] - bank.log_likelihood[:, still], -np.inf)
-
-
-def _log_density(e: Array, spread: Array, freedom: Array) -> Array:
-    """Of Student's t."""
-    told = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - np.log(freedom) / 2 - np.log(spread)
-    return np.asarray(told - (freedom + 1) / 2 * np.log1p((e / spread) ** 2 / freedom))
-
-
-def _normal(t: Array, freedom: Array) -> Array:
-    """Numbers of Student's t as normal numbers of the same probability."""
-    return np.asarray(-np.sign(t) * ndtri(np.maximum(stdtr(freedom, -np.abs(t)), 1e-300)))
+    return after, as_normal(np.where(told, e / spread, np.nan)[:, 0], freedom)

@@ -6,8 +6,8 @@ import pytest
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
+from stitch.watch.cell_assessment import cell_report
 from stitch.watch.cell_course import cell_course
-from stitch.watch.cell_report import cell_report
 from stitch.watch.history import opened
 from stitch.watch.sentences import headline
 

@@ -76,7 +76,7 @@ def _identity(report: CellReport) -> list[tuple[str, str]]:
         ("First", f"{day_text(report.first)} UTC"),
         ("Last", f"{day_text(report.last)} UTC"),
         ("Calibration in use", report.in_use),
-        ("False alarms", f"one of the whole cell in {report.run_length:,.0f} sessions, or fewer"),
+        ("False alarms", f"limits for one of the whole cell in {report.run_length:,.0f} sessions"),
         ("stitch", version("stitch")),
     ]
 
