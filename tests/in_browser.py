@@ -31,7 +31,7 @@ def shown(browser, path: Path, way: str):
     page.on("request", lambda request: None if request.url.startswith(own) else asked.append(request.url))
     page.on("console", lambda told: wrong.append(told.text) if told.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.goto(path.resolve().as_uri())
+    page.goto(path.resolve().as_uri(), timeout=120_000)
     return page, asked, wrong
 
 

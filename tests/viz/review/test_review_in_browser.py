@@ -25,7 +25,7 @@ class Story:
         )
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(address)
+        self.page.goto(address, timeout=LONG)
         self.expect("#scene.live").to_be_visible()
 
     def expect(self, place):
