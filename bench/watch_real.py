@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from stitch.measurement.session import Session
 from stitch.pipeline import run
@@ -95,7 +96,8 @@ def _moved(report: CellReport, times: np.ndarray) -> list[str]:
 def _later(session: Session, times: np.ndarray) -> list[str]:
     """The model of the first two hours on later poses, beside a model of their own hours."""
     lines = ["**The first two hours, later**: rms 3D distance of poses that took no part in a fit", ""]
-    lines += ["| hours | model of hours 0 to 2 | model of these hours | model of all hours |", "|---|---:|---:|---:|"]
+    lines += ["| hours | model of hours 0 to 2 | model of these hours | model of all hours | joints off hours 0 to 2 |"]
+    lines += ["|---|---:|---:|---:|---:|"]
     first = _some(np.flatnonzero(times < 2 * HOUR))
     early = model_of(run(block(session, first, "early"), effects=EFFECTS))
     everywhere = model_of(run(block(session, _some(np.arange(len(times))), "all"), effects=EFFECTS))
@@ -105,8 +107,17 @@ def _later(session: Session, times: np.ndarray) -> list[str]:
         these = model_of(run(block(session, fit_on, "these"), effects=EFFECTS))
         judged = block(session, judge_on, "judged")
         rms = [np.sqrt(np.mean(distances(run(judged, m)) ** 2)) for m in (early, these, everywhere)]
-        lines.append(f"| {low} to {high} | " + " | ".join(length_text(float(x), "mm") for x in rms) + " |")
+        told = " | ".join(length_text(float(x), "mm") for x in rms)
+        lines.append(f"| {low} to {high} | {told} | {joints_off(session, times, low, high):.0f}° |")
     return lines
+
+
+def joints_off(session: Session, times: np.ndarray, low: float, high: float) -> float:
+    """Median distance in the space of the joints, degrees, to the nearest other pose of the first two hours."""
+    joints = np.degrees(np.array([view.joints for view in session.views]))
+    early, own = (joints[(times >= a * HOUR) & (times < b * HOUR)] for a, b in ((0, 2), (low, high)))
+    nearest = 2 if low == 0 else 1
+    return float(np.median(cKDTree(early).query(own, k=[nearest])[0]))
 
 
 def _some(index: np.ndarray) -> np.ndarray:
