@@ -54,7 +54,8 @@ def test_error_is_that_of_the_covariance(kind):
         assert np.all(ratio > 0.4)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("line", marks=pytest.mark.slow), "area"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["line", "area"])
 def test_exact_without_noise(kind):
     cell = sphere_cell(3, kind, pose_noise=0.0, noise=0.0)
     start = global_start(cell.G, views_of(cell))

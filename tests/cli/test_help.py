@@ -78,7 +78,7 @@ def test_version_is_the_package_s(capsys):
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
-        ("stitch ex", ["export"]),
+        ("stitch ex", ["explain", "export"]),
         # These load what the command needs.
         pytest.param("stitch calibrate sp", ["sphere"], marks=pytest.mark.slow),
         pytest.param("stitch run --eff", ["--effects", "--effects-file"], marks=pytest.mark.slow),

@@ -48,6 +48,7 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     assert not (raw / "session.toml").exists()
 
 
+@pytest.mark.slow
 def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, capsys):
     table = raw / "RobotPoses.dat"
     table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))

@@ -17,7 +17,7 @@ from stitch.system.threads import library_threads_off
 VIEWS = 8
 
 
-HIDDEN = ("joint_compliance", pytest.param("part_slip", marks=pytest.mark.slow))
+HIDDEN = ("joint_compliance", "part_slip")
 
 
 def leaves(folder, hidden: dict[str, float], scene: str = "blade"):
@@ -50,6 +50,7 @@ def test_nothing_hidden_leaves_the_noise_that_was_put_in(still):
     assert 0.6 * noise < rms < 1.25 * noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HIDDEN)
 def test_a_hidden_effect_is_visible(still, tmp_path, name):
     rms, _, run, _ = leaves(tmp_path, {name: 1.0})

@@ -16,7 +16,7 @@ from data_synth.scanning import cast
 from stitch import frames
 
 
-@pytest.mark.parametrize("name", ["blade", "car-door", "spheres"])
+@pytest.mark.parametrize("name", ["blade", pytest.param("car-door", marks=pytest.mark.slow), "spheres"])
 def test_ranges_agree_with_libigl(name):
     """Two ray casters; the second carries its rays in double precision through a tree of its own."""
     scene = clean(name, rays=50)

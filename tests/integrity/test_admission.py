@@ -51,6 +51,7 @@ def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
     assert kept.left_out == () and len(kept.poses) == 10 and "kept as asked" in kept.notes[0]
 
 
+@pytest.mark.slow
 def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
     T = good.views[4].T_base_flange.copy()
     T[:3, 3] += [3.0, 0.0, 4.0]
@@ -61,7 +62,8 @@ def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
     assert amount == pytest.approx(5.0, rel=0.05)
 
 
-@pytest.mark.parametrize("factor", [1.0254, pytest.param(0.97, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0254, 0.97])
 def test_scans_of_another_scale_are_refused_though_they_fit_each_other(good, factor):
     views = [replace(v, cloud=Cloud(v.cloud.points * factor)) for v in good.views]
     with pytest.raises(InputError, match="times as large") as refused:

@@ -46,7 +46,9 @@ def test_one_compliance_explains_all_loads():
     assert own["c2"].unit == "rad/(N m)" and abs(own["c2"].value) == pytest.approx(COMPLIANCE, abs=4 * own["c2"].sigma)
     assert own["c2"].sigma < COMPLIANCE / 4  # nobody would take it for zero
     blind = replace(session, views=tuple(replace(view, covariates={}) for view in session.views))
-    assert found.heldout_rms < 0.5 * run(blind, effects=["joint_compliance"]).heldout_rms
+    # Three standard errors of the rms of 42 views with four targets of three coordinates each.
+    chance = 3 / np.sqrt(2 * 42 * 12)
+    assert found.heldout_rms < (1 - chance) * run(blind, effects=["joint_compliance"]).heldout_rms
 
 
 def test_torques_that_drives_report_take_the_place_of_those_of_gravity():

@@ -111,6 +111,7 @@ def test_the_page_needs_nothing_beside_it_and_has_one_scale(page):
     assert data[0]["steps"][-2]["mean"] < data[1]["steps"][-2]["mean"]
 
 
+@pytest.mark.slow
 def test_what_turns_the_one_part_turns_the_other(browser, file):
     page, asked, wrong = shown(browser, file, "light")
     one, other = page.locator("#part-a canvas"), page.locator("#part-b canvas")

@@ -80,6 +80,7 @@ def test_a_page_made_anew_is_the_page_of_the_run(folder, name, stitch_command):
     }
 
 
+@pytest.mark.slow
 def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
     runs = run_rig([load_session(folder / name) for name in "so"])
     write_run(runs[1], tmp_path)

@@ -12,6 +12,7 @@ from tests.viz.review.conftest import compare_without_picture, served
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
 LONG = 120_000  # ms that a command may take on a busy machine
+playwright.expect.set_options(timeout=LONG)
 
 
 class Story:
