@@ -22,12 +22,15 @@ def cases(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: str(r["case
 
 def good(rows: Sequence[Row]) -> None:
     """Sessions without a mistake."""
-    print("| sessions without a mistake | sessions | lost a view | a view suspected |\n|---|---|---|---|")
+    print(
+        "| sessions without a mistake | sessions | a test leaves views out | a run leaves views out | a view suspected |"
+    )
+    print("|---|---|---|---|---|")
     found = cases(rows, lambda r: str(r["case"]).removeprefix("good ") or "nothing hidden")
     every = [r for rows_of_case in found.values() for r in rows_of_case]
     for case, own in [*sorted(found.items()), ("all", every)]:
-        lost, suspected = (sum(bool(r[what]) for r in own) for what in ("left_out", "suspected"))
-        print(f"| {case.strip() or 'nothing hidden'} | {len(own)} | {lost} | {suspected} |")
+        counts = (sum(bool(r[what]) for r in own) for what in ("tested_out", "left_out", "suspected"))
+        print(f"| {case.strip() or 'nothing hidden'} | {len(own)} | {' | '.join(map(str, counts))} |")
 
 
 def sizes(rows: Sequence[Row]) -> None:
