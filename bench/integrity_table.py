@@ -22,9 +22,7 @@ def cases(rows: Sequence[Row], key: Callable[[Row], str] = lambda r: str(r["case
 
 def good(rows: Sequence[Row]) -> None:
     """Sessions without a mistake."""
-    print(
-        "| sessions without a mistake | sessions | a test leaves views out | a run leaves views out | a view suspected |"
-    )
+    print("| sessions without a mistake | sessions | a test leaves out | a run leaves out | a view suspected |")
     print("|---|---|---|---|---|")
     found = cases(rows, lambda r: str(r["case"]).removeprefix("good ") or "nothing hidden")
     every = [r for rows_of_case in found.values() for r in rows_of_case]
