@@ -1,5 +1,6 @@
 """`stitch run SESSION...`: coarse → correct → register → fuse, one run folder per call."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -17,7 +18,7 @@ from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.measurement.session import Session
 from stitch.model.arm import kept_arm
-from stitch.model.model_toml import write_model
+from stitch.model.model_toml import ModelFile, write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.recorder import Recorder
@@ -71,26 +72,17 @@ def run(
         load_effects(effects_file)
     for name in names_of_effects:
         known(name)
-    if hand_eye and (names_of_effects or arm):
-        raise InputError(
-            f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
-            "name one of the two"
-        )
     here = not sessions
     sessions = sessions or [_here()]
     loaded = [load_session(path) for path in sessions]
     names = _names(loaded)
     target = output or Path("../runs" if here else "runs") / "+".join(names)
-    model, _ = trusted_model(hand_eye, effects_file, trust) if hand_eye else (None, None)
-    kept = kept_arm(trusted_model(arm, effects_file, trust)[0]) if arm else None
-    if kept and (twice := set(names_of_effects) & set(kept.effects)):
-        raise InputError(f"--effects {twice.pop()}: the arm of {arm} brings it already; to fix: leave it out")
+    model, kept, own_effects = _given(hand_eye, arm, names_of_effects, effects_file, trust)
     with run_folder.new_folder(target, sessions, force) as scratch:
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, names_of_effects, keep, kept)
-        if effects_file:
-            runs = [replace(result, effects_file=str(effects_file.resolve())) for result in runs]
+        runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
             run_folder.write_with_page(result, folder, tolerance)
             if mesh:
@@ -102,6 +94,27 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         show(runs, target)
+
+
+def _given(
+    hand_eye: Path | None, arm: Path | None, effects: Sequence[str], effects_file: Path | None, trust: bool
+) -> tuple[ModelFile | None, ModelFile | None, str | None]:
+    """The model that is used as it is, the arm that is kept, and the file of the user's own effects, if any."""
+    if hand_eye and (effects or arm):
+        raise InputError(
+            f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
+            "name one of the two"
+        )
+    own = str(effects_file.resolve()) if effects_file else None
+    if hand_eye:
+        return trusted_model(hand_eye, effects_file, trust)[0], None, own
+    if arm is None:
+        return None, None, own
+    stated, file = trusted_model(arm, effects_file, trust)
+    kept = kept_arm(stated)
+    if twice := set(effects) & set(kept.effects):
+        raise InputError(f"--effects {twice.pop()}: the arm of {arm} brings it already; to fix: leave it out")
+    return None, kept, own or file
 
 
 def _here() -> Path:

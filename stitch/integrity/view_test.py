@@ -16,8 +16,9 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
 from stitch.statistics.least_squares import column_space
+from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.tails import f_tail
-from stitch.statistics.variance_components import MixedModel, VarianceFit, fit_variances
+from stitch.statistics.variance_components import VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
 _SEEN = 1e-6

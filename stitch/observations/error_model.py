@@ -9,8 +9,9 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.observations.pose_errors import PoseErrors
+from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
-from stitch.statistics.variance_components import MixedModel, VarianceFit, at_variances, fit_variances, whitener
+from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances, whitener
 from stitch.statistics.variance_prior import NOISE
 
 # A component that is as good as absent, as a share of the variance that it usually has.

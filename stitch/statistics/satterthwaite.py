@@ -11,7 +11,8 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.statistics.least_squares import column_space
-from stitch.statistics.variance_components import MixedModel, VarianceFit
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.variance_components import VarianceFit
 from stitch.statistics.variance_prior import prior_information
 
 # More is as good as knowing it.

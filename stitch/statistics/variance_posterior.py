@@ -8,7 +8,8 @@ variances, so what counts is their posterior mean (REML likelihood times prior),
 import numpy as np
 
 from stitch.frames import Array
-from stitch.statistics.variance_components import MixedModel, VarianceFit, deviance_slope
+from stitch.statistics.restricted_likelihood import MixedModel, deviance_slope
+from stitch.statistics.variance_components import VarianceFit
 
 # Draws that count and those before them; leapfrog steps of a draw and their length, in standard deviations.
 _DRAWS, _BURNT = 48, 8

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.satterthwaite import satterthwaite
-from stitch.statistics.variance_components import MixedModel, VarianceFit
+from stitch.statistics.variance_components import VarianceFit
 
 GROUPS = (30, 20, 500)
 

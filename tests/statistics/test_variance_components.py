@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from stitch.statistics.inverse import inverted
-from stitch.statistics.variance_components import MixedModel, at_variances, deviance_slope, fit_variances
+from stitch.statistics.restricted_likelihood import MixedModel, deviance_slope, problem_of
+from stitch.statistics.variance_components import at_variances, fit_variances
+from stitch.statistics.variance_scoring import scored
 
 
 def test_variances_are_found_again():
@@ -83,3 +85,27 @@ def test_one_block_is_inverted_as_many_are():
     assert np.allclose(inverse[0] @ V[0], np.eye(7), atol=1e-12)
     assert logdet + inverted(V[1:])[1] == pytest.approx(inverted(V)[1])
     assert inverted(-V[:1])[1] == np.inf
+
+
+def test_scoring_ends_where_a_search_ends():
+    """Sixty blocks go by scoring; the same as one search with scipy, from far away too."""
+    rng = np.random.default_rng(12)
+    m, blocks = 4, 60
+    half = rng.normal(size=(2, blocks, m, 3))
+    components = np.array([h @ h.transpose(0, 2, 1) for h in half] + [np.tile(1e-2 * np.eye(m), (blocks, 1, 1))])
+    true = np.array([0.5, 0.02, 1.5])
+    V = np.einsum("c,cbij->bij", true, components)
+    z = np.einsum("bij,bj->bi", np.linalg.cholesky(V), rng.normal(size=(blocks, m)))
+    mixed = MixedModel(z, np.ones((blocks, m, 1)), components)
+    for factor in (1.0, 30.0, 0.05):
+        begin = np.log(true * [factor, 1 / factor, 1.0])
+        found = scored(problem_of(mixed, None, None), begin, 1e-3)
+        looked = minimize(
+            lambda x: deviance_slope(x, mixed),
+            begin,
+            jac=True,
+            method="L-BFGS-B",
+            options={"gtol": 1e-6, "ftol": 1e-14},
+        )
+        assert found is not None
+        assert deviance_slope(found, mixed)[0] == pytest.approx(looked.fun, abs=2e-3)

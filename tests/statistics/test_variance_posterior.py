@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from stitch.statistics.variance_components import MixedModel, fit_variances
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
 N, SCALE = 40, 0.5

@@ -18,7 +18,8 @@ from stitch.observations.surfaces.free_poses import FreePoses, visible_direction
 from stitch.observations.surfaces.gram import Gram
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.parameter_selection import Whitened
-from stitch.statistics.variance_components import MixedModel, fit_variances
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.variance_components import fit_variances
 
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
 _TOLD = 1e-6

@@ -11,7 +11,7 @@ from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.pose_channel import Repeatability, covariance_of, mean_of
 from stitch.statistics.least_squares import Generalised, generalised
-from stitch.statistics.variance_components import MixedModel
+from stitch.statistics.restricted_likelihood import MixedModel
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from stitch.model.jacobian import target_shifts, twists
 from stitch.model.model import Model
 from stitch.model.term import Term
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.statistics.variance_components import MixedModel
+from stitch.statistics.restricted_likelihood import MixedModel
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,105 @@
+"""The restricted likelihood of variance components, with its slope.
+
+    z = A·α + G·θ + noise,   cov(noise) = V = Σ_i λ_i C_i,   θ ~ N(0, S)
+
+The α are free (integrated out with a flat prior: that is REML, Patterson & Thompson 1971, Harville 1977);
+the θ have a prior of the size that is plausible (their integral is the evidence for the columns G). V is
+block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.statistics.inverse import inverted
+from stitch.statistics.variance_prior import log_prior
+
+
+@dataclass(frozen=True)
+class MixedModel:
+    """B blocks of m numbers that were seen, the columns of their mean and the components of their covariance."""
+
+    z: Array  # (B, m)
+    A: Array  # (B, m, a) columns of the free mean
+    components: (
+        Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and what there is more
+    )
+    fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
+    independent: int | None = None  # numbers that could err independently, if that is not all of them
+    scales: Array | None = None  # (c − 3,) that σ of the further components usually has; None: there are none
+
+    @property
+    def size(self) -> int:
+        """Numbers in all."""
+        return int(self.z.size) if self.independent is None else self.independent
+
+    def covariance(self, variances: Array) -> Array:
+        """(B, m, m) for variances (c,)."""
+        V = np.einsum("c,cbij->bij", variances, self.components)
+        return np.asarray(V if self.fixed is None else V + self.fixed)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A mixed model with the further columns of its mean, and their prior."""
+
+    mixed: MixedModel
+    X: Array  # (B, m, a + g)
+    precision: Array  # (a + g,) of the prior
+    offset: float  # log det of the prior covariance
+
+
+def problem_of(mixed: MixedModel, G: Array | None, prior: Array | None) -> Problem:
+    """With further columns G (B, m, g) and the standard deviations (g,) of their coefficients, if these have any."""
+    a = mixed.A.shape[2]
+    if G is None:
+        return Problem(mixed, mixed.A, np.zeros(a), 0.0)
+    X = np.concatenate([mixed.A, G], axis=2)
+    if prior is None:
+        return Problem(mixed, X, np.zeros(X.shape[2]), 0.0)
+    precision = np.concatenate([np.zeros(a), 1 / prior**2])
+    return Problem(mixed, X, precision, float(2 * np.log(prior).sum()))
+
+
+def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:
+    """−2 log restricted likelihood and its slope in the log variances."""
+    with np.errstate(over="ignore"):
+        mixed, variances = problem.mixed, np.exp(log_variances)
+    inverse, logdet = inverted(mixed.covariance(variances))
+    if not np.isfinite(logdet):
+        return 1e300, np.zeros(len(variances))
+    WX = inverse @ problem.X
+    M = summed(problem.X, WX) + np.diag(problem.precision)
+    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+    values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
+    keep = values > 1e-12
+    half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
+    b = rows_of_blocks(WX).T @ mixed.z.ravel()
+    beta = half @ (half.T @ b)
+    rest = mixed.z - problem.X @ beta
+    Wr = np.matmul(inverse, rest[..., None])
+    WXh = WX @ half
+    # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
+    against = inverse - WXh @ WXh.transpose(0, 2, 1) - Wr @ Wr.transpose(0, 2, 1)
+    slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
+    # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
+    square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
+    logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
+    believed, pull = log_prior(log_variances, mixed.scales)
+    return logdet + square + believed, slope + pull
+
+
+def deviance_slope(log_variances: Array, mixed: MixedModel) -> tuple[float, Array]:
+    """−2 log of restricted likelihood and prior of the log variances (c,), up to a constant, and its slope (c,)."""
+    return deviance(log_variances, problem_of(mixed, None, None))
+
+
+def summed(X: Array, Y: Array) -> Array:
+    """Σ_b XᵀY, (a, c)."""
+    return np.asarray(rows_of_blocks(X).T @ rows_of_blocks(Y))
+
+
+def rows_of_blocks(X: Array) -> Array:
+    """(B·m, a) of (B, m, a); a model that is only judged has no columns."""
+    return X.reshape(X.shape[0] * X.shape[1], X.shape[2])

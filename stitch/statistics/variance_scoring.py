@@ -1,0 +1,46 @@
+"""Fisher scoring of variance components, where their maximum lies near."""
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.statistics.inverse import inverted
+from stitch.statistics.restricted_likelihood import Problem, deviance
+from stitch.statistics.variance_prior import log_prior, prior_information
+
+# Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
+# (rounding alone moves that of thousands of numbers by a tenth of it), and the blocks from which they pay.
+_SCORINGS, _LEAP, _HALVINGS, _SETTLED, _MANY_BLOCKS = 10, 2.0, 4, 1e-3, 50
+
+
+def scored(problem: Problem, begin: Array, flat: float) -> Array | None:
+    """(c,) log variances at the maximum by Fisher scoring, where it lies near; None where a search must look for it.
+
+    The expected curvature of the deviance is λ_iλ_j tr(V⁻¹C_iV⁻¹C_j), less what the mean takes. With thousands of
+    numbers in small blocks three steps do what a search without curvature needs sixteen for.
+    """
+    mixed = problem.mixed
+    if mixed.scales is not None or len(mixed.z) < _MANY_BLOCKS:
+        return None
+    x, (value, slope) = begin, deviance(begin, problem)
+    for _ in range(_SCORINGS):
+        if np.abs(slope).max() < flat:
+            return x
+        variances = np.exp(x)
+        inverse, _ = inverted(mixed.covariance(variances))
+        shares = variances[:, None, None, None] * (inverse @ mixed.components)
+        curvature = np.einsum("cbij,dbji->cd", shares, shares, optimize=True)
+        # In the log of a variance that is hardly seen the likelihood curves by its slope.
+        curvature += np.diag(2 * prior_information(variances, None) + np.maximum(slope - log_prior(x, None)[1], 0.0))
+        step = -np.linalg.solve(curvature, slope)
+        if -0.5 * float(slope @ step) < _SETTLED:
+            return x
+        step *= min(1.0, _LEAP / float(np.abs(step).max()))
+        for _ in range(_HALVINGS):
+            lower, its_slope = deviance(x + step, problem)
+            if lower <= value + _SETTLED:
+                break
+            step /= 2
+        else:
+            return None
+        x, value, slope = x + step, lower, its_slope
+    return None
