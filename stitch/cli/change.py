@@ -78,6 +78,8 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
         _show(result, as_json)
     elif as_json:
         emit((run / "result.json").read_text(encoding="utf-8").rstrip())
+    else:
+        console().print("Nothing was added: the model is as it was.", soft_wrap=True)
     write_diagnosis(found, state if result is None else state_of(result), run)
 
 
