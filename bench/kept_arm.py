@@ -1,6 +1,6 @@
 """The arm of one series of measured poses judged on another series, with base and probe of its own.
 
-Run: python bench/kept_arm.py [--every 4] [--write]; writes the table of docs/points.md. Needs the measured data
+Run: python bench/kept_arm.py [--every 20 5] [--write]; writes the table of docs/points.md. Needs the measured data
 beside the project (two series of one UR10, each with a laser tracker somewhere else).
 """
 
@@ -43,10 +43,10 @@ def row(name: str, found: Run) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--every", type=int, default=4, help="every n-th pose of both series")
+    parser.add_argument("--every", type=int, nargs=2, default=(20, 5), help="every n-th pose of either series")
     parser.add_argument("--write", action="store_true", help="put the table into docs/points.md")
     given = parser.parse_args()
-    series = {name: every(load_session(SHARED / name), given.every) for name in SERIES}
+    series = {name: every(load_session(SHARED / name), n) for name, n in zip(SERIES, given.every, strict=True)}
     lines, found = [], {}
     for name, session in series.items():
         began = time.monotonic()
