@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
-from unknown_cells import Asked, World, _true_poses, asked, seen
+from unknown_cells import Asked, World, asked, seen, true_poses
 from unknown_worlds import PARTS, UNNAMED
 
 from stitch import frames
@@ -38,7 +38,7 @@ def true_column(a: Asked, world: World) -> Array:
     assert isinstance(a.linear.observation, Surfaces)
     still = np.random.default_rng(0)
     bare = replace(world, joint_errors=0.0, flange_errors=0.0, scatter=np.zeros((len(a.moments), 6)))
-    with_it, without = (_true_poses(a, w, still) for w in (replace(world, scatter=bare.scatter), bare))
+    with_it, without = (true_poses(a, w, still) for w in (replace(world, scatter=bare.scatter), bare))
     to_centre = frames.make(np.eye(3), -a.linear.observation.freed.overlaps.gram.centre)
     return np.asarray(frames.log(to_centre @ with_it @ frames.inverse(to_centre @ without)).ravel())
 

@@ -65,7 +65,7 @@ def seen(asked: Asked, world: World, rng: np.random.Generator) -> LinearModel:
     g = freed.overlaps.gram
     to_centre = frames.make(np.eye(3), -g.centre)
     model = cell.measurement.capture.poses(cell.T_mount)
-    twists = frames.log(to_centre @ _true_poses(asked, world, rng) @ frames.inverse(to_centre @ model))
+    twists = frames.log(to_centre @ true_poses(asked, world, rng) @ frames.inverse(to_centre @ model))
     values, vectors, scale = visible_directions(g)
     noise = np.sqrt(cell.noise_factor * g.variance / values) * rng.standard_normal(len(values))
     twists = twists - twists.mean(axis=0) + _of_points(asked, world) + (scale * (vectors @ noise)).reshape(-1, 6)
@@ -89,7 +89,7 @@ def _with_twists(linear: LinearModel, twists: Array) -> LinearModel:
     return replace(linear, observation=observation, mixed=mixed, null=fit_variances(mixed, both_starts=True))
 
 
-def _true_poses(asked: Asked, world: World, rng: np.random.Generator) -> Array:
+def true_poses(asked: Asked, world: World, rng: np.random.Generator) -> Array:
     """(V, 4, 4) of the scanner where the part is held to stand still, reference frame."""
     cell, scene, laws = asked.cell, asked.scene, world.laws
     views = len(asked.moments)

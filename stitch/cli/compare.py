@@ -1,14 +1,12 @@
 """`stitch compare RUN`: where model and measurement differ."""
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table as Printed
 
-from stitch.cli.options import EffectsFile, Json, Trust
+from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.streams import emit
 from stitch.comparison.compare_surfaces import compare
 from stitch.comparison.compare_targets import compare_targets
@@ -25,7 +23,7 @@ _SHOWN = 4
 
 
 def compare_run(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,

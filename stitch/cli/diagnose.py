@@ -1,13 +1,11 @@
 """`stitch diagnose RUN`: which effect is missing; `stitch next RUN`: what to measure."""
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.options import EffectsFile, Json, Trust
+from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.streams import emit
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of
@@ -24,7 +22,7 @@ _SHOWN = 6
 
 
 def diagnose_run(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,
@@ -44,7 +42,7 @@ def diagnose_run(
 
 
 def next_measurement(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import EffectsFile, Json, Trust
+from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.streams import emit
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError, NoResultError
@@ -18,7 +18,7 @@ from stitch.writing.json_file import to_json
 
 
 def explain_run(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="FILE", help="Python file for the formula, to edit and add."),

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.export_program import export_program
-from stitch.cli.options import EffectsFile, Json, Trust
+from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.streams import results
 from stitch.errors import InputError
 from stitch.export.arm_formats import ARM_FORMATS
@@ -23,7 +23,7 @@ _KINDS = f"hand-eye: {', '.join(FORMATS)}; arm: {', '.join(ARM_FORMATS)}; cloud:
 
 
 def export_run(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     to: Annotated[str | None, typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.")] = None,
     program: Annotated[
         Path | None,

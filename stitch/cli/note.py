@@ -1,12 +1,11 @@
 """`stitch note RUN TEXT`: what a reviewer remarks on a step of the model's history, kept in its ledger."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stitch.cli.options import Json
+from stitch.cli.options import Json, RunFolder
 from stitch.cli.streams import emit
 from stitch.errors import InputError
 from stitch.stored.run_documents import read_ledger
@@ -18,7 +17,7 @@ _LONGEST = 2000
 
 
 def note(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     text: Annotated[str, typer.Argument(metavar="TEXT", help="What to remark.")],
     step: Annotated[int | None, typer.Option("--step", help="Step of the ledger; default the last.")] = None,
     by: Annotated[str, typer.Option("--by", metavar="NAME", help="Who says so.")] = "",

@@ -16,6 +16,7 @@ Tolerance = Annotated[
     float | None,
     typer.Option("--tolerance", help="On the page: within which the views have to agree on the part, length_unit."),
 ]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone on standard output.")]
 
 

@@ -7,7 +7,7 @@ import typer
 
 from stitch.cli.compare import write_comparison
 from stitch.cli.diagnose import write_diagnosis
-from stitch.cli.options import EffectsFile, Tolerance, Trust, require_tolerance
+from stitch.cli.options import EffectsFile, RunFolder, Tolerance, Trust, require_tolerance
 from stitch.cli.printing import print_page, printing_browser
 from stitch.comparison.two_runs import TwoRuns, sentence, two_runs
 from stitch.errors import InputError
@@ -19,7 +19,7 @@ from stitch.writing import run_folder
 
 
 def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")],
+    run: RunFolder,
     other: Annotated[
         Path | None, typer.Argument(metavar="[RUN2]", help="Another: write what changed from RUN to RUN2.")
     ] = None,

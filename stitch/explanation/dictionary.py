@@ -10,6 +10,7 @@ from stitch.effects.contract import Effect
 from stitch.effects.specs import per_joint, twist
 from stitch.explanation.quantities import Quantity
 from stitch.frames import Array
+from stitch.measurement.views import Views
 from stitch.model.term import Term, term_of
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
@@ -87,14 +88,14 @@ def _everywhere(linear: LinearModel, place: str) -> Term:
     return term_of(linear.measurement, effect)
 
 
-def _joints(joints: Array, views: object, d: Array) -> Array:
+def _joints(joints: Array, views: Views, d: Array) -> Array:
     """q* = q + d"""
     return joints + d
 
 
-def _twists(views: object, xi: Array) -> Array:
+def _twists(views: Views, xi: Array) -> Array:
     """The same twist in every view."""
-    return np.tile(xi, (views.count, 1))  # type: ignore[attr-defined]
+    return np.tile(xi, (views.count, 1))
 
 
 def _rows_per_view(linear: LinearModel) -> int:

@@ -46,14 +46,12 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
         chosen = search(linear, responses, slow) if ingredients else None
         if chosen is None:
             return Explanation(False, "Nothing that the cell knows of its views explains what is left.")
-        place = _place(chosen, [i.place for i in ingredients])
-        numbers = [k for k in chosen.numbers if ingredients[k].place == place]
-        if not chosen.holds or len(numbers) < len(chosen.numbers):
-            return Explanation(False, _not_held(chosen, formula_of(linear, ingredients, responses, chosen.numbers)))
-        own = [ingredients[k] for k in numbers]
-        scaled = fitted(linear, responses, numbers)
-        values = [coefficient(i, float(s)) for i, s in zip(own, scaled, strict=True)]
-        text = formula_text(own, values)
+        own = [ingredients[k] for k in chosen.numbers]
+        scaled = fitted(linear, responses, chosen.numbers)
+        values = [coefficient(i, float(x)) for i, x in zip(own, scaled, strict=True)]
+        text, places = formula_text(own, values), {i.place for i in own}
+        if not chosen.holds or len(places) > 1:
+            return Explanation(False, _not_held(chosen, text))
         source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
         share, helps = _on_views_left_out(linear, source)
         if not helps:
@@ -61,19 +59,7 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
                 False, f"{text} explains much, but not in views that are left out with their neighbours."
             )
         why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
-        return Explanation(True, why, text, place, share, chosen.p_value, source)
-
-
-def formula_of(linear: LinearModel, ingredients: list, responses: np.ndarray, numbers: tuple[int, ...]) -> str:  # type: ignore[type-arg]
-    """The text of some ingredients with their sizes from all views."""
-    own = [ingredients[k] for k in numbers]
-    scaled = fitted(linear, responses, numbers)
-    return formula_text(own, [coefficient(i, float(s)) for i, s in zip(own, scaled, strict=True)])
-
-
-def _place(chosen: Chosen, places: list[str]) -> str:
-    own = [places[k] for k in chosen.numbers]
-    return max(set(own), key=own.count)
+        return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
 
 
 def _not_held(chosen: Chosen, text: str) -> str:
