@@ -39,6 +39,10 @@ def explain_run(
     if output is not None and output.exists():
         raise InputError(f"{output}: there is such a file; to fix: name another, or move it away")
     state = load_state(run, effects_file, thin=True, trust=trust)
+    if NAME in state.model.effects:
+        raise InputError(
+            f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"
+        )
     found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
     heldout = state.residual_rms * found.heldout_share**0.5 if found.found else None
     if output is not None and found.found:

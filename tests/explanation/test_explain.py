@@ -84,6 +84,10 @@ def test_the_file_that_is_written_can_be_added(tmp_path, stitch_command, monkeyp
     assert after["heldout_rms"] < 0.8 * before
     assert after["heldout_rms"] == pytest.approx(told["heldout_rms"], rel=0.15)
     assert after["effects"]["explained"]["a"]["value"] == pytest.approx(SIZE, rel=0.1)
+    # A second one by that name would take the first one's place unseen.
+    with pytest.raises(SystemExit) as stop:
+        main(["explain", "r", "--effects-file", "mine.py"])
+    assert stop.value.code == 2
 
 
 @pytest.mark.parametrize(("output", "told"), [("mine.txt", "mine.py"), ("there.py", "there is such a file")])
