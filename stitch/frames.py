@@ -89,6 +89,24 @@ def adjoint(T: Array) -> Array:
     return out
 
 
+def left_jacobian(xi: Array) -> Array:
+    """(..., 6, 6) with `exp(ξ + δ) ≈ exp(J δ) · exp(ξ)` for small twists δ, by its series Σ ad(ξ)ⁿ/(n+1)!
+
+    (Barfoot 7.75). Angles up to 1 rad leave less than 1e-12.
+    """
+    xi = np.asarray(xi, float)
+    ad = np.zeros((*xi.shape, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = skew(xi[..., :3])
+    ad[..., 3:, :3] = skew(xi[..., 3:])
+    term = out = np.broadcast_to(np.eye(6), ad.shape)
+    if not xi.any():
+        return np.array(out)
+    for n in range(2, 16):
+        term = term @ ad / n
+        out = out + term
+    return np.asarray(out)
+
+
 def transform(T: Array, points: Array) -> Array:
     """Map points (..., N, 3) by T (..., 4, 4)."""
     T = np.asarray(T, float)

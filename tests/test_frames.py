@@ -41,6 +41,13 @@ def test_adjoint_carries_twists(xi, eta):
     assert np.allclose(T @ frames.exp(eta) @ frames.inverse(T), frames.exp(frames.adjoint(T) @ eta), atol=1e-9)
 
 
+@given(twists, twists)
+def test_left_jacobian_is_a_finite_difference(xi, eta):
+    step = 1e-6 * eta / 1e2
+    moved = frames.log(frames.exp(xi + step) @ frames.inverse(frames.exp(xi - step))) / 2
+    assert np.allclose(frames.left_jacobian(xi) @ step, moved, atol=1e-13)
+
+
 @given(twists)
 def test_inverse_and_quaternion(xi):
     T = frames.exp(xi)

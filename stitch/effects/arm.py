@@ -1,23 +1,14 @@
 """Effects of the arm: the true joint angles q* and the true links."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from stitch.effects.contract import effect
 from stitch.effects.specs import number, per_joint, per_torque
 from stitch.frames import Array
+from stitch.measurement.imperfect_arm import Links
 from stitch.measurement.views import Views
-
-
-@dataclass(frozen=True)
-class Links:
-    """What is wrong with an arm's links: a factor on all lengths per view, and errors of the DH rows."""
-
-    scale: Array  # (V,)
-    da: Array  # (n,) length_unit
-    dd: Array  # (n,) length_unit
-    dalpha: Array  # (n,) rad
 
 
 @effect("robot", needs=("velocity",), dt=number("s", typical=2e-3, limit=0.5))

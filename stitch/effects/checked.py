@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from stitch.effects.arm import Links
 from stitch.effects.contract import Effect
 from stitch.effects.specs import Spec
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.measurement.imperfect_arm import Links
 
 _KINDS = ("number", "offset", "joint", "torque", "twist")
 

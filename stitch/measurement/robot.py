@@ -82,27 +82,6 @@ def forward(robot: Robot, joints: Array) -> Array:
     return np.asarray(link_frames(robot, joints)[..., -1, :, :])
 
 
-def forward_with_errors(robot: Robot, joints: Array, scale: Array, da: Array, dd: Array, dalpha: Array) -> Array:
-    """T_base_flange (V, 4, 4) of an arm whose lengths are `scale` (V,) times too long and whose rows are off.
-
-    da, dd (n,) in length_unit and dalpha (n,) in rad are errors of the DH rows; for URDF they act behind
-    the joint in the frame that its axis makes: along x, along z, about x.
-    """
-    modified = robot.convention == "modified"
-    x_error, z_error = elementary("x", dalpha, da), elementary("z", 0, dd)
-    T = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
-    for i in range(robot.n_joints):
-        before, after = (np.tile(m[i], (len(joints), 1, 1)) for m in (robot.before, robot.after))
-        if modified:
-            before, after = before @ x_error[i], after @ z_error[i]
-        else:
-            after = z_error[i] @ after @ x_error[i]
-        before[:, :3, 3] *= scale[:, None]
-        after[:, :3, 3] *= scale[:, None]
-        T = T @ before @ elementary("z", joints[:, i] + robot.theta[i]) @ after
-    return np.asarray(T)
-
-
 def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
     """A point on each joint axis and its direction, both (..., n, 3), in the base frame."""
     axis_frame = link_frames(robot, joints)[..., :-1, :, :] @ robot.before

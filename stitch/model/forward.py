@@ -1,49 +1,67 @@
 """What a model does to poses and points, and both without it: as they truly were."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch import frames
-from stitch.effects.arm import Links
 from stitch.frames import Array, Indices
-from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Capture
+from stitch.measurement.imperfect_arm import Links, forward_with_errors, right_links
 from stitch.measurement.measurement import Measurement
+from stitch.measurement.robot import forward
 from stitch.measurement.scan import Scan
 from stitch.measurement.views import ScanView
 from stitch.model.model import Model
 from stitch.model.term import Term
 
 
+@dataclass(frozen=True)
+class ChainErrors:
+    """What effects of robot, mount and part do to the chain of frames of V views."""
+
+    joints: Array  # (V, n) rad, as they truly were
+    links: Links  # as they truly are
+    mount: Array  # (V, 6) twist right of the hand-eye
+    part: Array  # (V, 6) twist of the part in the reference frame
+
+
+def chain_errors(measurement: Measurement, terms: Sequence[Term]) -> ChainErrors:
+    """Collect what some effects do to the chain of frames."""
+    views = measurement.views
+    joints, links = views.joints, right_links(*views.joints.shape)
+    mount, part = np.zeros((2, views.count, 6))
+    for term in terms:
+        function, arguments = term.effect.function, term.arguments
+        # The function adds to what it is given; what it reads of the pose are the reported angles.
+        if term.effect.place == "robot":
+            joints = function(joints, views, **arguments)
+        elif term.effect.place == "links":
+            links = function(links, views, **arguments)
+        elif term.effect.place == "mount":
+            mount = mount + function(views, **arguments)
+        elif term.effect.place == "part":
+            part = part + function(views, **arguments)
+    return ChainErrors(joints, links, mount, part)
+
+
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
     """(V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
-    views = measurement.views
-    joints = views.joints
-    count, n = joints.shape
-    links = Links(np.ones(count), *np.zeros((3, n)))
-    mount, part = np.zeros((2, count, 6))
-    moved = False
-    for term in terms:
-        arguments = term.arguments
-        if term.effect.place == "robot":
-            # The function adds to what it is given; what it reads of the pose are the reported angles.
-            joints, moved = term.effect.function(joints, views, **arguments), True
-        elif term.effect.place == "links":
-            links, moved = term.effect.function(links, views, **arguments), True
-        elif term.effect.place == "mount":
-            mount = mount + term.effect.function(views, **arguments)
-        elif term.effect.place == "part":
-            part = part + term.effect.function(views, **arguments)
+    errors = chain_errors(measurement, terms)
     T_base_flange = measurement.T_base_flange
-    if moved and measurement.robot is not None:
-        true = kinematics.forward_with_errors(measurement.robot, joints, links.scale, links.da, links.dd, links.dalpha)
+    if measurement.robot is not None and any(moves_arm(term) for term in terms):
+        true = forward_with_errors(measurement.robot, errors.joints, errors.links)
         # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
-        T_base_flange = T_base_flange @ frames.inverse(kinematics.forward(measurement.robot, views.joints)) @ true
+        T_base_flange = T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints)) @ true
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
-    return np.asarray(frames.exp(-part) @ left), np.asarray(frames.exp(mount))
+    return np.asarray(frames.exp(-errors.part) @ left), np.asarray(frames.exp(errors.mount))
+
+
+def moves_arm(term: Term) -> bool:
+    """True for an effect of joints or links."""
+    return term.effect.place in ("robot", "links")
 
 
 def shift(measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice) -> Array:

@@ -1,13 +1,16 @@
 """How poses and points answer to the parameters of a term, by central differences about a model."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
+from stitch.measurement.imperfect_arm import FlangeSlopes, Links, flange_slopes
 from stitch.measurement.measurement import Measurement
-from stitch.model.forward import perturbed_frames, shift, shift_targets
+from stitch.model.forward import ChainErrors, chain_errors, moves_arm, perturbed_frames, shift, shift_targets
 from stitch.model.model import Model
 from stitch.model.term import Term
 
@@ -16,24 +19,91 @@ from stitch.model.term import Term
 _STEP, _STEP_GRIDDED = 0.1, 0.005
 
 
-def twists(measurement: Measurement, model: Model, term: Term, centre: Array) -> Array:
-    """(P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter of `term`.
+def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> list[Array]:
+    """Per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
 
-    Central differences about the model with `term` in place of its own, or added at its values.
+    About the model with the term in place of its own, or added at its values. Differences are taken of what an effect
+    does to joints, links, mount and part alone; from there the chain of frames carries them.
     """
-    to_centre = frames.make(np.eye(3), -centre)
-    out = []
-    for i, parameter in enumerate(term.parameters):
-        if parameter.discrete:
-            out.append(np.zeros((measurement.views.count, 6)))
-            continue
-        size = (_STEP_GRIDDED if parameter.grid else _STEP) * parameter.typical
-        both = []
-        for stepped in _stepped(term, i, size):
-            left, right = perturbed_frames(measurement, model.with_term(stepped).terms)
-            both.append(to_centre @ left @ model.T_mount @ right)
-        out.append(frames.log(both[0] @ frames.inverse(both[1])) / (2 * size))
-    return np.array(out).reshape(len(term.parameters), measurement.views.count, 6)
+    out, chain = [], None
+    for term in terms:
+        about = model.with_term(term)
+        errors = chain_errors(measurement, about.terms)
+        if chain is None or not chain.is_about(errors):
+            chain = _Chain(measurement, about, errors, centre)
+        moved = [_slope(measurement, about, term, i, chain) for i in range(len(term.parameters))]
+        out.append(np.array(moved).reshape(len(moved), measurement.views.count, 6))
+    return out
+
+
+def _slope(measurement: Measurement, about: Model, term: Term, i: int, chain: "_Chain") -> Array:
+    """(V, 6) of one parameter."""
+    parameter = term.parameters[i]
+    if parameter.discrete:
+        return np.zeros((measurement.views.count, 6))
+    size = (_STEP_GRIDDED if parameter.grid else _STEP) * parameter.typical
+    up, down = (chain_errors(measurement, about.with_term(t).terms) for t in _stepped(term, i, size))
+    return chain.twists(up, down, moves_arm(term)) / (2 * size)
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """How the views answer to small errors of the chain of frames, about those of a model."""
+
+    measurement: Measurement
+    about: Model
+    errors: ChainErrors
+    centre: Array  # (3,)
+
+    def is_about(self, errors: ChainErrors) -> bool:
+        own, other = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
+        return all(np.array_equal(a, b) for a, b in zip(own, other, strict=True))
+
+    def twists(self, up: ChainErrors, down: ChainErrors, of_arm: bool) -> Array:
+        """(V, 6) left twists of the views between two errors near these."""
+        if of_arm and self.measurement.robot is not None:
+            links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
+            return _applied(self.of_flange, self.flange.twists(up.joints - down.joints, Links(**links)))
+        return _applied(self.of_mount, up.mount - down.mount) + _applied(self.of_part, up.part - down.part)
+
+    @cached_property
+    def flange(self) -> FlangeSlopes:
+        """Body twists of the flange."""
+        assert self.measurement.robot is not None
+        return flange_slopes(self.measurement.robot, self.errors.joints, self.errors.links)
+
+    @cached_property
+    def of_flange(self) -> Array:
+        """(V, 6, 6) for body twists of the flange."""
+        if self.measurement.eye_to_hand:
+            # (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹: the flange's own side stands left.
+            return -frames.adjoint(self._to_centre @ frames.exp(-self.errors.part))
+        return frames.adjoint(self._to_centre @ self._left)
+
+    @cached_property
+    def of_mount(self) -> Array:
+        """(V, 6, 6) for changes of the twist of the mount: exp(m + δ) = exp(J δ)·exp(m)."""
+        carried = frames.adjoint(self._to_centre @ self._left @ self.about.T_mount)
+        return np.asarray(carried @ frames.left_jacobian(self.errors.mount))
+
+    @cached_property
+    def of_part(self) -> Array:
+        """(V, 6, 6) for changes of the twist of the part."""
+        return -np.asarray(frames.adjoint(self._to_centre) @ frames.left_jacobian(-self.errors.part))
+
+    @cached_property
+    def _left(self) -> Array:
+        """(V, 4, 4) what stands left of the hand-eye."""
+        return perturbed_frames(self.measurement, self.about.terms)[0]
+
+    @property
+    def _to_centre(self) -> Array:
+        return frames.make(np.eye(3), -self.centre)
+
+
+def _applied(matrix: Array, vectors: Array) -> Array:
+    """(V, 6) of (V, 6, 6) and (V, 6)."""
+    return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
 def shifts(measurement: Measurement, model: Model, term: Term, *, v: int, pose: Array, index: Indices | slice) -> Array:

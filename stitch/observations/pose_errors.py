@@ -142,12 +142,9 @@ def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
 def _columns(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
     """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
     in_use: dict[str, Term] = {term.name: term for term in model.terms}
-    out = []
-    for effect in effects:
-        term = in_use.get(effect.name) or term_of(measurement, effect)
-        moved = twists(measurement, model, term, centre)
-        out.append(moved.reshape(len(moved), -1).T * term.typical)
-    return np.hstack(out)
+    terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
+    found = zip(terms, twists(measurement, model, terms, centre), strict=True)
+    return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
 
 
 def _same_stop(T_base_flange: Array) -> Mask:

@@ -11,8 +11,9 @@ from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import known_sigmas, split, stacked
+from stitch.observations.targets.effect_rows import effect_columns
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows, effect_columns, mixed_model_of_rows, rows_of
+from stitch.observations.targets.rows import Rows, mixed_model_of_rows, rows_of
 from stitch.observations.targets.target_fit import TargetFit, rms_of
 from stitch.runs.recorder import Recorder
 from stitch.stages.fit import WEAK, fitted_parameters, iterate

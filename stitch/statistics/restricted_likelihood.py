@@ -62,42 +62,57 @@ def problem_of(mixed: MixedModel, G: Array | None, prior: Array | None) -> Probl
     return Problem(mixed, X, precision, float(2 * np.log(prior).sum()))
 
 
-def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:
-    """−2 log restricted likelihood and its slope in the log variances."""
+@dataclass(frozen=True)
+class Likelihood:
+    """The restricted likelihood at some variances, and what is best believed of the mean there."""
+
+    deviance: float  # −2 log of it, and of the prior of the log variances
+    slope: Array  # (c,) in the log variances
+    mean: Array  # (a + g,) coefficients
+    covariance: Array  # (a + g, a + g)
+    inverse: Array  # (B, m, m) of the numbers' covariance
+
+
+def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
+    """Evaluate it; infinitely unlikely, flat, where the covariance has no inverse."""
     with np.errstate(over="ignore"):
         mixed, variances = problem.mixed, np.exp(log_variances)
     inverse, logdet = inverted(mixed.covariance(variances))
+    X, z = rows_of_blocks(problem.X), mixed.z.ravel()
+    k = X.shape[1]
     if not np.isfinite(logdet):
-        return 1e300, np.zeros(len(variances))
-    WX = inverse @ problem.X
-    M = summed(problem.X, WX) + np.diag(problem.precision)
+        return Likelihood(1e300, np.zeros(len(variances)), np.zeros(k), np.zeros((k, k)), inverse)
+    WX = rows_of_blocks(inverse @ problem.X)
+    M = X.T @ WX + np.diag(problem.precision)
+    # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    b = rows_of_blocks(WX).T @ mixed.z.ravel()
-    beta = half @ (half.T @ b)
-    rest = mixed.z - problem.X @ beta
+    mean = half @ (half.T @ (WX.T @ z))
+    rest = (z - X @ mean).reshape(mixed.z.shape)
     Wr = np.matmul(inverse, rest[..., None])
-    WXh = WX @ half
+    WXh = (WX @ half).reshape(*mixed.z.shape, -1)
     # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
-    against = inverse - WXh @ WXh.transpose(0, 2, 1) - Wr @ Wr.transpose(0, 2, 1)
+    taken = np.concatenate([WXh, Wr], axis=2)
+    against = inverse - taken @ taken.transpose(0, 2, 1)
     slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
-    square = float(rest.ravel() @ Wr.ravel()) + float(beta @ (problem.precision * beta))
+    square = float(rest.ravel() @ Wr.ravel()) + float(mean @ (problem.precision * mean))
     logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
     believed, pull = log_prior(log_variances, mixed.scales)
-    return logdet + square + believed, slope + pull
+    return Likelihood(logdet + square + believed, slope + pull, mean, half @ half.T, inverse)
+
+
+def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:
+    """−2 log restricted likelihood and its slope in the log variances."""
+    here = likelihood(log_variances, problem)
+    return here.deviance, here.slope
 
 
 def deviance_slope(log_variances: Array, mixed: MixedModel) -> tuple[float, Array]:
     """−2 log of restricted likelihood and prior of the log variances (c,), up to a constant, and its slope (c,)."""
     return deviance(log_variances, problem_of(mixed, None, None))
-
-
-def summed(X: Array, Y: Array) -> Array:
-    """Σ_b XᵀY, (a, c)."""
-    return np.asarray(rows_of_blocks(X).T @ rows_of_blocks(Y))
 
 
 def rows_of_blocks(X: Array) -> Array:

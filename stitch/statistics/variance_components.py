@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from stitch.frames import Array
-from stitch.statistics.restricted_likelihood import MixedModel, deviance, problem_of, summed
+from stitch.statistics.restricted_likelihood import MixedModel, Problem, deviance, likelihood, problem_of
 from stitch.statistics.variance_prior import NOISE, usual_variances
 from stitch.statistics.variance_scoring import scored
 
@@ -65,28 +65,23 @@ def fit_variances(
     bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
     begin = [np.clip(s, *np.array(bounds).T) for s in begin]
-    near = scored(problem, begin[0], flat) if len(begin) == 1 and present.all() else None
-    if near is not None:
-        return at_variances(mixed, np.exp(near), G, prior)
+    near = [scored(problem, s, flat) if present.all() else None for s in begin]
     search = partial(minimize, deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    best = min((search(s) for s in begin), key=lambda f: float(f.fun))
-    return at_variances(mixed, np.where(present, np.exp(best.x), 0.0), G, prior)
+    ends = [search(s).x if found is None else found for s, found in zip(begin, near, strict=True)]
+    fits = [_fit(problem, np.where(present, np.exp(x), 0.0)) for x in ends]
+    return min(fits, key=lambda fit: fit.deviance)
 
 
 def at_variances(
     mixed: MixedModel, variances: Array, G: Array | None = None, prior: Array | None = None
 ) -> VarianceFit:
     """The same without searching: mean, covariance and deviance for given variances (c,)."""
-    problem = problem_of(mixed, G, prior)
-    value, _ = deviance(np.log(np.maximum(variances, _ABSENT)), problem)
-    V, X = mixed.covariance(variances), problem.X
-    weighted = np.linalg.solve(V, np.concatenate([X, mixed.z[..., None]], axis=2))
-    M = summed(X, weighted[..., :-1]) + np.diag(problem.precision)
-    # Equilibrate: columns count in rad, mm and per hour.
-    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    covariance = np.linalg.pinv(M * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
-    mean = covariance @ summed(X, weighted[..., -1:])[:, 0]
-    return VarianceFit(np.asarray(variances), value, mean, covariance)
+    return _fit(problem_of(mixed, G, prior), np.asarray(variances))
+
+
+def _fit(problem: Problem, variances: Array) -> VarianceFit:
+    here = likelihood(np.log(np.maximum(variances, _ABSENT)), problem)
+    return VarianceFit(variances, here.deviance, here.mean, here.covariance)
 
 
 def whitener(mixed: MixedModel, variances: Array) -> Array:

@@ -3,8 +3,7 @@
 import numpy as np
 
 from stitch.frames import Array
-from stitch.statistics.inverse import inverted
-from stitch.statistics.restricted_likelihood import Problem, deviance
+from stitch.statistics.restricted_likelihood import Problem, likelihood
 from stitch.statistics.variance_prior import log_prior, prior_information
 
 # Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
@@ -21,26 +20,25 @@ def scored(problem: Problem, begin: Array, flat: float) -> Array | None:
     mixed = problem.mixed
     if mixed.scales is not None or len(mixed.z) < _MANY_BLOCKS:
         return None
-    x, (value, slope) = begin, deviance(begin, problem)
+    x, here = begin, likelihood(begin, problem)
     for _ in range(_SCORINGS):
-        if np.abs(slope).max() < flat:
+        if np.abs(here.slope).max() < flat:
             return x
         variances = np.exp(x)
-        inverse, _ = inverted(mixed.covariance(variances))
-        shares = variances[:, None, None, None] * (inverse @ mixed.components)
+        shares = variances[:, None, None, None] * (here.inverse @ mixed.components)
         curvature = np.einsum("cbij,dbji->cd", shares, shares, optimize=True)
         # In the log of a variance that is hardly seen the likelihood curves by its slope.
-        curvature += np.diag(2 * prior_information(variances, None) + np.maximum(slope - log_prior(x, None)[1], 0.0))
-        step = -np.linalg.solve(curvature, slope)
-        if -0.5 * float(slope @ step) < _SETTLED:
+        curvature += np.diag(2 * prior_information(variances, None) + np.maximum(here.slope - log_prior(x, None)[1], 0))
+        step = -np.linalg.solve(curvature, here.slope)
+        if -0.5 * float(here.slope @ step) < _SETTLED:
             return x
         step *= min(1.0, _LEAP / float(np.abs(step).max()))
         for _ in range(_HALVINGS):
-            lower, its_slope = deviance(x + step, problem)
-            if lower <= value + _SETTLED:
+            there = likelihood(x + step, problem)
+            if there.deviance <= here.deviance + _SETTLED:
                 break
             step /= 2
         else:
             return None
-        x, value, slope = x + step, lower, its_slope
+        x, here = x + step, there
     return None

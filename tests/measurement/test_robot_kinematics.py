@@ -6,7 +6,6 @@ import pytest
 from stitch import frames
 from stitch.measurement.robot import (
     forward,
-    forward_with_errors,
     gravity_torques,
     jacobian,
     joint_axes,
@@ -106,20 +105,3 @@ def test_urdf_of_a_dh_robot_gives_the_same_flange(convention, tmp_path):
     q = np.random.default_rng(4).uniform(-3, 3, (50, 6))
     # 1e-9 m, written as mm.
     assert np.abs(forward(arm, q) - forward(again, q)).max() < 1e-6
-
-
-@pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_wrong_rows_are_another_arm(convention):
-    """Errors of DH rows give the same pose as an arm built with those rows."""
-    from stitch.reading.dh_rows import robot_from_dh
-
-    rng = np.random.default_rng(0)
-    rows = [{"a": float(rng.uniform(0, 400)), "alpha_deg": float(rng.uniform(-90, 90)), "d": float(rng.uniform(0, 300)),
-                 "theta_deg": 10.0} for _ in range(6)]  # fmt: skip
-    da, dd, dalpha = rng.normal(0, 0.3, 6), rng.normal(0, 0.3, 6), rng.normal(0, 1e-3, 6)
-    other = [dict(r, a=1.001 * (r["a"] + da[i]), d=1.001 * (r["d"] + dd[i]), alpha_deg=r["alpha_deg"] + np.degrees(dalpha[i]))
-             for i, r in enumerate(rows)]  # fmt: skip
-    gravity = np.array([0, 0, -9.81])
-    arm, wrong = (robot_from_dh("x", convention, r, None, gravity, "mm") for r in (rows, other))
-    q = rng.uniform(-2, 2, (7, 6))
-    assert np.allclose(forward_with_errors(arm, q, np.full(7, 1.001), da, dd, dalpha), forward(wrong, q), atol=1e-9)

@@ -34,7 +34,7 @@ def test_twists_are_the_derivative_of_the_poses(still_cells, name):
     values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
     T = still_cells["eye_to_hand"].T_mount
     centre = np.array([5.0, -3.0, 80.0])
-    slopes = twists(measurement, Model(T), term_of(measurement, effect).at(values), centre)
+    (slopes,) = twists(measurement, Model(T), [term_of(measurement, effect).at(values)], centre)
     point = np.array([10.0, 20.0, 120.0])
     for i, parameter in enumerate(parameters):
         if parameter.discrete:

@@ -16,8 +16,9 @@ from stitch.model.jacobian import target_shifts
 from stitch.model.model import Model
 from stitch.model.term import term_of
 from stitch.observations.targets.closed_form import closed_form
+from stitch.observations.targets.effect_rows import effect_rows
 from stitch.observations.targets.landmarks import initial_landmarks
-from stitch.observations.targets.rows import effect_rows, rows_of
+from stitch.observations.targets.rows import rows_of
 
 
 def off(T, true):
@@ -52,7 +53,7 @@ def test_rows_are_the_slopes_of_what_is_left():
         zero, plain = term_of(measurement, effect), Model(T_mount)
         landmarks = initial_landmarks(measurement.capture, T_mount)
         rows = rows_of(measurement.capture, T_mount, landmarks)
-        slopes = effect_rows(rows, measurement, plain, zero)
+        (slopes,) = effect_rows(rows, measurement, plain, [zero])
         for i, parameter in enumerate(zero.parameters):
             step = 0.01 * parameter.typical
             stepped = [zero.at(s * step * np.eye(len(zero.values))[i]) for s in (1, -1)]
@@ -71,7 +72,7 @@ def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
     measurement = measurement_of(session, capture(session))
     term = term_of(measurement, EFFECTS["joint_offset"])
     rows = rows_of(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
-    column = effect_rows(rows, measurement, Model(T_mount), term)[..., 5].ravel()
+    column = effect_rows(rows, measurement, Model(T_mount), [term])[0][..., 5].ravel()
     landmarks = rows.landmarks.reshape(rows.residual.size, -1)
     left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
     assert np.abs(left).max() < 1e-6 * np.abs(column).max()

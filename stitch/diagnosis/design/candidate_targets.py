@@ -12,8 +12,9 @@ from stitch.measurement.measurement import Measurement, downwards
 from stitch.measurement.sightings import Sightings
 from stitch.model.model import Model
 from stitch.model.term import Term
+from stitch.observations.targets.effect_rows import effect_rows
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows, effect_rows, mixed_model_of_rows, rows_of
+from stitch.observations.targets.rows import Rows, mixed_model_of_rows, rows_of
 
 
 def candidate_rows(
@@ -36,7 +37,7 @@ def candidate_rows(
     unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
     rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
     covariance = mixed_model_of_rows(rows, rows.hand_eye).covariance(variances)
-    return rows, [effect_rows(rows, measurement, Model(seen.T_mount), term) for term in terms], covariance
+    return rows, effect_rows(rows, measurement, Model(seen.T_mount), terms), covariance
 
 
 def _all_seen(measurement: Measurement, seen: Rows, landmarks: Landmarks, known: Indices) -> Measurement:

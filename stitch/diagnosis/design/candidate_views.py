@@ -52,7 +52,7 @@ def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> Can
     to_centre = frames.make(np.eye(3), -centre)
     own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
     extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
-    found = [twists(measurement, bare, term, centre) for term in zero]
+    found = twists(measurement, bare, zero, centre)
     of_a, of_b = (c[s.form.keep].transpose(1, 2, 0) for c, s in zip(found, (a, b), strict=True))
     half = _view_scatter(linear, measurement, to_centre)
     return CandidateViews(joints, np.concatenate([own, extra], axis=2), of_a, of_b, half)

@@ -24,6 +24,8 @@ def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term]
     of_points = [term for term in terms if moves_points([term])]
     sums = _point_gram(measurement, model, of_points, freed) if of_points else None
     seen = seen_twists(sums, freed) if sums else None
+    of_views = [term for term in terms if not moves_points([term])]
+    moved = iter(twists(measurement, model, of_views, freed.overlaps.gram.centre))
     out, at = [], 0
     for term in terms:
         if sums is not None and seen is not None and moves_points([term]):
@@ -31,7 +33,7 @@ def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term]
             out.append(Response(seen[:, own], sums.of(own)))
             at = own.stop
         else:
-            found = twists(measurement, model, term, freed.overlaps.gram.centre)
+            found = next(moved)
             out.append(Response(np.asarray(found.reshape(len(found), -1).T), None))
     return out
 

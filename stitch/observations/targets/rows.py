@@ -13,12 +13,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement
 from stitch.measurement.sightings import Sightings
-from stitch.model.forward import moves_points
-from stitch.model.jacobian import target_shifts, twists
-from stitch.model.model import Model
-from stitch.model.term import Term
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.statistics.restricted_likelihood import MixedModel
 
@@ -132,25 +127,6 @@ def _draw(landmarks: Landmarks, views: int, left: Array, columns: Array, fixed: 
         columns[block, :3, 3 * k : 3 * k + 3] = np.eye(3)
         columns[block, :3, -6:] = np.hstack([frames.skew(p), -np.eye(3)])
         fixed[block, :3] = landmarks.drawing.sigma[t] ** 2
-
-
-def effect_rows(rows: Rows, measurement: Measurement, model: Model, term: Term) -> Array:
-    """(B, m, P) how the rows answer to the parameters of `term`, at `model`."""
-    if not moves_points([term]):
-        moved = twists(measurement, model, term, rows.centre)
-        return rows.by_twists(moved.reshape(len(moved), -1).T)
-    poses = rows.capture.poses(rows.T_mount)
-    slopes = frames.rotate(poses, target_shifts(measurement, model, term, poses))  # (P, V, S, 3)
-    out = np.zeros((*rows.residual.shape, len(slopes)))
-    out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
-    out[: len(poses)][~rows.used] = 0.0
-    return out
-
-
-def effect_columns(rows: Rows, measurement: Measurement, model: Model) -> Array:
-    """(B, m, P) how the rows answer to all parameters of the effects in use."""
-    found = (effect_rows(rows, measurement, model, term) for term in model.terms)
-    return np.concatenate([np.zeros((*rows.residual.shape, 0)), *found], axis=2)
 
 
 def mixed_model_of_rows(rows: Rows, A: Array) -> MixedModel:

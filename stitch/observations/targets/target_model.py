@@ -12,8 +12,9 @@ from stitch.model.model import Model
 from stitch.model.term import Term, stacked
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import PointSums, Prior, Response
+from stitch.observations.targets.effect_rows import effect_columns, effect_rows
 from stitch.observations.targets.landmarks import Drawing, Landmarks, initial_landmarks
-from stitch.observations.targets.rows import Rows, effect_columns, effect_rows, mixed_model_of_rows, rows_of
+from stitch.observations.targets.rows import Rows, mixed_model_of_rows, rows_of
 from stitch.observations.targets.target_trial import TargetTrial
 from stitch.statistics.folds import JointEnd, grouped_folds, joint_ends
 from stitch.statistics.identifiability import independent
@@ -30,7 +31,7 @@ class Targets:
 
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Rows (n, P) of each term."""
-        found = [effect_rows(self.rows, measurement, model, term) for term in terms]
+        found = effect_rows(self.rows, measurement, model, terms)
         return [Response(c.reshape(self.rows.residual.size, c.shape[2])) for c in found]
 
     def reduce(self, response: Array) -> Array:
