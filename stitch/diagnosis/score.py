@@ -12,15 +12,13 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
+from stitch.diagnosis.form_trial import FormTrial, gain_at_null, residuals, try_form
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.tails import f_tail
-from stitch.statistics.variance_components import MANY_NUMBERS, at_variances, fit_variances
+from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 _SEEN = 0.5
-# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
-_FREE = 30.0
 # Forms that do not gain under the null's variances do not gain under their own either.
 _HOPELESS = -4.0
 # Under several variances, of which one is nearly that of the maximum, they gain half a nat at the most.
@@ -63,17 +61,6 @@ class Score:
         return bool(np.isfinite(self.covariance).all())
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """One form against the null."""
-
-    log_bayes_factor: float
-    p_value: float = 1.0
-    values: Array | None = None  # (p,) free fit; None where the form was not worth one
-    covariance: Array | None = None
-    variances: Array | None = None  # (c,)
-
-
 def score(linear: LinearModel, candidate: Candidate) -> Score:
     """Try all forms of a candidate beside everything else that poses may err by.
 
@@ -83,16 +70,17 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     base = linear.without([candidate.name])
     full = candidate.forms[0]
     starts = (base, *base.elsewhere)
-    whites = [at.residual(full.columns) * full.sizes for at in starts]
-    seen = any(bool((np.linalg.norm(white, axis=0) > _SEEN).any()) for white in whites if white.size)
-    quick = np.array([[_quick(base, at, form) for at in starts] for form in candidate.forms])
+    whites = [residuals(at, candidate) for at in starts]
+    seen = any(bool((np.linalg.norm(own[0] * full.sizes, axis=0) > _SEEN).any()) for own in whites if own[0].size)
+    found = list(zip(starts, whites, strict=True))
+    quick = np.array([[_quick(base, at, f, own[i]) for at, own in found] for i, f in enumerate(candidate.forms)])
     likely = quick.max(axis=1)
     least = _HOPELESS if base.pose_errors is None else max(_HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [
-        _try(base, form, starts[int(quick[i].argmax())].null.variances)
+        try_form(base, form, starts[int(quick[i].argmax())].null.variances)
         if i in worth and candidate.forms[i].columns.any()
-        else _Tried(float(likely[i]))
+        else FormTrial(float(likely[i]))
         for i, form in enumerate(candidate.forms)
     ]
     weights = form_weights(candidate)
@@ -116,53 +104,30 @@ def _refitted(linear: LinearModel) -> int:
     return _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
 
 
-def _beside(base: LinearModel, best: _Tried) -> LinearModel | None:
+def _beside(base: LinearModel, best: FormTrial) -> LinearModel | None:
     if base.pose_errors is None or best.variances is None:
         return None
     return replace(base, null=at_variances(base.mixed, best.variances))
 
 
-def _quick(base: LinearModel, at: LinearModel, form: Form) -> float:
+def _quick(base: LinearModel, at: LinearModel, form: Form, white: Array) -> float:
     """Log Bayes factor over the base at given variances: what refitted variances can only raise."""
-    return _at_null(at, form, at.residual(form.columns)) + 0.5 * (base.null.deviance - at.null.deviance)
+    return gain_at_null(at, form, white) + 0.5 * (base.null.deviance - at.null.deviance)
 
 
-def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """The most likely candidates at the null's variances, with all their parameters or those of one joint."""
-    quick = [max(_at_null(linear, form, linear.residual(form.columns)) for form in c.forms) for c in candidates]
-    return [candidates[k] for k in np.argsort(-np.array(quick), kind="stable")[:count]]
+def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[tuple[Candidate, float]]:
+    """The most likely candidates at the null's variances, with all their parameters or those of one joint.
 
-
-def _try(linear: LinearModel, form: Form, start: Array) -> _Tried:
-    """One form with its variances estimated anew."""
-    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
-    integrated = fit_variances(mixed, G, form.sizes, start=start)
-    if mixed.size > MANY_NUMBERS or linear.pose_errors is not None:
-        free = at_variances(mixed, integrated.variances, G, wide)
-    else:
-        free = fit_variances(mixed, G, wide, integrated.variances)
-    a = mixed.A.shape[2]
-    theta, covariance = free.mean[a:], free.covariance[a:, a:]
-    rank, square = _wald(theta, covariance, form.sizes)
-    rest = max(mixed.size - a - rank, 1)
-    p = f_tail(square / max(rank, 1), max(rank, 1), rest)
-    return _Tried(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance, integrated.variances)
-
-
-def _at_null(linear: LinearModel, form: Form, white: Array) -> float:
-    """Log Bayes factor at the null's variances: cheap, and an upper hand for what cannot help."""
-    white = white * form.sizes
-    information = np.eye(white.shape[1]) + white.T @ white
-    b = white.T @ linear.white_residual
-    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
-
-
-def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
-    """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
-    values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
-    keep = values < 0.5 * _FREE**2
-    projected = vectors[:, keep].T @ (theta / sizes)
-    return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
+    Returns:
+        With what they gain there (nats), best first.
+    """
+    gains = np.array(
+        [
+            max(gain_at_null(linear, f, w) for f, w in zip(c.forms, residuals(linear, c), strict=True))
+            for c in candidates
+        ]
+    )
+    return [(candidates[k], float(gains[k])) for k in np.argsort(-gains, kind="stable")[:count]]
 
 
 def form_weights(candidate: Candidate) -> Array:

@@ -28,7 +28,7 @@ class Blocks:
     @cached_property
     def scale(self) -> Array:
         """(k,) equilibrates: parameters count in rad, mm and per hour."""
-        return np.asarray(1 / np.sqrt(np.maximum(np.diag(self.information.sum(axis=0)) + self.precision, 1e-300)))
+        return np.asarray(1 / np.sqrt(np.maximum(np.diag(self.information) + self.precision, 1e-300)))
 
     @cached_property
     def weighted(self) -> Array:
@@ -37,37 +37,47 @@ class Blocks:
 
     @cached_property
     def information(self) -> Array:
-        """(B, k, k) XᵀWX of every block."""
-        return np.asarray(self.weighted.transpose(0, 2, 1) @ self.X)
+        """(k, k) XᵀWX."""
+        return _product(self.weighted, self.X)
 
     @cached_property
     def vector(self) -> Array:
-        """(B, k) XᵀWz of every block."""
-        return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z))
+        """(k,) XᵀWz."""
+        return _product(self.weighted, self.z[..., None])[:, 0]
+
+    def pulls(self, estimates: Array) -> Array:
+        """(B, k) XᵀW(z − X·x) of every block."""
+        return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z - self.X @ estimates))
 
     def solve(self, left_out: Array | Indices | None = None) -> Array:
         """(k,) estimates, without some blocks."""
-        M, b = self.information.sum(axis=0), self.vector.sum(axis=0)
+        M, b = self.information, self.vector
         if left_out is not None:
             out = np.asarray(left_out, np.int64)
-            M, b = M - self.information[out].sum(axis=0), b - self.vector[out].sum(axis=0)
+            M = M - _product(self.weighted[out], self.X[out])
+            b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
         inverse = _inverse(M + np.diag(self.precision), self.scale)
         return np.asarray(inverse @ (b + self.pull))
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
         spread = np.einsum("bmk,bmn,bnl->kl", self.weighted, self.covariance, self.weighted, optimize=True)
-        inverse = _inverse(self.information.sum(axis=0) + np.diag(self.precision), self.scale)
+        inverse = _inverse(self.information + np.diag(self.precision), self.scale)
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
     def moved_by(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
         pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
-        return np.asarray(_inverse(self.information.sum(axis=0) + np.diag(self.precision), self.scale) @ pulls)
+        return np.asarray(_inverse(self.information + np.diag(self.precision), self.scale) @ pulls)
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
+
+
+def _product(X: Array, Y: Array) -> Array:
+    """(k, l) Σ_b XᵀY of (B, m, k) and (B, m, l)."""
+    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
 
 
 def _inverse(M: Array, scale: Array) -> Array:

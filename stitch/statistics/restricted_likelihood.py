@@ -77,31 +77,29 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     """Evaluate it; infinitely unlikely, flat, where the covariance has no inverse."""
     with np.errstate(over="ignore"):
         mixed, variances = problem.mixed, np.exp(log_variances)
-    inverse, logdet = inverted(mixed.covariance(variances))
-    X, z = rows_of_blocks(problem.X), mixed.z.ravel()
-    k = X.shape[1]
-    if not np.isfinite(logdet):
-        return Likelihood(1e300, np.zeros(len(variances)), np.zeros(k), np.zeros((k, k)), inverse)
-    WX = rows_of_blocks(inverse @ problem.X)
-    M = X.T @ WX + np.diag(problem.precision)
+    inverse, k = inverted(mixed.covariance(variances)), problem.X.shape[2]
+    if not np.isfinite(inverse.logdet):
+        return Likelihood(1e300, np.zeros(len(variances)), np.zeros(k), np.zeros((k, k)), inverse.matrix)
+    white = rows_of_blocks(inverse.half @ problem.X)
+    white_z = np.matmul(inverse.half, mixed.z[..., None]).ravel()
+    M = white.T @ white + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
     keep = values > 1e-12
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
-    mean = half @ (half.T @ (WX.T @ z))
-    rest = (z - X @ mean).reshape(mixed.z.shape)
-    Wr = np.matmul(inverse, rest[..., None])
-    WXh = (WX @ half).reshape(*mixed.z.shape, -1)
+    mean = half @ (half.T @ (white.T @ white_z))
+    rest = white_z - white @ mean
     # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
-    taken = np.concatenate([WXh, Wr], axis=2)
-    against = inverse - taken @ taken.transpose(0, 2, 1)
+    taken = np.column_stack([white @ half, rest]).reshape(*mixed.z.shape, -1)
+    unwhitened = inverse.half.transpose(0, 2, 1) @ taken
+    against = inverse.matrix - unwhitened @ unwhitened.transpose(0, 2, 1)
     slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
-    square = float(rest.ravel() @ Wr.ravel()) + float(mean @ (problem.precision * mean))
-    logdet += float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
+    square = float(rest @ rest) + float(mean @ (problem.precision * mean))
+    logdet = inverse.logdet + float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
     believed, pull = log_prior(log_variances, mixed.scales)
-    return Likelihood(logdet + square + believed, slope + pull, mean, half @ half.T, inverse)
+    return Likelihood(logdet + square + believed, slope + pull, mean, half @ half.T, inverse.matrix)
 
 
 def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from stitch.frames import Array
-from stitch.statistics.restricted_likelihood import MixedModel, Problem, deviance, likelihood, problem_of
+from stitch.statistics.restricted_likelihood import Likelihood, MixedModel, Problem, deviance, likelihood, problem_of
 from stitch.statistics.variance_prior import NOISE, usual_variances
 from stitch.statistics.variance_scoring import scored
 
@@ -67,8 +67,12 @@ def fit_variances(
     begin = [np.clip(s, *np.array(bounds).T) for s in begin]
     near = [scored(problem, s, flat) if present.all() else None for s in begin]
     search = partial(minimize, deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    ends = [search(s).x if found is None else found for s, found in zip(begin, near, strict=True)]
-    fits = [_fit(problem, np.where(present, np.exp(x), 0.0)) for x in ends]
+    fits = [
+        _fit(problem, np.where(present, np.exp(search(s).x), 0.0))
+        if found is None
+        else _told(np.exp(found[0]), found[1])
+        for s, found in zip(begin, near, strict=True)
+    ]
     return min(fits, key=lambda fit: fit.deviance)
 
 
@@ -80,7 +84,10 @@ def at_variances(
 
 
 def _fit(problem: Problem, variances: Array) -> VarianceFit:
-    here = likelihood(np.log(np.maximum(variances, _ABSENT)), problem)
+    return _told(variances, likelihood(np.log(np.maximum(variances, _ABSENT)), problem))
+
+
+def _told(variances: Array, here: Likelihood) -> VarianceFit:
     return VarianceFit(variances, here.deviance, here.mean, here.covariance)
 
 

@@ -3,15 +3,15 @@
 import numpy as np
 
 from stitch.frames import Array
-from stitch.statistics.restricted_likelihood import Problem, likelihood
+from stitch.statistics.restricted_likelihood import Likelihood, Problem, likelihood
 from stitch.statistics.variance_prior import log_prior, prior_information
 
 # Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
 # (rounding alone moves that of thousands of numbers by a tenth of it), and the blocks from which they pay.
-_SCORINGS, _LEAP, _HALVINGS, _SETTLED, _MANY_BLOCKS = 10, 2.0, 4, 1e-3, 50
+_SCORINGS, _LEAP, _HALVINGS, _SETTLED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
 
 
-def scored(problem: Problem, begin: Array, flat: float) -> Array | None:
+def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likelihood] | None:
     """(c,) log variances at the maximum by Fisher scoring, where it lies near; None where a search must look for it.
 
     The expected curvature of the deviance is λ_iλ_j tr(V⁻¹C_iV⁻¹C_j), less what the mean takes. With thousands of
@@ -23,7 +23,7 @@ def scored(problem: Problem, begin: Array, flat: float) -> Array | None:
     x, here = begin, likelihood(begin, problem)
     for _ in range(_SCORINGS):
         if np.abs(here.slope).max() < flat:
-            return x
+            return x, here
         variances = np.exp(x)
         shares = variances[:, None, None, None] * (here.inverse @ mixed.components)
         curvature = np.einsum("cbij,dbji->cd", shares, shares, optimize=True)
@@ -31,7 +31,7 @@ def scored(problem: Problem, begin: Array, flat: float) -> Array | None:
         curvature += np.diag(2 * prior_information(variances, None) + np.maximum(here.slope - log_prior(x, None)[1], 0))
         step = -np.linalg.solve(curvature, here.slope)
         if -0.5 * float(here.slope @ step) < _SETTLED:
-            return x
+            return x, here
         step *= min(1.0, _LEAP / float(np.abs(step).max()))
         for _ in range(_HALVINGS):
             there = likelihood(x + step, problem)

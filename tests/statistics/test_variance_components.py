@@ -81,10 +81,16 @@ def test_variances_beyond_all_numbers_are_as_unlikely_as_nothing_else():
 def test_one_block_is_inverted_as_many_are():
     half = np.random.default_rng(4).normal(size=(2, 7, 7))
     V = half @ half.transpose(0, 2, 1) + np.eye(7)
-    inverse, logdet = inverted(V[:1])
-    assert np.allclose(inverse[0] @ V[0], np.eye(7), atol=1e-12)
-    assert logdet + inverted(V[1:])[1] == pytest.approx(inverted(V)[1])
-    assert inverted(-V[:1])[1] == np.inf
+    both, alone = inverted(V), [inverted(V[:1]), inverted(V[1:])]
+    assert sum(one.logdet for one in alone) == pytest.approx(both.logdet)
+    assert both.logdet == pytest.approx(np.linalg.slogdet(V)[1].sum())
+    for b, one in enumerate(alone):
+        for own in (one.matrix[0], both.matrix[b]):
+            assert np.allclose(own @ V[b], np.eye(7), atol=1e-12)
+        for own in (one.half[0], both.half[b]):
+            assert np.allclose(own @ V[b] @ own.T, np.eye(7), atol=1e-12)
+            assert not np.triu(own, 1).any()
+    assert inverted(-V[:1]).logdet == inverted(-V).logdet == np.inf
 
 
 def test_scoring_ends_where_a_search_ends():
@@ -109,4 +115,4 @@ def test_scoring_ends_where_a_search_ends():
         )
         assert found is not None or factor != 1.0
         if found is not None:
-            assert deviance_slope(found, mixed)[0] == pytest.approx(looked.fun, abs=2e-3)
+            assert found[1].deviance == deviance_slope(found[0], mixed)[0] == pytest.approx(looked.fun, abs=2e-3)

@@ -9,7 +9,7 @@ from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import promising, score
 from stitch.diagnosis.selection.ranking import Ranked, certain, rank, ranked_one
 from stitch.diagnosis.thresholds import AT_ONCE, TRIED
-from stitch.diagnosis.validation.extrapolation import extrapolate
+from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
 from stitch.observations.linear_model import LinearModel
 
 
@@ -34,9 +34,8 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
-        chosen = _eliminated_back(linear, chosen, len(candidates))
-        tried = [(r.name, extrapolate(_without(linear, chosen, r), r.score)) for r in chosen]
-        erring = {name: found for name, found in tried if found is not None and not found.helps}
+        chosen, beyond = _eliminated_back(linear, chosen, len(candidates))
+        erring = {name: found for name, found in beyond.items() if found is not None and not found.helps}
         if not erring:
             return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
         name = max(erring, key=lambda name: erring[name].share)
@@ -49,26 +48,50 @@ def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequenc
     """Further effects, one by one, as long as one can be named beside those before."""
     chosen = list(chosen)
     while len(chosen) < AT_ONCE:
-        conditioned = _conditioned(linear, chosen)
-        others = [c for c in candidates if c.name not in {r.name for r in chosen}]
-        scores = [score(conditioned, c) for c in promising(conditioned, others, TRIED)]
-        # Preselected by what they gain: all that were looked at count as tests.
-        ranked, _ = rank(scores, tests=len(others))
-        following = next((r for r in ranked if certain(r)), None)
+        following = _following(
+            _conditioned(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
+        )
         if following is None:
             break
         chosen.append(following)
     return chosen
 
 
-def _eliminated_back(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> list[Ranked]:
-    """The effects that can still be named beside all the others."""
-    chosen = list(chosen)
+def _following(conditioned: LinearModel, others: Sequence[Candidate]) -> Ranked | None:
+    """The effect that explains most of what is left, if it can be named.
+
+    What seems to gain less than half of the best is fitted only where nothing else can be named: beside that one it
+    has its turn again.
+    """
+    likely = promising(conditioned, others, TRIED)
+    near = [c for c, gain in likely if gain >= 0.5 * likely[0][1]]
+    for tried in (near, [c for c, _ in likely if c not in near]):
+        # Preselected by what they gain: all that were looked at count as tests.
+        ranked, _ = rank([score(conditioned, c) for c in tried], tests=len(others))
+        following = next((r for r in ranked if certain(r)), None)
+        if following is not None:
+            return following
+    return None
+
+
+def _eliminated_back(
+    linear: LinearModel, chosen: Sequence[Ranked], tests: int
+) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
+    """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
+    chosen, beyond = list(chosen), dict[str, Extrapolation | None]()
     for r in list(chosen):
-        own = ranked_one(_without(linear, chosen, r), r.score.candidate, tests)
+        beside = _without(linear, chosen, r)
+        own = ranked_one(beside, r.score.candidate, tests)
         others = [other for other in chosen if other.name != r.name]
+        if not certain(own) or own.score.form is not r.score.form:
+            beyond = {}  # what was asked of the others was asked beside this one
         chosen = [*others, own] if certain(own) else others
-    return chosen
+        if certain(own):
+            beyond[own.name] = extrapolate(beside, own.score)
+    for r in chosen:
+        if r.name not in beyond:
+            beyond[r.name] = extrapolate(_without(linear, chosen, r), r.score)
+    return chosen, {r.name: beyond[r.name] for r in chosen}
 
 
 def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:

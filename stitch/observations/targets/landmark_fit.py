@@ -34,5 +34,5 @@ def fitted_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, Blocks, A
 def landmarks_covariance(blocks: Blocks, rows: Rows, hand_eye: Array) -> Array:
     """(U, U) by the scatter of the poses, the sensor's noise and the uncertainty (6, 6) of the hand-eye."""
     pull = np.einsum("bmk,bmi->ki", blocks.weighted, rows.hand_eye)
-    moved = np.linalg.solve(blocks.information.sum(axis=0) + np.diag(blocks.precision), pull)
+    moved = np.linalg.solve(blocks.information + np.diag(blocks.precision), pull)
     return np.asarray(blocks.estimates_covariance() + moved @ hand_eye @ moved.T)

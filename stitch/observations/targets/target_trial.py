@@ -46,11 +46,7 @@ class TargetTrial:
     def influential_views(self, coefficients: Array) -> Indices:
         """The views without which the coefficients would move most, to first order."""
         b = self.blocks
-        pulls = b.vector - b.information @ coefficients
-        moves = (
-            pulls
-            * b.scale
-            @ np.linalg.pinv(b.information.sum(axis=0) * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
-        )
+        inverse = np.linalg.pinv(b.information * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
+        moves = b.pulls(coefficients) * b.scale @ inverse
         sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
         return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)

@@ -1,0 +1,68 @@
+"""One form of a candidate beside a model: what it gains, and its free amplitudes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.candidates import Candidate, Form
+from stitch.frames import Array
+from stitch.observations.linear_model import LinearModel
+from stitch.statistics.tails import f_tail
+from stitch.statistics.variance_components import MANY_NUMBERS, at_variances, fit_variances
+
+# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
+_FREE = 30.0
+
+
+@dataclass(frozen=True)
+class FormTrial:
+    """One form against the null."""
+
+    log_bayes_factor: float
+    p_value: float = 1.0
+    values: Array | None = None  # (p,) free fit; None where the form was not worth one
+    covariance: Array | None = None
+    variances: Array | None = None  # (c,)
+
+
+def try_form(linear: LinearModel, form: Form, start: Array) -> FormTrial:
+    """One form with its variances estimated anew."""
+    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
+    integrated = fit_variances(mixed, G, form.sizes, start=start)
+    if mixed.size > MANY_NUMBERS or linear.pose_errors is not None:
+        free = at_variances(mixed, integrated.variances, G, wide)
+    else:
+        free = fit_variances(mixed, G, wide, integrated.variances)
+    a = mixed.A.shape[2]
+    theta, covariance = free.mean[a:], free.covariance[a:, a:]
+    rank, square = _wald(theta, covariance, form.sizes)
+    rest = max(mixed.size - a - rank, 1)
+    p = f_tail(square / max(rank, 1), max(rank, 1), rest)
+    return FormTrial(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance, integrated.variances)
+
+
+def residuals(linear: LinearModel, candidate: Candidate) -> list[Array]:
+    """(n, p) per form what its columns say beside the model; those of one joint are among those of all."""
+    out, whole = [], candidate.forms[0]
+    white = linear.residual(whole.columns)
+    for form in candidate.forms:
+        if form.term is not whole.term:
+            whole, white = form, linear.residual(form.columns)
+        out.append(white[:, form.keep[whole.keep]])
+    return out
+
+
+def gain_at_null(linear: LinearModel, form: Form, white: Array) -> float:
+    """Log Bayes factor at the null's variances: cheap, and an upper hand for what cannot help."""
+    white = white * form.sizes
+    information = np.eye(white.shape[1]) + white.T @ white
+    b = white.T @ linear.white_residual
+    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
+
+
+def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
+    """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
+    values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
+    keep = values < 0.5 * _FREE**2
+    projected = vectors[:, keep].T @ (theta / sizes)
+    return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
