@@ -48,6 +48,21 @@ def kinds(rows: Sequence[Row]) -> None:
         print(f"| {case} | {len(own)} | {' | '.join(map(str, counts))} |")
 
 
+def many(rows: Sequence[Row]) -> None:
+    """A third of the views and more."""
+    print(
+        "| wrong views | sessions | refused | all of them left out | some fused, said so | silent | right ones lost |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for case, own in cases(rows).items():
+        mixed = [r for r in own if r.get("mixed")]
+        refused, silent = (
+            sum(bool(x) for x in own_) for own_ in ((r["ended"] == "refused" for r in own), (r["silent"] for r in own))
+        )
+        clean, lost = len(own) - refused - len(mixed), sum(r.get("lost", 0) for r in own if not r.get("mixed"))
+        print(f"| {case} | {len(own)} | {refused} | {clean} | {len(mixed) - silent} | {silent} | {lost} |")
+
+
 def real(rows: Sequence[Row]) -> None:
     """Measured scans with mistakes."""
     print("| mistake in measured scans | objects | refused | ran without those views | ran | named |")
@@ -61,7 +76,7 @@ def real(rows: Sequence[Row]) -> None:
 
 if __name__ == "__main__":
     for file in map(Path, sys.argv[1:]):
-        {"good": good, "sizes": sizes, "kinds": kinds, "real": real}[file.stem](
+        {"good": good, "sizes": sizes, "kinds": kinds, "many": many, "real": real}[file.stem](
             [json.loads(line) for line in file.read_text().splitlines()]
         )
         print()

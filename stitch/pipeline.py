@@ -83,7 +83,7 @@ def run_rig(
             if len(session.views) < len(sessions[i].views):
                 recorders[i].start(session)
             out, kept = ((), own.left_out) if keep else (own.left_out, ())
-            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
+            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links, doubts=own.doubts)
             runs.append(collected(session, i, last, before[i], recorders[i]))
         return runs
 

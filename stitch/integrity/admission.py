@@ -6,18 +6,21 @@ from functools import partial
 
 import numpy as np
 
+from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import (
     beyond_any_arm,
+    contradicted_by,
     contradicts,
+    doubtful,
     judged_by_size,
     stands_off,
 )
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
-from stitch.integrity.refusals import refuse, require_own_model, unexplained
+from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
@@ -29,6 +32,8 @@ from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
 
+_LISTED = 3
+
 
 @dataclass(frozen=True)
 class Admission:
@@ -37,6 +42,7 @@ class Admission:
     left_out: tuple[LeftOut, ...] = ()
     suspected: tuple[LeftOut, ...] = ()  # off by no more than an effect of an arm may cause: fused, and noted
     links: ViewLinks = field(default_factory=ViewLinks)
+    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
 
     @property
     def names(self) -> set[str]:
@@ -76,6 +82,7 @@ def admission(session: Session, measurement: Measurement, correction: Correction
         # Other mistakes look like a factor on lengths too.
         refuse(session, deep_check(session))
         refuse(session, [size])
+    doubts = _doubts(session, own, found, T_mount)
     if found.block is not None and not _beyond_any_slip(session, found):
         # A slip of the part, or a knock of the mount, within what a model can hold: the diagnosis names it.
         found = replace(found, block=None)
@@ -88,6 +95,25 @@ def admission(session: Session, measurement: Measurement, correction: Correction
         left_out=out,
         suspected=tuple(_suspect(session, own, m, T_mount) for m in found.suspected),
         links=_links(session, found),
+        doubts=doubts,
+    )
+
+
+def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
+    """What to say of poses that contradict the scans as no arm of use does; a mistake of all of them is refused."""
+    if not doubtful(session, found):
+        return ()
+    refuse_whole(session)
+    twists = frames.log(found.freed.poses @ frames.inverse(own.poses(T_mount)))
+    middles = np.array([points.mean(axis=0) for points in own.shown])
+    moved = np.linalg.norm(
+        twists[:, 3:] + np.cross(twists[:, :3], frames.transform(own.poses(T_mount), middles[:, None])[:, 0]), axis=1
+    )
+    worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
+    names = ", ".join(f"{session.views[v].name} ({moved[v]:.3g} {session.length_unit})" for v in worst)
+    return (
+        f"No arm scatters by {contradicted_by(session, found)}: several rows or scans are wrong, and the views hold "
+        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {names}.",
     )
 
 

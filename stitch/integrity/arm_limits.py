@@ -25,6 +25,11 @@ def contradicts(session: Session, found: Snooping) -> bool:
     return lost or beyond_any_arm(session, found.rotation, found.translation)
 
 
+def doubtful(session: Session, found: Snooping) -> bool:
+    """True if all poses together scatter by what no arm is believed to do to a single view."""
+    return found.rotation > _VIEW_ROTATION or found.translation * METRES[session.length_unit] > _VIEW_M
+
+
 def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
     """True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
     return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]

@@ -35,6 +35,20 @@ def refuse(session: Session, problems: Sequence[Problem]) -> None:
         raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
 
 
+def refuse_whole(session: Session) -> list[Problem]:
+    """Refuse a mistake of the whole session, such as a wrong order of angles.
+
+    Returns:
+        What else a deep check found.
+
+    Raises:
+        InputError: there is one.
+    """
+    found = deep_check(session)
+    refuse(session, [p for p in found if p.kind not in (*_OF_VIEWS, *_LEAVE_A_REST)])
+    return found
+
+
 def require_majority(session: Session, left_out: Sequence[LeftOut]) -> None:
     """Refuse a session of which so many views do not belong that the rest cannot say which of them are wrong.
 
@@ -47,8 +61,7 @@ def require_majority(session: Session, left_out: Sequence[LeftOut]) -> None:
     """
     if len(left_out) < _MANY * len(session.views):
         return
-    found = deep_check(session)
-    refuse(session, [p for p in found if p.kind not in (*_OF_VIEWS, *_LEAVE_A_REST)])
+    found = refuse_whole(session)
     if 2 * len(left_out) >= len(session.views) and not any(p.kind in _LEAVE_A_REST for p in found):
         names = ", ".join(item.view for item in left_out)
         raise NoResultError(

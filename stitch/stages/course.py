@@ -46,6 +46,7 @@ class End:
     kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
     suspected: tuple[LeftOut, ...] = ()  # views that stand out, and are fused
     links: ViewLinks = field(default_factory=ViewLinks)
+    doubts: tuple[str, ...] = ()  # of the session as a whole
 
 
 def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
@@ -77,7 +78,11 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         ledger=(*end.ledger, _step(fitted, finished)),
         effects_file=end.effects_file,
         convergence=finished.convergence,
-        notes=(*view_notes(end.left_out, end.kept, end.suspected), *course.notes(session, fitted, index, end.begun)),
+        notes=(
+            *end.doubts,
+            *view_notes(end.left_out, end.kept, end.suspected),
+            *course.notes(session, fitted, index, end.begun),
+        ),
         left_out=end.left_out,
         links=end.links,
         targets=own.targets,

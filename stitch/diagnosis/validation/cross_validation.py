@@ -105,8 +105,7 @@ def _steadiness(linear: LinearModel, trial: Trial, X: Array, whole: Array) -> fl
     """A combination of parameters that one view carries alone vanishes without it."""
     size = X.shape[1] - linear.design.shape[1]
     theta = whole[-size:]
-    norm = float(theta @ theta)
-    if norm == 0:
+    if not theta.any():
         return 0.0
     white = linear.residual(linear.reduce(X[:, -size:]))
     strength = float(np.sum((white @ theta) ** 2))
