@@ -1,8 +1,14 @@
-"""Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle."""
+"""Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle.
+
+Or add a whole group of effects that the views cannot tell apart, where that helps.
+"""
+
+from dataclasses import replace
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
 from stitch.diagnosis.thresholds import MANY_VIEWS, RISE
+from stitch.diagnosis.validation.group_validation import group_share
 from stitch.pipeline import change, diagnose
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
@@ -37,6 +43,29 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
         return result, lines, found
     kept, dropped = _without_idle(result, given)
     return (result, lines, found) if not dropped else (kept, [*lines, *dropped], diagnose(state_of(kept)))
+
+
+def suggest_group(state: State) -> tuple[Run | None, list[str], Diagnosis]:
+    """The run with all effects of a group that these views cannot tell apart, what to say of it, and the diagnosis.
+
+    The run is None where the diagnosis names no such group, or where the group does not help on views left out.
+    """
+    found = diagnose(state)
+    if found.verdict != "cannot_tell":
+        return None, [found.sentence, "There is no group of effects that these views cannot tell apart."], found
+    names = " + ".join(found.effects)
+    asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
+    share, sigma = group_share(found.linear, asked)
+    judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
+    if share > 1 - sigma:
+        return None, [found.sentence, f"{names} together do not help on views left out: {judged}."], found
+    tried = change(state, [*state.model.effects, *found.effects])
+    told = (
+        f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
+        "tell its parts apart, so that none of their values means anything alone"
+    )
+    tried = replace(tried, notes=(f"{told}.", *tried.notes))
+    return tried, [found.sentence, f"{told}."], diagnose(state_of(tried))
 
 
 def _without_idle(result: Run, given: set[str]) -> tuple[Run, list[str]]:

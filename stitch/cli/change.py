@@ -13,6 +13,7 @@ from stitch.cli.run import recorder_for
 from stitch.cli.streams import emit
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import plain_verdict
+from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
 from stitch.effects.in_session import known, require
 from stitch.errors import InputError
@@ -20,7 +21,7 @@ from stitch.model.term import Term
 from stitch.pipeline import change
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
-from stitch.stepwise import suggest
+from stitch.stepwise import suggest, suggest_group
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
 from stitch.units import length_text, rounded
@@ -35,6 +36,7 @@ def add(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; changed in place.")],
     effects: Annotated[list[str] | None, typer.Argument(metavar="EFFECT...", help="Effects to add.")] = None,
     suggested: Annotated[bool, typer.Option("--suggested", help="Diagnose and add until nothing is left.")] = False,
+    group: Annotated[bool, typer.Option("--group", help="Diagnose; add effects that it cannot tell apart.")] = False,
     at_most: Annotated[int, typer.Option("--at-most", help="Limit for --suggested.")] = 5,
     effects_file: EffectsFile = None,
     trust: Trust = False,
@@ -47,13 +49,15 @@ def add(
     Examples:
       stitch add runs/blade-17 backlash
       stitch add runs/blade-17 --suggested
+      stitch add runs/blade-17 --group
     """
-    if bool(effects) == suggested:
-        raise InputError("add what? to fix: name the effects, or let --suggested choose; one of the two")
+    if bool(effects) + suggested + group != 1:
+        raise InputError("add what? to fix: name the effects, or let --suggested or --group choose; one of the three")
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
-        if suggested:
-            _suggested(run, state, at_most, recording, as_json)
+        if suggested or group:
+            chosen = suggest(state, at_most) if suggested else suggest_group(state)
+            _suggested(run, state, chosen, recording, as_json)
             return
         used = state.model.effects
         for name in effects or []:
@@ -63,9 +67,11 @@ def add(
         _change(run, state, [*used, *(effects or [])], recording, as_json)
 
 
-def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: bool) -> None:
-    """Diagnose and add; what was tried on the way leaves no recording, the end does."""
-    result, lines, found = suggest(state, at_most)
+def _suggested(
+    run: Path, state: State, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
+) -> None:
+    """Write and show what a diagnosis chose; what was tried on the way leaves no recording, the end does."""
+    result, lines, found = chosen
     for line in lines:
         console().print(line, soft_wrap=True)
     if result is not None:
@@ -73,7 +79,8 @@ def _suggested(run: Path, state: State, at_most: int, recording: bool, as_json: 
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
                 before = replace(state_of(result), ledger=result.ledger[:-1])
-                result = change(before, result.effects, recorder_for(scratch, recording))
+                again = change(before, result.effects, recorder_for(scratch, recording))
+                result = replace(again, notes=result.notes)
             run_folder.write_with_page(result, scratch)
         _show(result, as_json)
     elif as_json:

@@ -1,5 +1,6 @@
 """`stitch diagnose RUN`: which effect is missing; `stitch next RUN`: what to measure."""
 
+import shlex
 from pathlib import Path
 
 from rich.console import Console
@@ -39,6 +40,8 @@ def diagnose_run(
         emit(to_json(document))
     else:
         show(found, unit)
+        if found.verdict == "cannot_tell":
+            console().print(f"Fitted as one, if that helps: stitch add {shlex.quote(str(run))} --group", soft_wrap=True)
 
 
 def next_measurement(

@@ -1,0 +1,25 @@
+"""Whether effects that cannot be told apart predict views left out, all of them together."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.diagnosis.score import Score
+from stitch.diagnosis.validation.cross_validation import believed_size, share_of
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.response import Prior
+
+
+def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
+    """How far left-out poses lie from what the group predicts over how far from the present model, mean square.
+
+    Returns:
+        The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
+    """
+    a = linear.design.shape[1]
+    precision = np.concatenate([np.zeros(a), *(believed_size(linear, own).precision[a:] for own in group)])
+    prior = Prior(precision, np.zeros(len(precision)))
+    trial = linear.trial(np.hstack([linear.design, *(own.form.response for own in group)]), None, prior)
+    pairs = [(t, t.solve(fold), fold) for fold in linear.observation.folds() for t in (trial, linear.present)]
+    off = np.array([t.scatter(fold, found) for t, found, fold in pairs]).reshape(-1, 2)
+    return share_of(off[:, 0], off[:, 1])

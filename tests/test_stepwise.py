@@ -1,0 +1,44 @@
+"""A group of effects that cannot be told apart: added as one where it helps on views left out, and only there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch import stepwise
+from stitch.pipeline import diagnose, run
+from stitch.runs.state import state_of
+
+OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+
+
+@pytest.fixture(scope="module")
+def first():
+    session, *_ = labelled_cell(1, views=24, offset=OFFSET)
+    return run(session)
+
+
+def answered(monkeypatch, verdict, effects):
+    """Diagnoses that say what a session with such effects would lead to."""
+    monkeypatch.setattr(stepwise, "diagnose", lambda state: replace(diagnose(state), verdict=verdict, effects=effects))
+
+
+def test_a_group_that_helps_is_added_as_one(first, monkeypatch):
+    answered(monkeypatch, "cannot_tell", ("joint_offset", "gear_eccentricity"))
+    result, lines, _ = stepwise.suggest_group(state_of(first))
+    assert result.effects == ["joint_offset", "gear_eccentricity"]
+    assert result.heldout_rms < 0.5 * first.heldout_rms
+    assert "do not tell its parts apart" in lines[-1] and result.notes[0] == lines[-1]
+
+
+def test_a_group_of_which_nothing_is_there_stays_out(monkeypatch):
+    answered(monkeypatch, "cannot_tell", ("backlash", "settling"))
+    session, *_ = labelled_cell(3, views=24)
+    result, lines, _ = stepwise.suggest_group(state_of(run(session)))
+    assert result is None and "do not help on views left out" in lines[-1]
+
+
+def test_what_has_a_name_is_no_group(first):
+    result, lines, found = stepwise.suggest_group(state_of(first))
+    assert found.verdict == "missing_effect" and result is None and "no group" in lines[-1]
