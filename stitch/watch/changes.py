@@ -56,19 +56,16 @@ def _change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int
     end = min(order[own[i + 1].raised] if i + 1 < len(own) else len(order), max(at + _AROUND, order[alarm.raised] + 1))
     runs = list(order)[begin:end]
     found = _found(sessions_from(history, runs), alarm.parameter, drifting)
-    if found is None:
-        nan = float("nan")
-        return Change(alarm.parameter, alarm.onset, alarm.raised, "step", None, nan, nan, nan, alarm.chart)
-    shape = found.shape
+    shape = "step" if found is None else found.shape
     return Change(
         parameter=alarm.parameter,
-        since=runs[found.session],
+        since=alarm.onset if found is None else runs[found.session],
         raised=alarm.raised,
         kind="step" if shape == "step" else "drift",
         channel=None if shape in ("step", "drift") else shape,
-        size=found.size,
-        sigma=found.sigma,
-        p_value=found.p_value,
+        size=np.nan if found is None else found.size,
+        sigma=np.nan if found is None else found.sigma,
+        p_value=np.nan if found is None else found.p_value,
         chart=alarm.chart,
     )
 
