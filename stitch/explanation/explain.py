@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.score import score
+from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.validation.cross_validation import cross_validate
+from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
 from stitch.explanation.dictionary import coefficient, dictionary
@@ -19,6 +20,8 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 NAME = "explained"
+# rad; no gear, spring or clearance does more to a joint. Larger addends are differences of two that look alike.
+_MOST = 0.01
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,20 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
         text, places = formula_text(own, values), {i.place for i in own}
         if not chosen.holds or len(places) > 1:
             return Explanation(False, _not_held(chosen, text))
+        if any(i.place == "robot" and abs(x) > _MOST for i, x in zip(own, scaled, strict=True)):
+            return Explanation(
+                False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that."
+            )
         source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
-        share, helps = _on_views_left_out(linear, source)
-        if not helps:
+        scored = _as_effect(linear, source)
+        left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
+        share = left_out.heldout
+        if not left_out.helps or share >= 1:
             return Explanation(
                 False, f"{text} explains much, but not in views that are left out with their neighbours."
             )
+        if beyond is not None and not beyond.helps:
+            return Explanation(False, f"{beyond.objection(text)}.")
         why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
         return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
 
@@ -69,13 +80,12 @@ def _not_held(chosen: Chosen, text: str) -> str:
     )
 
 
-def _on_views_left_out(linear: LinearModel, source: str) -> tuple[float, bool]:
-    """Share of the mean square error that the file's effect leaves on views left out, and whether these are helped."""
+def _as_effect(linear: LinearModel, source: str) -> Score:
+    """The effect of a file of effects against the model."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.py"
         file.write_text(source, encoding="utf-8")
         load(file)
         candidate = candidate_of(linear, EFFECTS[NAME])
         assert candidate is not None
-        found = cross_validate(linear, score(linear, candidate))
-    return found.heldout, found.helps and found.heldout < 1
+        return score(linear, candidate)
