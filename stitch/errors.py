@@ -13,6 +13,10 @@ class InputError(StitchError):
     exit_code = 2
 
 
+class BusyError(InputError):
+    """Another process writes there: the same may do in a while."""
+
+
 class NoResultError(StitchError):
     """Good input, but the computation reached no result: says why and what to try (exit code 1)."""
 

@@ -1,27 +1,23 @@
-"""`stitch batch SESSION…`: many sessions, each a run of its own."""
+"""`stitch batch SESSION…`: many sessions, each a run of its own, on one process or many."""
 
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
+from uuid import uuid4
 
 import typer
-from rich.table import Table
 
-from stitch.cli.options import Force, Json
-from stitch.cli.progress import Tee
-from stitch.cli.run import recordings
+from stitch.batch.job import Job
+from stitch.batch.results import results
+from stitch.batch.session_row import SessionRow
+from stitch.batch.summary import DOCUMENT, PAGE, document, sentence, write_summary
+from stitch.cli.batch_table import show_files, show_row, show_table
+from stitch.cli.options import Json
 from stitch.cli.streams import emit
-from stitch.errors import InputError, NoResultError, StitchError
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
-from stitch.reading.session_toml import document, name_of
+from stitch.errors import InputError, NoResultError
+from stitch.reading.session_toml import document as session_document
+from stitch.reading.session_toml import name_of
 from stitch.system.console import console
 from stitch.system.steps import steps
-from stitch.units import MICROMETRES, length_text
-from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 
 
@@ -29,94 +25,80 @@ def batch(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = Path("runs"),
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")] = 1,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="tcp://…", help="A Dask scheduler instead.")] = "",
-    force: Force = False,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", metavar="tcp://…", help="Workers of a Dask scheduler that runs already.")
+    ] = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Run finished sessions too, and replace runs of other sessions.")
+    ] = False,
+    recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     as_json: Json = False,
 ) -> None:
-    """Run many sessions; one that fails does not stop the others.
+    """Run many sessions; one that fails does not stop the others. Started again, it runs what is not finished.
 
     \b
     Examples:
       stitch batch blade-17 blade-18 blade-19 -o runs --workers 2
+      stitch batch blade-* --scheduler tcp://10.0.0.5:8786
     """
-    folders = [output / _name(path) for path in sessions]
-    if len(set(folders)) < len(folders):
-        twice = max(folders, key=folders.count).name
+    if scheduler and workers > 1:
+        raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")
+    jobs = _jobs(sessions, output, force, recording)
+    rows: dict[str, SessionRow] = {}
+    try:
+        for row in steps("sessions", results(jobs, workers, scheduler, console().print), len(jobs)):
+            rows[row.name] = row
+            show_row(row, len(rows), len(jobs))
+    except KeyboardInterrupt:
+        raise NoResultError(
+            f"stopped with {len(rows)} of {len(jobs)} sessions told; what is finished is kept, and the same command "
+            "goes on from there"
+        ) from None
+    _finish([rows[job.run.name] for job in jobs], output, as_json)
+
+
+def _jobs(sessions: list[Path], output: Path, force: bool, recording: bool) -> list[Job]:
+    """A job a session.
+
+    Raises:
+        InputError: two sessions, or a session and a file of the batch, would have the same place.
+    """
+    names = [_name(path) for path in sessions]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
         raise InputError(f"two of the sessions are named {twice!r}; run them with -o of their own")
-    rows = list(steps("sessions", _map(sessions, folders, force, workers, scheduler), len(sessions)))
-    if as_json:
-        emit(to_json(rows))
-    else:
-        _show(rows)
-    failed = [row for row in rows if row["error"]]
-    if failed:
-        refused = all(row["bad_input"] for row in failed)
-        kind = InputError if refused else NoResultError
-        raise kind(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")
+    if taken := {DOCUMENT, PAGE} & set(names):
+        raise InputError(f"a session is named {taken.pop()!r}, as a file of the batch is; give it another name")
+    here, token = output.resolve(), uuid4().hex
+    return [
+        Job(path.resolve(), here / name, token, force, recording) for path, name in zip(sessions, names, strict=True)
+    ]
 
 
 def _name(session: Path) -> str:
     """What the session is called; a session that cannot be read is refused when it is its turn."""
     try:
         file = session / "session.toml"
-        return name_of(file, document(file))
+        return name_of(file, session_document(file))
     except InputError:
         return session.resolve().name
 
 
-def stitch_one(session: Path, folder: Path, force: bool = False) -> dict[str, Any]:
-    """Run one session into its folder; what goes wrong becomes part of the answer."""
-    try:
-        loaded = load_session(session)
-        with run_folder.new_folder(folder, [session], force) as scratch:
-            result = run(loaded, recorder=Tee(recordings(scratch)))
-            run_folder.write_with_page(result, scratch)
-    except Exception as error:  # whatever befalls one session, the others go on
-        kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
-        told = f"{kind}{' '.join(str(error).split())}"
-        return {"session": str(session), "run": None, "error": told, "bad_input": isinstance(error, InputError)}
-    um = MICROMETRES[result.session.length_unit]
-    return {
-        "session": str(session),
-        "run": str(folder),
-        "error": None,
-        "bad_input": False,
-        "residual_um": result.residual_rms * um,
-        "registered_um": result.stages[2].rms * um,
-        "noise_floor_um": result.noise_floor * um,
-        "seconds": sum(s.seconds for s in result.stages),
-    }
+def _finish(rows: list[SessionRow], output: Path, as_json: bool) -> None:
+    """Tables, files, and how it ends.
 
-
-def _map(
-    sessions: list[Path], folders: list[Path], force: bool, workers: int, scheduler: str
-) -> Iterator[dict[str, Any]]:
-    one = partial(stitch_one, force=force)
-    if scheduler:
-        try:
-            client = import_module("distributed").Client(scheduler, timeout=10)
-        except ModuleNotFoundError:
-            raise InputError("--scheduler needs the package distributed: pip install distributed") from None
-        except OSError as error:
-            raise InputError(f"--scheduler {scheduler}: no answer ({error})") from None
-        absolute = [[p.resolve() for p in paths] for paths in (sessions, folders)]
-        yield from client.gather(client.map(one, *absolute))
-    elif workers > 1:
-        with ProcessPoolExecutor(workers) as pool:
-            yield from pool.map(one, sessions, folders)
+    Raises:
+        InputError, NoResultError: sessions have no result.
+    """
+    failed = [row for row in rows if row.error is not None]
+    if len(failed) < len(rows):
+        write_summary(rows, output)
+    if as_json:
+        emit(to_json(document(rows)))
     else:
-        yield from map(one, sessions, folders)
-
-
-def _show(rows: list[dict[str, Any]]) -> None:
-    terminal, table = console(), Table()
-    for heading in ("session", "one hand-eye", "registered", "noise", "seconds"):
-        table.add_column(heading, justify="left" if heading == "session" else "right")
-    for row in rows:
-        keys = ("residual_um", "registered_um", "noise_floor_um")
-        told = ["–"] * 3 if row["error"] else [length_text(row[key] / 1e3, "mm", zeros=True) for key in keys]
-        table.add_row(Path(row["session"]).name, *told, "–" if row["error"] else f"{row['seconds']:.1f}")
-    terminal.print(table)
-    for row in rows:
-        if row["error"]:
-            terminal.print(f"{row['session']}: {row['error']}", soft_wrap=True)
+        show_table(rows)
+        console().print(sentence(rows), soft_wrap=True, style="bold")
+        show_files(output, (PAGE, DOCUMENT))
+    if failed:
+        kind = InputError if all(row.bad_input for row in failed) else NoResultError
+        raise kind(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")

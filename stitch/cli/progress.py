@@ -1,13 +1,11 @@
 """Progress on a terminal, as one of the recorders."""
 
 import time
-from collections.abc import Sequence
 from math import isfinite
 
 from stitch.cli.live_line import live_line
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.runs.recorder import Recorder
 from stitch.runs.run import Run, StageResult
 from stitch.units import length_text
 
@@ -41,30 +39,3 @@ class Progress:
         """How many iterations there will be nobody knows: the time that has passed."""
         seconds = round(time.monotonic() - self.begun)
         live_line().say(f"{text}; {seconds // 60}:{seconds % 60:02d}")
-
-
-class Tee:
-    """Several recorders at once."""
-
-    def __init__(self, recorders: Sequence[Recorder]) -> None:
-        self.recorders = recorders
-
-    def start(self, session: Session) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.start(session)
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.iteration(stage, index, poses, rms, gate)
-
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.stage(result, poses, residuals)
-
-    def finish(self, run: Run) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.finish(run)

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stitch.cli.options import EffectsFile, Force, Json, Tolerance, Trust, require_tolerance
-from stitch.cli.progress import Progress, Tee
+from stitch.cli.progress import Progress
 from stitch.cli.progress_lines import ProgressLines, wanted
 from stitch.cli.run_summary import show
 from stitch.cli.streams import emit
@@ -22,10 +21,12 @@ from stitch.model.model_toml import ModelFile, write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.recorder import Recorder
+from stitch.runs.tee import Tee
 from stitch.stored.trusted_model import trusted_model
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.mesh import write_mesh
+from stitch.writing.recordings import recordings
 from stitch.writing.result_document import model_of, result_document
 from stitch.writing.run_contents import FILES
 
@@ -147,8 +148,3 @@ def recorder_for(folder: Path, recording: bool) -> Recorder:
     """Progress on a terminal or as lines, and the recording."""
     lines: list[Recorder] = [ProgressLines()] if wanted() else []
     return Tee([Progress(), *lines, *(recordings(folder) if recording else [])])
-
-
-def recordings(folder: Path) -> list[Recorder]:
-    """What other packages record of a run."""
-    return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]

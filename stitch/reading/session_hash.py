@@ -18,13 +18,22 @@ def session_hash(session: Session) -> str:
     A dash where the session does not lie on disk any more.
     """
     try:
-        files = [session.path / name for name in _TABLES if (session.path / name).is_file()]
-        with open(session.path / "views.csv", encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-        files += [session.path / row["cloud"].strip() for row in rows if row.get("cloud")]
+        files = measured_files(session.path)
     except (OSError, ValueError, csv.Error):
         return UNKNOWN
     return content_hash(session.path, files)
+
+
+def measured_files(folder: Path) -> list[Path]:
+    """The tables of a session's folder and the clouds that they name.
+
+    Raises:
+        OSError, ValueError, csv.Error: views.csv cannot be read.
+    """
+    files = [folder / name for name in _TABLES if (folder / name).is_file()]
+    with open(folder / "views.csv", encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file, skipinitialspace=True))
+    return files + [folder / row["cloud"].strip() for row in rows if row.get("cloud")]
 
 
 def content_hash(folder: Path, files: Sequence[Path]) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stitch.errors import InputError
+from stitch.errors import BusyError
 
 try:
     import fcntl
@@ -23,7 +23,7 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
         what: what is written, for the message.
 
     Raises:
-        InputError: another process holds it.
+        BusyError: another process holds it.
     """
     if lock in _held:
         _held[lock] += 1
@@ -50,7 +50,7 @@ def _locked(lock: Path, what: Path) -> int:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(descriptor)
-            raise InputError(
+            raise BusyError(
                 f"{what}: another stitch is writing there; wait until it has ended, or name another folder"
             ) from None
         except OSError:

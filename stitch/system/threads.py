@@ -19,10 +19,21 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_processes = 1
+
+
+def share_cores(processes: int) -> None:
+    """Leave the cores to so many processes like this one, before the first `parallel`."""
+    global _processes
+    _processes = processes
+
+
 @cache
 def _pool() -> ThreadPoolExecutor:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(max_workers=cores, thread_name_prefix="stitch", initializer=library_threads_off)
+    return ThreadPoolExecutor(
+        max_workers=max(cores // _processes, 1), thread_name_prefix="stitch", initializer=library_threads_off
+    )
 
 
 def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> Iterator[Result]:
