@@ -41,20 +41,21 @@ def mark(job: Job, content: str | None, folder: Path) -> None:
         file.write_text(json.dumps(told) + "\n", encoding="utf-8")
 
 
-def finished(job: Job, content: str | None) -> bool:
-    """True if the folder holds a run of this very content, whatever was added to its model since.
+def finished(job: Job, content: str | None) -> str | None:
+    """The batch that has run a session, if the folder holds a run of this very content; effects may have joined it.
 
     Of a batch that runs all again, only what it has run itself is finished.
     """
     if content is None or sessions_in(job.run) != [str(job.session.resolve())]:
-        return False
+        return None
     try:
         told = json.loads((job.run / MARK).read_text(encoding="utf-8"))
         # A later `stitch run` leaves the mark, and begins the history of the model anew.
         own = told["began_with"] == _first_step(job.run) and told["format"] == _FORMAT
-        return bool(own and told["content"] == content and (not job.force or told["batch"] == job.batch))
+        whole = own and told["content"] == content and (not job.force or told["batch"] == job.batch)
+        return str(told["batch"]) if whole else None
     except (OSError, ValueError, LookupError, TypeError, InputError):
-        return False
+        return None
 
 
 def _first_step(folder: Path) -> str:

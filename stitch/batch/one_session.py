@@ -30,10 +30,11 @@ def run_session(job: Job) -> SessionRow:
         require_free(job.run, [job.session], job.force)
         with _held(job.run):
             content = content_of(job.session)
-            found = finished(job, content)
-            if not found:
+            batch = finished(job, content)
+            if batch is None:
                 _stitch(job, content)
-            return row_of(job.session, job.run, skipped=found)
+            # A worker may die between a run and its answer; the next finds a run of this batch.
+            return row_of(job.session, job.run, skipped=batch not in (None, job.batch))
     except Exception as error:  # whatever befalls one session, the others go on
         return failed_row(job.session, job.run, error)
 

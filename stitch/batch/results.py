@@ -38,29 +38,37 @@ def results(
         if not client.scheduler_info()["workers"]:
             say(f"{scheduler} has no workers yet; waiting for one (dask worker {scheduler})")
         at_once = sessions_at_once(client)
-        yield from _from_workers(client, [replace(job, at_once=at_once) for job in jobs])
+        yield from rows_from(client, [replace(job, at_once=at_once) for job in jobs])
 
 
-def _from_workers(client: Any, jobs: Sequence[Job]) -> Iterator[SessionRow]:
-    """All at once; then, one after the other, those whose workers died.
+def rows_from(
+    client: Any, jobs: Sequence[Job], work: Callable[[Job], SessionRow] = run_session
+) -> Iterator[SessionRow]:
+    """Rows from the workers of a client: all jobs at once; then, one after the other, those whose workers died.
 
     Who has killed a worker is not certain where several sessions were with it, and what is too large beside another
     may have room alone.
     """
     # One group of tasks: the scheduler keeps them, and hands a worker no second one while it has one.
     keys = [(f"stitch-{job.batch}", job.run.name) for job in jobs]
-    futures = client.map(run_session, jobs, key=keys, pure=False)
+    futures = client.map(work, jobs, key=keys, pure=False)
     job_of = dict(zip(futures, jobs, strict=True))
     suspected = []
-    for future in import_module("distributed").as_completed(futures):
-        job = job_of.pop(future)
-        row = _row(future, job)
-        if row is None:
-            suspected.append(job)
-        else:
-            yield row
+    for done in import_module("distributed").as_completed(futures).batches():
+        # Fetched together: one by one a scheduler would be busy with that alone.
+        whole = [future for future in done if future.status == "finished"]
+        told = dict(zip(whole, client.gather(whole), strict=True))
+        for future in done:
+            job = job_of.pop(future)
+            row = told.get(future) or _row(future, job)
+            # The scheduler need not keep what has been told.
+            future.release()
+            if row is None:
+                suspected.append(job)
+            else:
+                yield row
     for job in suspected:
-        alone = client.submit(run_session, job, key=(f"stitch-{job.batch}-alone", job.run.name), pure=False)
+        alone = client.submit(work, job, key=(f"stitch-{job.batch}-alone", job.run.name), pure=False)
         yield _row(alone, job) or failed_row(job.session, job.run, _KILLED)
 
 
@@ -76,6 +84,3 @@ def _row(future: Any, job: Job) -> SessionRow | None:
             case "CancelledError" | "FutureCancelledError":
                 return failed_row(job.session, job.run, _GONE)
         return failed_row(job.session, job.run, error)
-    finally:
-        # The scheduler need not keep what has been told.
-        future.release()
