@@ -2,23 +2,11 @@
 
 from pathlib import Path
 from typing import Annotated
-from uuid import uuid4
 
 import typer
 
-from stitch.batch.job import Job
-from stitch.batch.results import results
-from stitch.batch.session_row import SessionRow
-from stitch.batch.summary import DOCUMENT, PAGE, document, sentence, write_summary
-from stitch.cli.batch_table import show_files, show_row, show_table
 from stitch.cli.options import Json
-from stitch.cli.streams import emit
-from stitch.errors import InputError, NoResultError
-from stitch.reading.session_toml import document as session_document
-from stitch.reading.session_toml import name_of
-from stitch.system.console import console
-from stitch.system.steps import steps
-from stitch.writing.json_file import to_json
+from stitch.errors import InputError
 
 
 def batch(
@@ -43,62 +31,7 @@ def batch(
     """
     if scheduler and workers > 1:
         raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")
-    jobs = _jobs(sessions, output, force, recording)
-    rows: dict[str, SessionRow] = {}
-    try:
-        for row in steps("sessions", results(jobs, workers, scheduler, console().print), len(jobs)):
-            rows[row.name] = row
-            show_row(row, len(rows), len(jobs))
-    except KeyboardInterrupt:
-        raise NoResultError(
-            f"stopped with {len(rows)} of {len(jobs)} sessions told; what is finished is kept, and the same command "
-            "goes on from there"
-        ) from None
-    _finish([rows[job.run.name] for job in jobs], output, as_json)
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.batch_sessions import run_batch
 
-
-def _jobs(sessions: list[Path], output: Path, force: bool, recording: bool) -> list[Job]:
-    """A job a session.
-
-    Raises:
-        InputError: two sessions, or a session and a file of the batch, would have the same place.
-    """
-    names = [_name(path) for path in sessions]
-    if len(set(names)) < len(names):
-        twice = max(names, key=names.count)
-        raise InputError(f"two of the sessions are named {twice!r}; run them with -o of their own")
-    if taken := {DOCUMENT, PAGE} & set(names):
-        raise InputError(f"a session is named {taken.pop()!r}, as a file of the batch is; give it another name")
-    here, token = output.resolve(), uuid4().hex
-    return [
-        Job(path.resolve(), here / name, token, force, recording) for path, name in zip(sessions, names, strict=True)
-    ]
-
-
-def _name(session: Path) -> str:
-    """What the session is called; a session that cannot be read is refused when it is its turn."""
-    try:
-        file = session / "session.toml"
-        return name_of(file, session_document(file))
-    except InputError:
-        return session.resolve().name
-
-
-def _finish(rows: list[SessionRow], output: Path, as_json: bool) -> None:
-    """Tables, files, and how it ends.
-
-    Raises:
-        InputError, NoResultError: sessions have no result.
-    """
-    failed = [row for row in rows if row.error is not None]
-    if len(failed) < len(rows):
-        write_summary(rows, output)
-    if as_json:
-        emit(to_json(document(rows)))
-    else:
-        show_table(rows)
-        console().print(sentence(rows), soft_wrap=True, style="bold")
-        show_files(output, (PAGE, DOCUMENT))
-    if failed:
-        kind = InputError if all(row.bad_input for row in failed) else NoResultError
-        raise kind(f"{len(failed)} of {len(rows)} sessions have no result; their lines say why")
+    run_batch(sessions, output, workers, scheduler, force=force, recording=recording, as_json=as_json)

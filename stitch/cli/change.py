@@ -9,7 +9,7 @@ from rich.table import Table
 
 from stitch.cli.diagnose import write_diagnosis
 from stitch.cli.options import EffectsFile, Json, Trust
-from stitch.cli.run import recorder_for
+from stitch.cli.recorders import recorder_for
 from stitch.cli.streams import emit
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import plain_verdict

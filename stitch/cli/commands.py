@@ -11,6 +11,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from stitch.cli.command_help import help_of
 from stitch.cli.streams import results_alone
 
 GROUP = "stitch.commands"
@@ -60,6 +61,11 @@ class Commands(MutableMapping[str, Any]):
     def __len__(self) -> int:
         return len(self._entries)
 
+    def unloaded(self) -> dict[str, TyperCommand]:
+        """All of them by name with what they are for, as a list shows them; only what does not say so is loaded."""
+        told = {name: help_of(entry) for name, entry in self._entries.items()}
+        return {name: TyperCommand(name, help=text) if text else self[name] for name, text in told.items()}
+
 
 def _loaded(entry: EntryPoint) -> Any:
     """The command behind an entry; a `typer.Typer` is a group of commands."""
@@ -78,7 +84,15 @@ class CommandGroup(TyperGroup):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.commands = Commands()
+        self.commands: Any = Commands()
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """The list of commands, without waiting for the libraries of all."""
+        loaded, self.commands = self.commands, self.commands.unloaded()
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self.commands = loaded
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Names alone: whoever presses the tab key does not wait for the libraries of all commands."""

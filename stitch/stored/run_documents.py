@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jsonschema import Draft202012Validator
-from jsonschema.exceptions import best_match
 
 from stitch.errors import InputError
 from stitch.model.effects_covariance import EffectsCovariance
@@ -146,6 +144,10 @@ def ledger_steps(folder: Path) -> tuple[LedgerStep, ...]:
 
 
 def _checked(file: Path, schema: dict[str, Any]) -> Any:
+    # Loaded by who reads a run: most that only write one do not.
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import best_match
+
     told = read_text(file, "name a run folder that `stitch run` wrote")
     try:
         document = json.loads(told, parse_constant=_refused)

@@ -6,14 +6,31 @@ import sys
 
 import pytest
 
-DEAR = {"scipy.stats", "matplotlib", "rerun", "trimesh", "open3d", "dask", "cv2"}
+DEAR = {"scipy.stats", "matplotlib", "rerun", "trimesh", "open3d", "dask", "distributed", "cv2", "jsonschema"}
+# What a command needs to say what it could do.
+LIGHT = DEAR | {"numpy", "scipy", "pyarrow", "asyncio"}
+
+
+def loaded(code):
+    """Modules of a process that has run some code."""
+    told = f"import json, sys\n{code}\nprint('modules', json.dumps(list(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", told], capture_output=True, check=True, text=True).stdout
+    return set(json.loads(out.rpartition("modules ")[2]))
 
 
 @pytest.mark.parametrize(
     ("module", "also_without"),
-    [("stitch", {"numpy"}), ("stitch.cli.main", {"numpy", "scipy"}), ("stitch.cli.run", set())],
+    [("stitch", {"numpy"}), ("stitch.cli.main", LIGHT), ("stitch.cli.run_sessions", set())],
 )
 def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
-    code = f"import json, sys; import {module}; print(json.dumps(list(sys.modules)))"
-    loaded = set(json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))
-    assert not loaded & (DEAR | also_without)
+    assert not loaded(f"import {module}") & (DEAR | also_without)
+
+
+@pytest.mark.parametrize("line", ["--version", "--help", "run --help", "batch --help"])
+def test_help_loads_no_mathematics(line):
+    code = f"from stitch.cli.main import main\ntry:\n    main({line.split()})\nexcept SystemExit:\n    pass"
+    assert not loaded(code) & LIGHT
+
+
+def test_a_batch_on_one_process_needs_no_cluster():
+    assert not loaded("import stitch.cli.batch_sessions") & {"distributed", "dask", "tornado", "asyncio"}

@@ -1,0 +1,15 @@
+"""Who watches a command work: the terminal, a program that reads lines, and the recording."""
+
+from pathlib import Path
+
+from stitch.cli.progress import Progress
+from stitch.cli.progress_lines import ProgressLines, wanted
+from stitch.runs.recorder import Recorder
+from stitch.runs.tee import Tee
+from stitch.writing.recordings import recordings
+
+
+def recorder_for(folder: Path, recording: bool) -> Recorder:
+    """Progress on a terminal or as lines, and the recording."""
+    lines: list[Recorder] = [ProgressLines()] if wanted() else []
+    return Tee([Progress(), *lines, *(recordings(folder) if recording else [])])
