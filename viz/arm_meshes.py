@@ -1,12 +1,16 @@
 """The arm as its makers drew it, at one view, where the session's URDF names meshes."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import rerun as rr
-import trimesh
 
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.robot import LinkMesh, Robot, link_frames
+
+if TYPE_CHECKING:
+    import trimesh
 
 _PAINT = (176, 182, 190)
 # A recording is to be mailed: an arm of more triangles is shown as the chain of its joints alone.
@@ -34,7 +38,10 @@ def log_meshes(recording: rr.RecordingStream, robot: Robot, joints: Array) -> No
         recording.log(f"robot/links/{own.link} {own.file.stem} {i}", shown, static=True)
 
 
-def _read(own: LinkMesh) -> trimesh.Trimesh | None:
+def _read(own: LinkMesh) -> "trimesh.Trimesh | None":
+    # Few sessions bring meshes: the others do not wait for their library.
+    import trimesh
+
     try:
         mesh = trimesh.load(own.file, force="mesh")
     except Exception:  # whatever a reader of some format meets in a file of a stranger

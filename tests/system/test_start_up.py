@@ -32,5 +32,9 @@ def test_help_loads_no_mathematics(line):
     assert not loaded(code) & LIGHT
 
 
+def test_an_arm_without_meshes_needs_no_library_of_meshes():
+    assert "trimesh" not in loaded("import viz.recording, viz.run_page")
+
+
 def test_a_batch_on_one_process_needs_no_cluster():
     assert not loaded("import stitch.cli.batch_sessions") & {"distributed", "dask", "tornado", "asyncio"}
