@@ -1,6 +1,6 @@
 """Rows of a batch in the order in which they are finished."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from importlib import import_module
@@ -20,12 +20,12 @@ _GONE = NoResultError("the scheduler has gone; to fix: start the same batch agai
 
 
 def results(
-    jobs: Sequence[Job], workers: int = 1, scheduler: str = "", say: Callable[[str], None] = print
-) -> Iterator[SessionRow]:
+    jobs: Sequence[Job], workers: int = 1, scheduler: str = "", say: Callable[[str], object] = str
+) -> Generator[SessionRow]:
     """Run the jobs on this process, on so many, or on those of a scheduler; rows as they come.
 
     Args:
-        say: is told what somebody has to know meanwhile.
+        say: is told what somebody has to know meanwhile; by default nobody is.
 
     Raises:
         InputError: the packages for more than one process are missing, or the scheduler does not answer.
@@ -33,7 +33,9 @@ def results(
     if workers == 1 and not scheduler:
         yield from map(run_session, jobs)
         return
-    opened: AbstractContextManager[Any] = joined_client(scheduler) if scheduler else local_client(workers)
+    opened: AbstractContextManager[Any] = (
+        joined_client(scheduler) if scheduler else local_client(min(workers, len(jobs)))
+    )
     with opened as client:
         if not client.scheduler_info()["workers"]:
             say(f"{scheduler} has no workers yet; waiting for one (dask worker {scheduler})")

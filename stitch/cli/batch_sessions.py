@@ -1,5 +1,6 @@
 """What `stitch batch` does: a job a session, and what is said of them."""
 
+from contextlib import closing
 from pathlib import Path
 from uuid import uuid4
 
@@ -28,9 +29,11 @@ def run_batch(
     jobs = _jobs(sessions, output, force, recording)
     rows: dict[str, SessionRow] = {}
     try:
-        for row in steps("sessions", results(jobs, workers, scheduler, console().print), len(jobs)):
-            rows[row.name] = row
-            show_row(row, len(rows), len(jobs))
+        # Whatever ends the loop ends the workers.
+        with closing(results(jobs, workers, scheduler, console().print)) as coming:
+            for row in steps("sessions", coming, len(jobs)):
+                rows[row.name] = row
+                show_row(row, len(rows), len(jobs))
     except KeyboardInterrupt:
         raise NoResultError(
             f"stopped with {len(rows)} of {len(jobs)} sessions told; what is finished is kept, and the same command "
