@@ -7,6 +7,7 @@ import rerun as rr
 from matplotlib.figure import Figure
 
 from stitch import frames
+from stitch.cells.window.allowance import allowance_sentence
 from stitch.cells.window.deviation import Deviations
 from stitch.cells.window.window_jobs import FitJob
 from stitch.cells.window.window_solution import Part
@@ -25,9 +26,10 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
     pictures = []
     for i, part in enumerate(parts):
         of = f" of part {i + 1}" if len(parts) > 1 else ""
+        cad = "the CAD" if part.fit.allowance is None else "the CAD with its allowance"
         caption = (
             "The scan on the CAD, seen along the part's thinnest axis, outer and inner side alike. Red stands outside "
-            f"the CAD, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
+            f"{cad}, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
             "whose mean is beyond it."
         )
         pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
@@ -73,6 +75,8 @@ def sentence(parts: list[Part]) -> str:
             sentences.append(
                 f"{name} is found; {where}, and all {len(bad)} cells are within {part.deviations.tolerance:g}."
             )
+        if part.fit.allowance is not None:
+            sentences.append(allowance_sentence(part.fit.allowance))
     return " ".join(sentences)
 
 
@@ -86,12 +90,25 @@ def _tables(parts: list[Part]) -> list[Table]:
         poses.append((str(i + 1), *place, *sizes, *shares))
     header = ("part", "x", "y", "z", "σ", "σ (°)", "rms", "meets the CAD", "next best pose")
     tables = [Table("Where the parts lie", header, poses)]
+    tables += _allowances(parts)
     for i, part in enumerate(parts):
         worst = np.argsort(-np.abs(part.deviations.cells.mean))[:_WORST]
         rows = [_cell_row(part.deviations, k) for k in worst]
         title = "Worst cells" + (f" of part {i + 1}" if len(parts) > 1 else "")
         tables.append(Table(title, ("x", "y", "z", "deviation", "points", "verdict"), rows))
     return tables
+
+
+def _allowances(parts: list[Part]) -> list[Table]:
+    """Stock on the parts; no table where nobody spoke of it."""
+    rows = []
+    for i, part in enumerate(parts):
+        if (found := part.fit.allowance) is not None:
+            kind = "varying" if found.wanted.varying else "even" if found.wanted.free else "stated"
+            sizes = (f"{size:+.4f}" for size in (found.value, found.lowest, found.highest))
+            rows.append((str(i + 1), kind, *sizes, f"{found.sigma:.4f}", f"{found.told:.0%}"))
+    header = ("part", "allowance", "mean", "lowest", "highest", "σ of the mean", "told from a motion")
+    return [Table("Allowance: stock outside the CAD is plus", header, rows)] if rows else []
 
 
 def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:

@@ -1,12 +1,14 @@
 """Scan onto CAD: point to plane, robustly weighted, on points that look all ways."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
-from stitch.cells.window.biweight import MAD, TUKEY, biweight, biweight_slope
+from stitch.cells.window.allowance import Allowance, Wanted, columns
+from stitch.cells.window.allowance_fit import describe, ridge, spread_of, told_apart
+from stitch.cells.window.biweight import TUKEY, biweight, biweight_slope
 from stitch.cells.window.cad import Nearest, Surface, nearest
 from stitch.cells.window.cell_weights import cell_weights
 from stitch.cells.window.joined_scans import Joined
@@ -14,7 +16,7 @@ from stitch.cells.window.regions import Regions
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 
-_POINTS = 20_000
+_POINTS, _FEWEST = 20_000, 50
 _ROUNDS = 80
 # A step below this share of the part is none; and cells along the part for the second kind of weight.
 _STILL, _CELLS = 1e-7, 40
@@ -22,6 +24,7 @@ _STILL, _CELLS = 1e-7, 40
 _DIRECTIONS = 4
 # A surface that leaves a direction open by this share of the best one fixes no pose.
 _OPEN = 1e-6
+NONE = Wanted()
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,11 @@ class CadFit:
 
     T_base_part: Array  # (4, 4)
     covariance: Array  # (6, 6) of ξ about the CAD's centre, T·exp(ξ), rotation (rad) first
-    scale: float  # robust 1-sigma of the distances
-    rms: float  # of all distances of points that have a partner, deformed places too
+    scale: float  # robust 1-sigma of the distances less the allowance
+    rms: float  # of the same of all points that have a partner, deformed places too
     inliers: float  # share of the fit's points with weight above a half
     points: int
+    allowance: Allowance | None = None  # None: none was spoken of
 
     @property
     def sigma(self) -> Array:
@@ -41,8 +45,10 @@ class CadFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None = None) -> CadFit:
-    """Refine a coarse T_base_part (4, 4) until it stands still.
+def fit(
+    scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None = None, wanted: Wanted = NONE
+) -> CadFit:
+    """Refine a coarse T_base_part (4, 4) until it stands still, and with it the allowance if it is wanted.
 
     The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
     beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
@@ -51,35 +57,40 @@ def fit(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None 
     of its flanks alone hold it in its plane.
 
     Raises:
-        NoResultError: too few points meet the CAD, or the surface leaves a direction open.
+        NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
     """
     scan = scan.take(_all_ways(scan, T_base_part))
+    noise = scan.noise if np.isfinite(scan.noise) else 0.0
     scale, by_cell = cad.size / 100, False
+    numbers, size = np.zeros(wanted.columns), cad.size / 100
     for _ in range(_ROUNDS):
-        local, found, allowed = _look(scan, cad, T_base_part, regions)
-        used = found.accept & allowed
-        if used.sum() < 50:
-            raise NoResultError(f"{used.sum()} points meet the CAD; check the start, the regions and the CAD's unit")
+        seen = _look(scan, cad, T_base_part, regions, wanted)
+        rest = seen.distance - wanted.known - seen.stock @ numbers
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
-        spread = MAD * float(np.median(np.abs(found.distance[used])))
-        scale = max(spread, 0.5 * scale, scan.noise if np.isfinite(scan.noise) else 0.0)
-        weight = used * biweight(found.distance / (TUKEY * scale))
+        spread = spread_of(rest[seen.used], wanted)
+        scale = max(spread, 0.5 * scale, noise)
+        weight = seen.used * biweight(rest / (TUKEY * scale))
         if by_cell:
-            weight *= cell_weights(local, found, used, cad.size / _CELLS, scale)
-        step, design = _step(local, found, weight, cad)
-        T_base_part = moved_about(T_base_part, step, cad.centre)
-        if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, scan.noise):
+            weight *= cell_weights(seen.local, replace(seen.found, distance=rest), seen.used, cad.size / _CELLS, scale)
+        N = _normal_matrix(seen.design, weight, cad)
+        shrink, size = ridge(N, numbers, scale, size)
+        pull = np.concatenate([np.zeros(6), numbers]) * shrink
+        step = np.asarray(np.linalg.solve(N + np.diag(shrink), -seen.design.T @ (weight * rest) - pull), np.float64)
+        T_base_part, numbers = moved_about(T_base_part, step[:6], cad.centre), numbers + step[6:]
+        if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, noise):
             if by_cell:
                 break
             by_cell = True
-    distance = found.distance[used]
+    covariance = _sandwich(seen.design, rest, weight, scale, shrink)
+    left = rest[seen.used]
     return CadFit(
         T_base_part,
-        covariance=_sandwich(design, found.distance, weight, scale),
+        covariance=covariance[:6, :6],
         scale=scale,
-        rms=float(np.sqrt((distance**2).mean())),
-        inliers=float(np.mean(np.abs(distance) < 0.54 * TUKEY * scale)),
-        points=int(used.sum()),
+        rms=float(np.sqrt((left**2).mean())),
+        inliers=float(np.mean(np.abs(left) < 0.54 * TUKEY * scale)),
+        points=len(left),
+        allowance=describe(seen.local[seen.used], cad, wanted, numbers, covariance, N),
     )
 
 
@@ -89,12 +100,15 @@ def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
 
 
-def _sandwich(design: Array, distance: Array, weight: Array, scale: float) -> Array:
-    """Covariance (6, 6): the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7)."""
-    u = distance / (TUKEY * scale)
+def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: Array) -> Array:
+    """Covariance (6 + K, 6 + K): the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7).
+
+    What is shrunk is as large as believed, which is an error of its own.
+    """
+    u = rest / (TUKEY * scale)
     slope = np.where(weight > 0, weight / np.maximum(biweight(u), 1e-12) * biweight_slope(u), 0.0)
-    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design))
-    meat = np.einsum("ni,n,nj->ij", design, (weight * distance) ** 2, design)
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design) + np.diag(shrink))
+    meat = np.einsum("ni,n,nj->ij", design, (weight * rest) ** 2, design) + np.diag(shrink) * scale**2
     return np.asarray(inverse @ meat @ inverse)
 
 
@@ -120,22 +134,43 @@ def _quota(counts: Indices) -> int:
     return low
 
 
-def _look(
-    scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None
-) -> tuple[Array, Nearest, NDArray[np.bool_]]:
+@dataclass(frozen=True)
+class _Seen:
+    """N points at one pose: part frame, partners, which may count, and how distances answer."""
+
+    local: Array  # (N, 3)
+    found: Nearest
+    used: NDArray[np.bool_]  # (N,)
+    stock: Array  # (N, K) columns of the allowance
+    design: Array  # (N, 6 + K) of the twist about the CAD's centre and the allowance
+
+    @property
+    def distance(self) -> Array:
+        return self.found.distance
+
+
+def _look(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None, wanted: Wanted) -> _Seen:
     T = frames.inverse(T_base_part)
     local = frames.transform(T, scan.points)
     found = nearest(cad, local, frames.rotate(T, scan.normals))
-    allowed = np.ones(len(local), bool) if regions is None else regions.used(local)
-    return local, found, allowed
+    used = found.accept if regions is None else found.accept & regions.used(local)
+    if used.sum() < _FEWEST:
+        raise NoResultError(f"{used.sum()} points meet the CAD; check the start, the regions and the CAD's unit")
+    stock = columns(local, cad, wanted)
+    design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal, -stock])
+    return _Seen(local, found, used, stock, design)
 
 
-def _step(local: Array, found: Nearest, weight: Array, cad: Surface) -> tuple[Array, Array]:
-    """One Gauss-Newton step about the CAD's centre: twist (6,) and design (N, 6)."""
-    design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal])
+def _normal_matrix(design: Array, weight: Array, cad: Surface) -> Array:
+    """(6 + K, 6 + K) of a Gauss-Newton step: a twist about the CAD's centre, and the numbers of the allowance."""
     N = np.einsum("ni,n,nj->ij", design, weight, design)
     units = np.repeat([cad.size / 2, 1.0], 3)
-    values = np.linalg.eigvalsh(N / np.outer(units, units))
+    values = np.linalg.eigvalsh(N[:6, :6] / np.outer(units, units))
     if values[0] < _OPEN * values[-1]:
-        raise NoResultError("the scanned surface leaves a direction open (plane, cylinder or sphere); scan an edge too")
-    return np.linalg.solve(N, -design.T @ (weight * found.distance)), design
+        shift = ", and of a plate the allowance is a shift along its normal" if len(N) > 6 else ""
+        raise NoResultError(
+            f"the scanned surface leaves a direction open (plane, cylinder or sphere){shift}; scan an edge too"
+        )
+    if len(N) > 6:
+        told_apart(N)
+    return np.asarray(N)

@@ -1,4 +1,4 @@
-"""The deviation map: every scanned point's signed distance from the CAD, and cells that are out of tolerance."""
+"""The deviation map: signed distances of scanned points from the CAD with its stock, and cells out of tolerance."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from stitch import frames
 from stitch.cells.pose_table import write_columns
+from stitch.cells.window.allowance import Allowance
 from stitch.cells.window.cad import Surface, nearest
 from stitch.cells.window.joined_scans import Joined
 from stitch.frames import Array
@@ -42,12 +43,20 @@ class Deviations:
         return np.asarray(np.abs(self.cells.mean) > self.tolerance)
 
 
-def deviations(scan: Joined, cad: Surface, T_base_part: Array, tolerance: float, cell: float) -> Deviations:
-    """Distances of all usable points; cells of the edge length `cell` average the noise away."""
+def deviations(
+    scan: Joined, cad: Surface, T_base_part: Array, tolerance: float, cell: float, allowance: Allowance | None = None
+) -> Deviations:
+    """Distances of all usable points from the CAD, or from the CAD with its allowance; cells average the noise away.
+
+    Args:
+        cell: edge length of the cells.
+    """
     T = frames.inverse(T_base_part)
     local = frames.transform(T, scan.points[scan.usable])
     found = nearest(cad, local, frames.rotate(T, scan.normals[scan.usable]))
     points, distance, normal = local[found.accept], found.distance[found.accept], found.normal[found.accept]
+    if allowance is not None:
+        distance = distance - allowance.at(points)
     key = np.hstack([np.floor(points / cell), np.round(normal)]).astype(np.int64)
     _, where, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     where = where.ravel()

@@ -1,6 +1,7 @@
 """`stitch fit JOB`: where the parts lie, how they differ from their CAD, and the robot path that follows them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
 from stitch.cells.window import fit_parts, read_fit_job, scan_session
+from stitch.cells.window.allowance import allowance_sentence, read_allowance
 from stitch.cells.window.window_solution import Part, fit_document, write_fit
 from stitch.system.console import console
 from stitch.writing.session_files import write_session
@@ -21,6 +23,12 @@ def fit(
     recording: RecordingOption = None,
     report: ReportOption = None,
     session: SessionOption = None,
+    allowance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
 ) -> None:
     """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
@@ -28,8 +36,10 @@ def fit(
     \b
     Examples:
       stitch fit fit.toml --report page.html
+      stitch fit casting.toml --allowance free
     """
-    job = read_fit_job(file)
+    wanted = read_allowance(allowance)
+    job = replace(read_fit_job(file), wanted=wanted)
     parts = fit_parts(job)
     written = write_fit(job, parts, output) if output is not None else []
     if session is not None:
@@ -52,6 +62,8 @@ def _print(terminal: Console, number: int, part: Part) -> None:
         f"Part {number}: origin {x:.3f} {y:.3f} {z:.3f} in the base, σ {found.sigma[3:].max():.4f} and "
         f"{np.degrees(found.sigma[:3]).max():.5f}°; distances {found.scale:.3f} robust, {found.rms:.3f} rms."
     )
+    if found.allowance is not None:
+        terminal.print(f"  {allowance_sentence(found.allowance)}")
     if part.start.runner_up > 0.9 * part.start.share:
         terminal.print(
             f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part "

@@ -1,7 +1,7 @@
 """Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from stitch import frames
 from stitch.cells.csv_table import read_columns, refuse_twice
 from stitch.cells.job_toml import check_keys, choice, file_beside, finite, read_job_file, vectors
 from stitch.cells.pose_table import COLUMNS, from_columns, pose_of
+from stitch.cells.window.allowance import Wanted
 from stitch.cells.window.cad import Surface, read_cad
 from stitch.cells.window.joined_scans import Joined, Placed, assemble, read_session, read_table
 from stitch.cells.window.regions import Box, Regions
@@ -40,6 +41,7 @@ class FitJob:
     T_base_part_nominal: Array | None  # (4, 4)
     path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
     file: Path | None = None  # that was read
+    wanted: Wanted = field(default_factory=Wanted)  # of the stock on the part
 
 
 @dataclass(frozen=True)

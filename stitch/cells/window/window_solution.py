@@ -9,6 +9,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.pose_table import COLUMNS, to_numbers, write_columns, write_poses
+from stitch.cells.window.allowance import Allowance
 from stitch.cells.window.cad_fit import CadFit, fit
 from stitch.cells.window.cad_start import Start, find_start
 from stitch.cells.window.deviation import Deviations, deviations, write_csv, write_ply
@@ -44,7 +45,7 @@ def fit_parts(job: FitJob) -> list[Part]:
 
 def _part(job: FitJob, scan: Any) -> Part:
     start = find_start(scan, job.cad)
-    found = fit(scan, job.cad, start.T_base_part, job.regions)
+    found = fit(scan, job.cad, start.T_base_part, job.regions, job.wanted)
     T = frames.inverse(found.T_base_part)
     local, normals = frames.transform(T, scan.points[scan.usable]), frames.rotate(T, scan.normals[scan.usable])
     covered = {box.name: coverage(box, job.cad, local, normals) for box in job.regions.expected}
@@ -58,7 +59,9 @@ def _part(job: FitJob, scan: Any) -> Part:
     path = None
     if job.path is not None and job.T_base_part_nominal is not None:
         path = correct_path(job.path[1], job.T_base_part_nominal, found.T_base_part)
-    mapped = deviations(scan, job.cad, found.T_base_part, tolerance=job.tolerance, cell=job.cell)
+    mapped = deviations(
+        scan, job.cad, found.T_base_part, tolerance=job.tolerance, cell=job.cell, allowance=found.allowance
+    )
     return Part(start, found, mapped, coverage=covered, forbidden=forbidden, path=path)
 
 
@@ -87,6 +90,19 @@ def _part_document(part: Part) -> dict[str, Any]:
         "worst": None if worst is None else {"at": cells.middle[worst].tolist(), "deviation": float(cells.mean[worst])},
         "coverage": part.coverage,
         "points_in_forbidden": part.forbidden,
+        **({} if part.fit.allowance is None else {"allowance": _allowance_document(part.fit.allowance)}),
+    }
+
+
+def _allowance_document(found: Allowance) -> dict[str, Any]:
+    return {
+        "value": found.value,
+        "sigma": found.sigma,
+        "kind": "varying" if found.wanted.varying else "free" if found.wanted.free else "stated",
+        "lowest": found.lowest,
+        "highest": found.highest,
+        "sigma_field": found.sigma_field,
+        "told_apart": found.told,
     }
 
 
