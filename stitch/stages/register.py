@@ -1,18 +1,14 @@
 """Register what the hand-eye cannot explain: all views at once, each held by the robot's pose.
 
-The fit is "DPWVM-style". Source A names DPWVM without a formula; from its published relatives come
-the variance of signed point-to-plane distances (VMM) and the separate weighting of both signs by
-the distance to their weighted means (WPMAVM). Choices made here: S± = {±d ≥ 0}, weights
-exp(−(d−μ±)²/2σ±²) with robust σ± about the weighted means μ±, divided by the local density and
-multiplied by the confidence of the incidence, and the cost Var(d) + λ·mean(d)² with λ = 1, which is
-the weighted mean of d². λ < 1 would ignore an offset common to all points: right against CAD with an
-unknown allowance, blind to the very steps that view-to-view stitching has to close.
+Correspondences weigh as `correspondence_weights.py` says. The cost is the weighted mean of d² = Var(d) + mean(d)²: an
+offset common to all points of a pair is the very step that stitching has to close, so it counts in full (λ = 1).
+Against CAD with an unknown allowance it does not (`cells/window`).
 
-Solving all views together leaves no drift around a loop. The prior is each view's pose from the
-robot, with the scatter that the overlaps themselves show (REML).
+Solving all views together leaves no drift around a loop. The prior is each view's pose from the robot, with the
+scatter that the overlaps themselves show (REML).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,17 +16,18 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.gram import assemble, gram
+from stitch.observations.surfaces.gram import Gram, assemble, gram
 from stitch.observations.surfaces.match import Match, sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.surfaces.target_pairs import joined
 from stitch.runs.recorder import Recorder, Silent
-from stitch.statistics.robust import MAD_TO_SIGMA
+from stitch.stages.correspondence_weights import plane_weights
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
+# Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
+Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 
 
 @dataclass(frozen=True)
@@ -41,29 +38,6 @@ class Registration:
     corrections: Array  # (V, 6) twists in the reference frame: poses = exp(corrections) @ model poses
     overlaps: Overlaps
     history: tuple[float, ...]
-
-
-def sign_weights(d: Array, base: Array) -> Array:
-    """Weights of the "plus and minus" family for signed distances d (M,) and base weights (M,)."""
-    weight = np.array(base, float)
-    for side in (d >= 0, d < 0):
-        if side.sum() < 8:
-            continue
-        mean = np.average(d[side], weights=base[side])
-        sigma = MAD_TO_SIGMA * np.median(np.abs(d[side] - mean))
-        weight[side] *= np.exp(-((d[side] - mean) ** 2) / (2 * max(sigma, 1e-12) ** 2))
-    return weight
-
-
-def pair_weights(matches: Sequence[Match], scans: Sequence[Scan]) -> list[Array]:
-    """DPWVM-style weights of every correspondence, the signs judged over all pairs together."""
-    base = []
-    for m in matches:
-        area = scans[m.v].area[m.index_v] * scans[m.w].area[m.index_w]
-        # Density varies by orders of magnitude at mixed ranges; no point may dominate.
-        base.append(m.weight * np.clip(np.sqrt(area / np.median(area)), 0.2, 5.0))
-    weights = sign_weights(np.concatenate([m.residual for m in matches]), np.concatenate(base))
-    return np.split(weights, np.cumsum([len(m.residual) for m in matches])[:-1])
 
 
 def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
@@ -80,6 +54,7 @@ def register(
     gate: float,
     recorder: Recorder | None = None,
     start: Array | None = None,
+    weigh: Weighing = plane_weights,
 ) -> Registration:
     """Move every view by its own twist until the overlaps agree.
 
@@ -88,12 +63,12 @@ def register(
         scatter: prior of the flange poses and the factor on the overlap noise.
         gate: first distance between partners, length_unit.
         start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
+        weigh: what every correspondence counts.
 
     Raises:
         NoResultError: no two views overlap.
     """
     recorder = recorder or Silent()
-    views = len(capture.scans)
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
     poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
     for index in range(_MAXIMUM_ITERATIONS):
@@ -101,9 +76,7 @@ def register(
         history.append(overlaps.gram.rms)
         recorder.iteration("register", index, poses, overlaps.gram.rms, gate)
         centre = overlaps.gram.centre
-        weights = pair_weights(overlaps.matches, capture.scans)
-        surfaces = gram(overlaps.matches, views, centre, overlaps.gram.scale, weights)
-        g = joined(surfaces, overlaps.targets, capture.noise_factor)
+        g = _weighed(overlaps, capture, weigh(overlaps.matches, capture, poses))
         to_centre = frames.make(np.eye(3), -centre)
         moved = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
         step = _step(g.variance * scatter.noise_factor, assemble(g), prior_precision(capture, scatter, centre), moved)
@@ -116,6 +89,13 @@ def register(
     final = collect(capture, poses, gate, picked)
     corrections = frames.log(poses @ frames.inverse(model_poses))
     return Registration(poses, corrections, final, (*history, final.gram.rms))
+
+
+def _weighed(overlaps: Overlaps, capture: Capture, weights: Sequence[Array]) -> Gram:
+    """The normal equations of the overlaps under other weights."""
+    old = overlaps.gram
+    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
+    return joined(surfaces, overlaps.targets, capture.noise_factor)
 
 
 def _held(start: Array, model_poses: Array) -> Array:

@@ -19,7 +19,7 @@ from stitch.stages.coarse import coarse
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse, view_residuals
 from stitch.stages.observability import unobservable
-from stitch.stages.register import register, sign_weights
+from stitch.stages.register import register
 
 
 def at_part(capture: Capture, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,15 +155,6 @@ def test_view_residuals_show_a_shifted_view():
     spread = [np.nanmedian(np.abs(r[s.usable])) for r, s in zip(residuals, capture.scans, strict=True)]
     assert int(np.argmax(spread)) == 3
     assert [len(r) for r in residuals] == [len(s.points) for s in capture.scans]
-
-
-def test_sign_weights_follow_each_side_and_spare_the_middle():
-    rng = np.random.default_rng(0)
-    d = np.concatenate([rng.normal(0, 0.02, 5000), [1.0, -1.0]])
-    w = sign_weights(d, np.ones(len(d)))
-    assert w[-2:].max() < 1e-6
-    assert w[:-2].min() > 0
-    assert np.average(d, weights=w) == pytest.approx(0, abs=2e-3)
 
 
 def test_no_overlap_is_a_result_with_a_reason():

@@ -1,0 +1,111 @@
+"""Register under other weights on measured objects and on the demo's blade: the second table of docs/register.md.
+
+Usage: python bench/register_real.py PATH_OF_REGHEC_SESSIONS [--write]
+
+What is compared is what the weights did not see: points of every view that were no samples of the fit, their distances
+inside four robust sigmas. Beside them stands how far the poses lie from those of the first weights, and the sigma that
+the normal equations and the robot's prior give those.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from register_weights import PAGE
+from weighings import WEIGHINGS
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.scene import load_scene
+from data_synth.simulate import simulate
+from stitch import frames
+from stitch.frames import Array, Indices
+from stitch.measurement.capture import Capture, capture, part_size
+from stitch.measurement.scan import Scan
+from stitch.measurement.session import Session
+from stitch.observations.surfaces.gram import assemble
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
+from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.reading.session_folder import load_session
+from stitch.stages.coarse import coarse
+from stitch.stages.correct import correct
+from stitch.stages.register import Registration, prior_precision, register
+
+OBJECTS = ("david", "cone", "sphere", "rubik", "gripperopen")
+SHOWN = ("GICP inside Tukey", "Tukey", "sign classes")
+BEGIN, END = "<!-- real: begin -->", "<!-- real: end -->"
+
+
+def left_out(scan: Scan) -> Indices:
+    """As many points as the fit samples, none of them among its own."""
+    others = np.setdiff1d(np.flatnonzero(scan.usable), sample(scan, FINE_SAMPLES))
+    return others[np.linspace(0, len(others) - 1, min(len(others), FINE_SAMPLES)).astype(int)]
+
+
+def spread(own: Capture, found: Registration, scatter: Repeatability) -> Array:
+    """(6V, 6V) covariance of the views' twists about the centre of the overlaps."""
+    g = found.overlaps.gram
+    H = assemble(g)[0] / (g.variance * scatter.noise_factor)
+    for v, precision in enumerate(prior_precision(own, scatter, g.centre)):
+        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
+    return np.linalg.inv(H)
+
+
+def apart(found: Registration, other: Registration) -> Array:
+    """(V, 3) displacement at the centre of the part, less what all views share."""
+    to_centre = frames.make(np.eye(3), -found.overlaps.gram.centre)
+    xi = frames.log(to_centre @ found.poses @ frames.inverse(to_centre @ other.poses))[:, 3:]
+    return np.asarray(xi - xi.mean(axis=0))
+
+
+def rows_of(name: str, session: Session, T_start: Array | None) -> list[str]:
+    """One line for each way to weigh."""
+    own = capture(session)
+    if T_start is None:
+        begun = coarse([own])
+        T_start, gate = begun.T_mount, begun.gate
+    else:
+        gate = 0.35 * part_size([own])
+    found = correct([own], T_start, gate)
+    scatter, overlaps = found.hand_eye.repeatability[0], found.overlaps[0]
+    poses, spare = own.poses(found.hand_eye.T_mount), [left_out(scan) for scan in own.scans]
+    lines, first, sigma = [], None, 0.0
+    for weights in SHOWN:
+        begun_at = time.perf_counter()
+        registered = register(own, poses, scatter, overlaps.gate, start=found.freed[0].poses, weigh=WEIGHINGS[weights])
+        seconds = time.perf_counter() - begun_at
+        if first is None:
+            first = registered
+            moved = spread(own, registered, scatter).reshape(len(poses), 6, len(poses), 6)
+            sigma = np.sqrt(np.mean([np.trace(moved[v, 3:, v, 3:]) / 3 for v in range(len(poses))]))
+        fresh = collect(own, registered.poses, registered.overlaps.gate, spare).gram.rms
+        off = np.sqrt(np.mean(apart(registered, first) ** 2))
+        numbers = (registered.overlaps.gram.rms, fresh, off, sigma)
+        lines.append(f"| {name} | {weights} | {' | '.join(f'{1e3 * x:.1f}' for x in numbers)} | {seconds:.1f} |")
+        print(lines[-1], flush=True)
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    lines = [
+        "µm; of the last two lengths rms per axis, at the part.",
+        "",
+        "| object | weights | rms, fit's points | rms, left out | from the first's poses | σ of those | seconds |",
+        "|---|---|---:|---:|---:|---:|---:|",
+    ]
+    for name in OBJECTS:
+        lines += rows_of(name, load_session(options.folder / name), None)
+    measured = simulate(load_scene("blade"), {"joint_compliance": 2.0}, 0)
+    lines += rows_of("demo's blade", session_of(measured), measured.T_coarse)
+    if options.write:
+        before, after = PAGE.read_text(encoding="utf-8").split(BEGIN)[0], PAGE.read_text(encoding="utf-8").split(END)[1]
+        PAGE.write_text(f"{before}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
