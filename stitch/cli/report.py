@@ -27,8 +27,9 @@ def report(
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Of two runs; default RUN2/two-runs.html.")
     ] = None,
     with_diagnosis: Annotated[
-        bool, typer.Option("--diagnosis/--no-diagnosis", help="Compare and diagnose too; of one run.")
-    ] = True,
+        bool | None,
+        typer.Option("--diagnosis/--no-diagnosis", help="Of one run: compare and diagnose too; default so."),
+    ] = None,
     tolerance: Tolerance = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, by a Chromium on the path.")] = False,
     effects_file: EffectsFile = None,
@@ -50,8 +51,11 @@ def report(
     if other is None:
         if output is not None:
             raise InputError(f"--output {output}: the page of one run is its report.html; to fix: leave --output away")
-        written = _one(run, with_diagnosis, tolerance, printer, effects_file, trust)
+        written = _one(run, with_diagnosis is not False, tolerance, printer, effects_file, trust)
     else:
+        if with_diagnosis is not None:
+            flag = "--diagnosis" if with_diagnosis else "--no-diagnosis"
+            raise InputError(f"{flag}: of two runs nothing is diagnosed; to fix: leave {flag} away")
         states = [load_state(folder, effects_file, trust=trust) for folder in _different(run, other)]
         runs = [stored_run(folder, state) for folder, state in zip((run, other), states, strict=True)]
         both = two_runs(runs, _names(run, other))

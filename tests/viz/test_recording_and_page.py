@@ -39,6 +39,19 @@ def names_of_views(path):
     return {name for batch, key in named for name in batch.column(key)[-1].as_py()}
 
 
+def eyes(path):
+    """Name of a 3D view → where its eye stands and looks, and what is up, as the blueprint has them."""
+    reader, named, eye = RrdReader(str(path)), {}, {}
+    for chunk in reader.stream(store=reader.blueprints()[-1]):
+        batch, (_, *place) = chunk.to_record_batch(), chunk.entity_path.split("/")
+        for key in batch.schema.names:
+            if place[0] == "view" and key == "ViewBlueprint:display_name":
+                named[place[1]] = batch.column(key)[-1].as_py()[0]
+            elif place[0] == "view" and key.startswith("EyeControls3D:"):
+                eye.setdefault(place[1], {})[key] = batch.column(key)[-1].as_py()
+    return {named[view]: found for view, found in eye.items()}
+
+
 def titles(rows):
     """Names of the views of a step, as result.json has its numbers."""
     return [f"{row['step']}: views disagree by {row['mean'] * 1e3:.3g} µm on average" for row in rows]
@@ -61,7 +74,12 @@ def test_titles_and_words_say_what_the_result_says(recorded):
     run, path = recorded
     stated = result_document(run)["disagreement"]["steps"]
     before, after = titles([stated[1], stated[-1]])
-    assert {before, f"{after} (single views moved)"} <= names_of_views(path)
+    after = f"{after} (single views moved)"
+    assert {before, after} <= names_of_views(path)
+    # The viewer cannot link eyes: before and after at least open with the same.
+    eye = eyes(path)
+    assert set(eye[before]) == {f"EyeControls3D:{what}" for what in ("position", "look_target", "eye_up")}
+    assert eye[before] == eye[after]
     last = columns(path, "TextDocument:text")["/now"][0]
     assert titles(stated[-1:])[0].partition(": ")[2] in last
 

@@ -141,6 +141,11 @@ def test_bad_folders_end_in_one_line(tmp_path, capsys):
         (["report", tmp_path, tmp_path / "none"], "damaged|no such run folder|name a run folder"),
         (["report", tmp_path, tmp_path], "are one run"),
         (["report", tmp_path, "-o", tmp_path / "x.html"], "the page of one run"),
+        (
+            ["report", tmp_path, tmp_path / "b", "--no-diagnosis"],
+            "^stitch: --no-diagnosis: .*to fix: leave --no-diagnosis",
+        ),
+        (["report", tmp_path, tmp_path / "b", "--diagnosis"], "^stitch: --diagnosis: .*to fix: leave --diagnosis"),
     ):
         with pytest.raises(SystemExit) as ended:
             main([str(word) for word in words])
