@@ -80,7 +80,7 @@ def _read(run: Path, codes: dict[str, int], seconds: dict[str, float]) -> Made:
     return Made(
         codes=codes,
         seconds=seconds,
-        sentence=(result.get("disagreement") or {}).get("sentence") or result.get("verdict", ""),
+        sentence=result.get("plain") or result.get("verdict", ""),
         verdict=found.get("verdict", ""),
         effects=found.get("effects", []),
         diagnosis=found.get("sentence", ""),

@@ -28,13 +28,13 @@ _PAGES = {
     "report-dark": (1100, 1500, "--blink-settings=preferredColorScheme=0"),
     "report-phone": (500, 1500),
 }
-_PORT, _WINDOW = 9923, "1400x760"
+_PORT, _WINDOW, _TITLE = 9923, "1400x760", 37
 MOMENTS = (0, 10, 15, 20, 30)  # of the timeline `model`: a step every 10
 
 
 def demo_run(folder: Path) -> Path:
     """A blade cell with two joints that give way, what is missing found and added."""
-    session, run = folder / "blade", folder / "run"
+    session, run = folder / "blade", folder / "after"
     call(
         ["synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3"],
         ["run", session, "-o", run, "--no-recording"],
@@ -92,7 +92,7 @@ def recording(run: Path) -> None:
     shown = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         client = _loaded()
-        for tab, name in enumerate(("before-after", "model", "missing", "cell", "iterations")):
+        for tab, name in enumerate(("before-after", "model", "missing", "cell", "error")):
             blueprint = client.get_blueprint().blueprint
             for node in blueprint.values():
                 tabs = node.get("ContainerBlueprint", {})
@@ -105,6 +105,8 @@ def recording(run: Path) -> None:
                     client.set_time("model", sequence=moment, play_state="paused")
                     time.sleep(2)
                 picture = Image.open(io.BytesIO(client.take_screenshot()))
+                # The window's own bar says what machine took the picture.
+                picture = picture.crop((0, _TITLE, *picture.size))
                 keep(picture, f"recording-{name}" + ("" if moment is None else f"-{moment}"))
     finally:
         shown.terminate()

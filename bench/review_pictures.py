@@ -9,6 +9,7 @@ pictures.
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -45,6 +46,17 @@ def command(*words: object) -> None:
     except SystemExit as ended:
         if ended.code:
             raise
+
+
+@contextmanager
+def named_folder():
+    """A folder for a while, of a name that is fit to be seen on pictures."""
+    folder = Path(tempfile.gettempdir()) / "cell"
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
 
 
 @contextmanager
@@ -188,8 +200,7 @@ def main() -> None:
     parser.add_argument("--session", type=Path, help="a session, instead of the demo's cell; no pictures")
     parser.add_argument("--effect", help="the effect to add, instead of the one that is named")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place, sync_playwright() as driver:
-        folder = Path(place)
+    with named_folder() as folder, sync_playwright() as driver:
         session = given.session or folder / "blade"
         if given.session is None:
             command("synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3")

@@ -6,18 +6,22 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import numpy as np
 import rerun.blueprint as rrb
 
+from stitch.comparison.model_history import change_of
 from stitch.frames import Array
+from stitch.runs.run import Run
 from viz.model_timeline import FRAMES, ModelScene, shown_steps
 from viz.part_camera import Camera
 
 # Of the longest side of the part, from its middle: all of it is in the picture.
 _AWAY = 1.2
+# What is seen at distance 1, a little less than the whole picture.
+_HIGH, _WIDE = 0.9, 1.3
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
 
-def model_blueprint(scene: ModelScene, camera: Camera, stages: tuple[str, ...]) -> rrb.Blueprint:
-    """Before and after | the model step by step | what is missing | the cell | every iteration."""
+def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[str, ...]) -> rrb.Blueprint:
+    """Before and after | the model step by step | what is missing | the cell | how the error fell."""
     before, after = shown_steps(scene.history)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
     compare = rrb.Horizontal(
@@ -43,26 +47,21 @@ def model_blueprint(scene: ModelScene, camera: Camera, stages: tuple[str, ...]) 
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
-            rrb.BarChartView(
-                origin="bars",
-                contents=["bars/first", "bars/views"],
-                name="Each view off the others (µm)",
-                plot_legend=rrb.PlotLegend(visible=False),
-            ),
-            rrb.BarChartView(origin="bars/moved", name="Each view moved by register (µm)"),
+            _bars("bars", "Each view off the others (µm); grey: first model", "bars/first", "bars/views"),
+            _bars("bars/moved", "Each view moved by register (µm)"),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[5, 6, 6, 3],
+            row_shares=[7, 6, 6, 4],
         ),
         column_shares=[3, 3, 2],
         name="The model, step by step",
     )
     time = rrb.TimePanel(state="collapsed", timeline="model", play_state="paused", fps=FRAMES)
-    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), _iterations(stages), active_tab=0)
+    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), _errors(run, stages), active_tab=0)
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
-def target_blueprint(cell: Array) -> rrb.Blueprint:
-    """Targets and what was found | what is missing | the cell, some points (N, 3) of which are given, base frame."""
+def target_blueprint(cell: Array, run: Run) -> rrb.Blueprint:
+    """Targets and what was found | what is missing | the cell, by some of its points (N, 3) | how the error fell."""
     result = rrb.Horizontal(
         rrb.Spatial3DView(
             origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
@@ -70,13 +69,14 @@ def target_blueprint(cell: Array) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.TextDocumentView(origin="verdict", name="What was found"),
             rrb.TextDocumentView(origin="now", name="Sticks"),
-            rrb.BarChartView(origin="bars/moved", name="Each view moved by register (µm)"),
+            _bars("bars/moved", "Each view moved by register (µm)"),
             row_shares=[4, 1, 2],
         ),
         column_shares=[3, 2],
         name="Targets",
     )
-    return rrb.Blueprint(rrb.Tabs(result, _diagnosis(), _cell(cell), active_tab=0), collapse_panels=True)
+    tabs = rrb.Tabs(result, _diagnosis(), _cell(cell), _errors(run, ()), active_tab=0)
+    return rrb.Blueprint(tabs, collapse_panels=True)
 
 
 def _part(origin: str, name: str, scene: ModelScene, camera: Camera) -> rrb.Spatial3DView:
@@ -97,33 +97,47 @@ def _bar(origin: str, name: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=origin, name=name)
 
 
+def _bars(origin: str, name: str, *contents: str) -> rrb.BarChartView:
+    """Without a legend: it would name paths, and cover bars."""
+    legend = rrb.PlotLegend(visible=False)
+    return rrb.BarChartView(origin=origin, contents=list(contents) or [origin], name=name, plot_legend=legend)
+
+
 def _cell(points: Array) -> rrb.Vertical:
     """Everything in the picture, from the side and a little from above."""
-    middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
-    across = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    across = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][-1]
     # Turned a little: the shortest way through a cell is often along the scanner's rays.
     across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
-    eye = rrb.EyeControls3D(
-        position=middle + size * (0.8 * level + [0.0, 0.0, 0.25]), look_target=middle, eye_up=[0, 0, 1]
-    )
+    # So far off that height and width are in the picture, and what stands nearest too.
+    wide, deep = (float(np.ptp(points @ axis)) for axis in (np.cross(level, [0.0, 0.0, 1.0]), level))
+    away = deep / 2 + max(float(np.ptp(points[:, 2])) / _HIGH, wide / _WIDE)
+    position = middle + away * np.array([level[0], level[1], 0.3])
+    eye = rrb.EyeControls3D(position=position, look_target=middle, eye_up=[0, 0, 1])
     view = rrb.Spatial3DView(
         origin="robot",
-        name="Arm at every view (grey), field of the scanner (lines), part; base frame",
+        name="Arm at every view (grey lines), field of the scanner (pyramids), part (points); base frame",
         background=_GROUND,
         eye_controls=eye,
     )
     return rrb.Vertical(view, name="The cell")
 
 
-def _iterations(stages: tuple[str, ...]) -> rrb.Vertical:
-    bars = [rrb.BarChartView(origin=f"iterations/{s}", name=f"{s}: rms of every iteration (µm)") for s in stages]
-    return rrb.Vertical(*bars, name="Every iteration")
+def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
+    """Every model that was fitted, in the fit and on views left out; below, how the last fit closed in."""
+    models = ", ".join(f"{i} {change_of(run.ledger, i)}" for i in range(len(run.ledger)))
+    fell = [
+        _bars("steps/residual_rms", f"Rms of each model in the fit (µm): {models}"),
+        _bars("steps/heldout_rms", "The same on views left out (µm)"),
+    ]
+    closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
+    return rrb.Vertical(rrb.Horizontal(*fell), *closed, name="How the error fell")
 
 
 def _diagnosis() -> rrb.Horizontal:
     """Verdict with candidate effects | their evidence, and where the overlaps put the views."""
     verdict = rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict and candidate effects, best first")
-    evidence = rrb.BarChartView(origin="diagnosis/evidence", name="Log Bayes factor of each candidate effect")
-    moved = rrb.BarChartView(origin="diagnosis/displaced", name="Every view off where the model puts it (µm)")
+    evidence = _bars("diagnosis/evidence", "Log Bayes factor of each candidate effect, numbered as in the table")
+    moved = _bars("diagnosis/displaced", "Every view off where the model puts it (µm)")
     return rrb.Horizontal(verdict, rrb.Vertical(evidence, moved), column_shares=[3, 2], name="What is missing")

@@ -3,8 +3,9 @@
 FIELD = (
     "Per place of the part, how far each view puts the surface from where the others put it, averaged over a patch so "
     "that the scanner's noise is gone. What fades from one step to the next is what that step explained. Grey: seen by "
-    "one view only. Drag to turn, click and scroll to come closer."
+    "one view only."
 )
+HANDLING = "Drag to turn, click and scroll to come closer."
 CONVERGENCE = "Near the dashed line only the scanner's own noise remains; further iterations bring nothing."
 PER_VIEW = (
     "Left: how far each view had to move beyond what the model says. Right: the rms that remains. "
@@ -39,8 +40,9 @@ STICKS = (
 TARGETS = "The farthest target of every view, in the order of views, and how the distances are distributed."
 TWO_FIELDS = (
     "Per place of the part, how far each view puts the surface from where the others put it, by the model of each run; "
-    "one scale of colours for both. Drag to turn: both turn. Grey: seen by one view only."
+    "one scale of colours for both. Grey: seen by one view only."
 )
+HANDLING_OF_TWO = "Drag to turn: both turn."
 WATCHED = (
     "Dots: what the sessions found. Blue: smoothed, with two sigmas. Green: the calibration in use, dotted how far a "
     "parameter may be off. Red: something happened, a line for a step, dashes for a drift."

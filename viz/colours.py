@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 BLUE, ORANGE, GREEN, DARK = "#0072B2", "#D55E00", "#009E73", "#707070"
 # Of a few things that stand beside one another on dark and light, from the same set.
 COLOURS_OF_FEW = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167))
+# What stands beside or behind what matters.
+GREY = (95, 100, 106)
 # Grey: no other view sees this place, so there is nothing to compare.
 UNSEEN = (160, 160, 160)
 # Blue–white–red: below, at and above the surface of the other views.

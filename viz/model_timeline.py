@@ -14,7 +14,7 @@ from stitch.comparison.model_history import ModelHistory, ModelStep
 from stitch.frames import Array
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
-from viz.colours import COLOURS_OF_FEW, unsigned_colours
+from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
 from viz.run_figures import shown_points
 
@@ -27,7 +27,7 @@ _FEW = 4
 # The largest displacement is shown as this share of the part's size.
 _SHOWN_SHARE = 0.08
 _THICK = rr.Radius.ui_points(3.0)
-_GREY, _BAR = (95, 100, 106), (244, 114, 43)
+_BAR = (244, 114, 43)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene) -> Non
     for name, step in (("before", before), ("after", after)):
         recording.log(f"part/{name}", _colours(scene, step.field.overall), static=True)
     rest = run.fused.points[np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _STILL)).astype(int)]
-    recording.log("stitched", rr.Points3D(rest.astype(np.float32), colors=[_GREY]), static=True)
+    recording.log("stitched", rr.Points3D(rest.astype(np.float32), colors=[GREY]), static=True)
     places = []
     for v, view in enumerate(run.session.views):
         at_rest = frames.transform(run.poses[v], shown_points(view))
@@ -96,7 +96,7 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene) -> Non
             colour = COLOURS_OF_FEW[scene.farthest.index(v)]
             recording.log(f"scans/{view.name}", rr.Points3D(points.astype(np.float32), colors=[colour]), static=True)
     means = _means(scene.history.models[0].field.values) * scene.um
-    recording.log("bars/first", rr.BarChart(means, color=_GREY), static=True)
+    recording.log("bars/first", rr.BarChart(means, color=GREY), static=True)
     for frame in range(0, FRAMES * (len(scene.history.steps) - 1) + 1, _BETWEEN):
         recording.set_time("model", sequence=frame)
         _log_frame(recording, scene, frame / FRAMES, np.array(places))
@@ -138,7 +138,7 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
     recording.log("bars/views", rr.BarChart(means, color=_BAR))
     if share in (0.0, 1.0):
         now = k + round(share)
-        factor = f"Displacements are shown {scene.magnified[now]:g} times larger than they are."
+        factor = f"Displacements: {scene.magnified[now]:g} times larger than they are."
         text = f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; noise alone would leave "
         text += f"{steps[now].field.noise * scene.um:.2g} µm.\n\n{factor}"
         recording.log("now", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))

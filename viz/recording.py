@@ -12,7 +12,7 @@ from stitch.runs.run import Run, StageResult
 from stitch.units import MICROMETRES
 from viz.blueprint import model_blueprint, target_blueprint
 from viz.colour_bar import log_colour_bar
-from viz.colours import FIELD, robust_limit, unsigned_colours
+from viz.colours import COLOURS_OF_FEW, FIELD, GREY, robust_limit, unsigned_colours
 from viz.diagnosis_recording import NOT_YET
 from viz.model_timeline import log_model, model_scene
 from viz.part_camera import camera_for
@@ -54,13 +54,16 @@ class RerunRecorder:
         rec.log("verdict", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
         rec.log("diagnosis/verdict", rr.TextDocument(NOT_YET, media_type=rr.MediaType.MARKDOWN), static=True)
         for stage, rms in self.rms.items():
-            rec.log(f"iterations/{stage}", rr.BarChart(np.array(rms) * um), static=True)
+            rec.log(f"iterations/{stage}", rr.BarChart(np.array(rms) * um, color=GREY), static=True)
+        for which, colour in (("residual_rms", COLOURS_OF_FEW[0]), ("heldout_rms", COLOURS_OF_FEW[1])):
+            fell = np.nan_to_num([getattr(step, which) * um for step in run.ledger])
+            rec.log(f"steps/{which}", rr.BarChart(fell, color=colour), static=True)
         shift = np.linalg.norm(view_shifts(run), axis=1) * um
-        rec.log("bars/moved", rr.BarChart(shift), static=True)
+        rec.log("bars/moved", rr.BarChart(shift, color=GREY), static=True)
         cell = log_robot(rec, run)
         if history is None:
             _log_targets(rec, run)
-            rec.send_blueprint(target_blueprint(cell))
+            rec.send_blueprint(target_blueprint(cell, run))
         else:
             surface = part_surface(run.fused, history.patches)
             camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
@@ -68,7 +71,7 @@ class RerunRecorder:
             log_model(rec, run, scene)
             full = scene.limit * um
             log_colour_bar(rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"])
-            rec.send_blueprint(model_blueprint(scene, camera, tuple(self.rms)))
+            rec.send_blueprint(model_blueprint(scene, camera, run, tuple(self.rms)))
         file.write()
 
 

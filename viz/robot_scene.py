@@ -13,7 +13,7 @@ from viz.run_figures import shown_points
 
 # Of lines, in pixels.
 _THIN = rr.Radius.ui_points(1.0)
-_GREY, _PART = (110, 110, 110), (190, 195, 200)
+_GREY, _PART, _SCANNER = (110, 110, 110), (190, 195, 200), (230, 159, 0)
 _SEEN = 0.98  # share of the points that lie within the drawn field of the scanner
 _POINTS = 20_000
 
@@ -35,7 +35,7 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
     for name, T, colour in zip(names, T_base_scanner, colours, strict=False):
         lines = [frames.transform(T, strip) for strip in corners]
         seen.append(np.concatenate(lines))
-        shown, label = (colour, name) if in_hand else (_GREY, "scanner")
+        shown, label = (colour, name) if in_hand else (_SCANNER, "scanner")
         recording.log(f"robot/scanner/{label}", rr.LineStrips3D(lines, colors=[shown], radii=_THIN), static=True)
     points = run.fused.points[
         np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _POINTS)).astype(int)

@@ -1,7 +1,7 @@
 """What a run found, as Markdown for the recording."""
 
 from stitch.comparison.model_history import ModelHistory
-from stitch.comparison.plain_verdict import plain_verdict
+from stitch.comparison.run_verdict import run_verdict
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 
@@ -11,10 +11,7 @@ _COLOURS = "Pale: the views agree. Dark red: they disagree. Grey: seen by one vi
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
     """Verdict, how the error fell, what could not be seen."""
     um = MICROMETRES[run.session.length_unit]
-    lines = [f"# {run.session.name}", ""]
-    if history is not None:
-        lines += [f"**{plain_verdict(history, run.session.length_unit)}**", ""]
-    lines += [run.verdict, ""]
+    lines = [f"# {run.session.name}", "", f"**{run_verdict(run, history)}**", "", run.verdict, ""]
     if history is not None:
         lines += ["| step of the model | views disagree by (µm) |", "|---|---:|"]
         lines += [f"| {s.name} | {s.field.mean_abs * um:.3g} |" for s in history.steps]

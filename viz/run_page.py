@@ -5,7 +5,7 @@ from typing import Any
 
 from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory, model_history
-from stitch.comparison.plain_verdict import judged, plain_verdict
+from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
@@ -35,15 +35,15 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
 
 
 def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
-    unit = run.session.length_unit
+    light = None if tolerance is None else run_light(run, history, tolerance)
     gone = [f"View {item.view} does not belong and was left out: {item.why}." for item in run.left_out]
     hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
     return Head(
         title=run.session.name,
-        verdict=run.verdict if history is None else plain_verdict(history, unit),
+        verdict=run_verdict(run, history),
         subjects=[Subject(identity(run))],
-        lights=[] if history is None or tolerance is None else [judged(history, tolerance, unit)],
-        evidence="" if history is None else run.verdict,
+        lights=[] if light is None else [light],
+        evidence=run.verdict,
         notes=[*gone, *hidden],
     )
 
@@ -79,7 +79,8 @@ def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in steps[1:]]
     still = part_picture(surface, camera, shown[-4:], full_colour(history.models[0].field) * um, "µm")
-    return {"data": script_json(data), "still": png(still, 110), "caption": captions.FIELD}
+    words = {"caption": captions.FIELD, "handling": captions.HANDLING}
+    return {"data": script_json(data), "still": png(still, 110), **words}
 
 
 def _pictures(run: Run) -> list[tuple[str, str, str]]:

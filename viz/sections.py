@@ -13,6 +13,7 @@ from stitch.diagnosis.sentences import amounts_of
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
+from stitch.writing.plain_finding import plain_finding
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
@@ -30,10 +31,12 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     pictures = _pictures(found, state.session.length_unit)
     addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
     unit, fields = state.session.length_unit, candidate_fields(found)
+    plain = plain_finding(found, unit)
     lacking = sorted({need for needs in found.missing.values() for need in needs})
     html = render(
         "diagnosis.html.j2",
         found=found,
+        plain=plain,
         rows=_rows(found, fields, MICROMETRES[unit]),
         field=None if fields is None else script_json(packed_candidates(fields, unit)),
         lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
@@ -41,25 +44,8 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
     )
     _insert(folder / "report.html", "diagnosis", html)
-    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(_finding(found, fields, unit))}</p>')
+    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(plain)}</p>')
     add_diagnosis(found, fields, unit, folder / "recording.rrd")
-
-
-def _finding(found: Diagnosis, fields: CandidateFields | None, length_unit: str) -> str:
-    """What is missing, for everybody; the sentence with its numbers stands below."""
-    named = " or ".join(found.effects)
-    match found.verdict:
-        case "adequate":
-            return "No effect is found missing: noise and the arm's scatter explain what is left."
-        case "cannot_tell":
-            return f"Something is missing in the model, and these views cannot tell whether it is {named}."
-        case "unknown_effect":
-            return "Something is missing in the model that no effect of the library explains."
-    if fields is None or found.effects[0] not in fields.if_added:
-        return f"Missing in the model: {named}."
-    um = MICROMETRES[length_unit]
-    now, then = (f"{f.mean_abs * um:.3g} µm" for f in (fields.present, fields.if_added[found.effects[0]]))
-    return f"Missing in the model: {named}. Added, the views should disagree by {then} instead of {now}."
 
 
 class _Picture(NamedTuple):

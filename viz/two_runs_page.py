@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from stitch.comparison.disagreement_field import full_colour
-from stitch.comparison.plain_verdict import Judged, judged, plain_verdict
+from stitch.comparison.plain_verdict import Judged
+from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.comparison.two_runs import Side, TwoRuns, sentence
 from stitch.units import MICROMETRES, length_text
 from viz import captions
@@ -48,16 +49,15 @@ def _head(both: TwoRuns, tolerance: float | None) -> Head:
 
 
 def _light(letter: str, side: Side, tolerance: float | None) -> list[Judged]:
-    if side.history is None or tolerance is None:
+    own = None if tolerance is None else run_light(side.run, side.history, tolerance)
+    if own is None:
         return []
-    own = judged(side.history, tolerance, side.run.session.length_unit)
     return [own._replace(sentence=f"{letter}: {own.sentence}")]
 
 
 def _found(side: Side) -> list[str]:
     """The verdict of one run, for everybody and with its evidence."""
-    plain = [] if side.history is None else [plain_verdict(side.history, side.run.session.length_unit)]
-    return [*plain, side.run.verdict]
+    return [run_verdict(side.run, side.history), side.run.verdict]
 
 
 def _content(both: TwoRuns) -> dict[str, object]:
@@ -65,6 +65,7 @@ def _content(both: TwoRuns) -> dict[str, object]:
     return {
         "parts": _parts(both),
         "caption": captions.TWO_FIELDS,
+        "handling": captions.HANDLING_OF_TWO,
         "bars": svg(two_bars(both.a.run, both.b.run)),
         "errors": error_rows(both),
         "differing": [row for row in known if row.differs],

@@ -12,7 +12,7 @@ from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.cli.recorders import recorder_for
 from stitch.cli.streams import emit
 from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import plain_verdict
+from stitch.comparison.run_verdict import run_verdict
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
 from stitch.effects.in_session import known, require
@@ -139,8 +139,7 @@ def show_ledger(result: Run) -> None:
         numbers = (length_text(x, unit, 4, zeros=True) for x in (s.residual_rms, s.heldout_rms, s.noise_floor))
         table.add_row(str(i), ", ".join(s.effects) or "hand-eye alone", *numbers)
     terminal.print(table)
-    if (history := model_history(result)) is not None:
-        terminal.print(plain_verdict(history, unit), soft_wrap=True, style="bold")
+    terminal.print(run_verdict(result, model_history(result)), soft_wrap=True, style="bold")
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
             known_to = f"± {p.sigma:.1g}" if p.fitted else "(explains most)"

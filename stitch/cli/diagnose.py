@@ -17,6 +17,7 @@ from stitch.system.console import console
 from stitch.units import length_text
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
+from stitch.writing.plain_finding import plain_finding
 from stitch.writing.run_folder import extend, held
 
 _SHOWN = 6
@@ -91,9 +92,10 @@ def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, obje
 
 
 def show(found: Diagnosis, length_unit: str) -> None:
-    """Sentence first, then the candidate effects, what the poses follow, what to do next."""
+    """For everybody first, then the evidence, the candidate effects, what the poses follow, what to do next."""
     terminal = console()
-    terminal.print(found.sentence, soft_wrap=True, style="bold")
+    terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
+    terminal.print(found.sentence, soft_wrap=True)
     table = Table(title="Candidate effects", title_justify="left")
     for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)

@@ -9,7 +9,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import plain_verdict
+from stitch.comparison.run_verdict import run_verdict
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
@@ -29,8 +29,7 @@ def show(runs: list[Run], target: Path) -> None:
         for s in result.stages[1:]:
             if s.note:
                 terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
-        if (history := model_history(result)) is not None:
-            terminal.print(plain_verdict(history, result.session.length_unit), soft_wrap=True, style="bold")
+        terminal.print(run_verdict(result, model_history(result)), soft_wrap=True, style="bold")
         terminal.print(result.verdict, soft_wrap=True)
         hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
         for line in (*hidden, *result.notes[len(result.left_out) :]):

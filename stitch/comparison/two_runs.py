@@ -131,7 +131,8 @@ def sentence(both: TwoRuns) -> str:
     where = "rms over the labelled points" if both.a.history is None else "on average over the part"
     told = f"as far as those of A, by {off_a}" if off_a == off_b else f"by {off_b} instead of {off_a}"
     subject = _change(both.a.run.effects, both.b.run.effects) + ("" if both.same_data else ", on other data")
-    return f"{subject}, the views of B disagree {told}, {where}; {_hand_eyes(both.hand_eye, unit)}."
+    seen = "targets" if both.a.history is None else "part"
+    return f"{subject}, the views of B disagree {told}, {where}; {_hand_eyes(both.hand_eye, unit, seen)}."
 
 
 def _change(a: Sequence[str], b: Sequence[str]) -> str:
@@ -142,10 +143,10 @@ def _change(a: Sequence[str], b: Sequence[str]) -> str:
     return f"{told[0].upper()}{told[1:]} in the model"
 
 
-def _hand_eyes(change: HandEyeChange, length_unit: str) -> str:
+def _hand_eyes(change: HandEyeChange, length_unit: str, seen: str) -> str:
     if not change.twist.any():
         return "both have the same hand-eye"
-    apart = f"the hand-eyes put the part {length_text(change.at_part, length_unit)} apart"
+    apart = f"the hand-eyes put the {seen} {length_text(change.at_part, length_unit)} apart"
     if np.isnan(change.p_value):
         return f"{apart}, and how well they are known is not stated"
     beyond = "more than" if change.p_value < _CHANCE else "no more than"

@@ -6,6 +6,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.writing.json_file import rows_of_fields
+from stitch.writing.plain_finding import plain_finding
 
 FORMAT = "stitch-diagnosis/1"
 
@@ -16,6 +17,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "format": FORMAT,
         "verdict": d.verdict,
         "effects": list(d.effects),
+        "plain": plain_finding(d, d.linear.measurement.length_unit),
         "sentence": d.sentence,
         "residual_rms": d.residual_rms,
         "noise_floor": d.noise_floor,

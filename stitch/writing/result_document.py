@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import plain_verdict
+from stitch.comparison.run_verdict import run_verdict
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
 from stitch.runs.run import LeftOut, Run
@@ -73,6 +73,7 @@ def result_document(run: Run) -> dict[str, Any]:
         **labelled_facts(run),
         "convergence": run.convergence,
         "disagreement": _disagreement(run),
+        "plain": run_verdict(run, model_history(run)),
         "verdict": run.verdict,
         "notes": list(run.notes),
         "versions": _versions(),
@@ -104,7 +105,6 @@ def _disagreement(run: Run) -> dict[str, Any] | None:
     return {
         "gate": run.registered.gate,
         "patch_radius": history.patches.radius,
-        "sentence": plain_verdict(history, run.session.length_unit),
         "steps": [
             {"step": s.name, "mean": s.field.mean_abs, "of_noise": s.field.noise, "largest": s.field.quantile()}
             for s in history.steps

@@ -81,7 +81,7 @@ def _read(run: Path, version: str) -> Snapshot:
         "run": str(run),
         "session": result["session"],
         "name": result.get("name", Path(result["session"]).name),
-        "sentence": (result.get("disagreement") or {}).get("sentence") or result["verdict"],
+        "sentence": result.get("plain") or result["verdict"],
         "evidence": result["verdict"],
         "residual": result["residual_rms"] * um,
         "heldout": None if result["heldout_rms"] is None else result["heldout_rms"] * um,

@@ -19,6 +19,7 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
     return {
         "verdict": document["verdict"],
         "named": document["effects"],
+        "plain": document.get("plain") or document["sentence"],
         "sentence": document["sentence"],
         "candidates": [_candidate(row, um) for row in candidates if row["observable"]],
         "unseen": [row["effect"] for row in candidates if not row["observable"] and not row.get("needs")],

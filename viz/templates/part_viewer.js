@@ -69,7 +69,12 @@ function showPart(root, data, more, eye) {
       const x = signed ? -f + i * f : i * f / 2;
       b.textContent = `${signed && i === 2 ? "+" : ""}${digits(x)}${i === 2 ? " µm" : ""}`.replace("-", "−");
     });
-    bar.querySelector("span").textContent = signed ? "inwards · outwards of the other views" : "views agree · views disagree";
+    const ends = signed ? ["inwards of the others", "outwards"] : ["views agree", "views disagree"];
+    bar.querySelector("span").replaceChildren(...ends.map(end => {
+      const text = document.createElement("span");
+      text.textContent = end;
+      return text;
+    }));
   }
   const digits = x => x === 0 ? "0" : Number(x.toPrecision(3)).toString();
   function names() {

@@ -3,10 +3,6 @@ import { at, element, um } from "./elements.js";
 import { predict } from "./scene.js";
 
 const FIRST = 4;
-const TITLES = {
-  adequate: "Nothing is missing", missing_effect: "An effect is missing",
-  cannot_tell: "Something is missing; these views cannot tell what", unknown_effect: "Something unknown is missing",
-};
 let all = false;
 
 // `ask` sends a command; `busy` while one that changes the run is under way.
@@ -26,7 +22,7 @@ export function showCandidates(state, ask, busy) {
   found.candidates.length > FIRST && element("button", { type: "button", "aria-expanded": String(all), onclick: () => { all = !all; showCandidates(state, ask, busy); } },
       all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`)].filter(Boolean);
   const open = all || root.querySelector("#tried[open]") !== null;
-  root.replaceChildren(element("h3", {}, TITLES[found.verdict]), element("p", {}, found.sentence),
+  root.replaceChildren(element("h3", {}, found.plain), element("p", { class: "soft" }, found.sentence),
     ...(found.verdict === "adequate" ? [element("details", { id: "tried", open }, element("summary", {}, "Candidate effects that were tried"), ...table)] : table),
     ...[limits(found)].filter(Boolean));
 }

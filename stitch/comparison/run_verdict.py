@@ -1,0 +1,44 @@
+"""The verdict of any run in plain words, and its light: of surfaces that overlap, or of labelled points alone."""
+
+import numpy as np
+
+from stitch.comparison.model_history import ModelHistory, change_of
+from stitch.comparison.plain_verdict import Judged, judged, plain_verdict
+from stitch.runs.run import Run
+from stitch.units import length_text
+
+
+def run_verdict(run: Run, history: ModelHistory | None) -> str:
+    """One sentence for everybody: how far the views disagree, and what the effects in use brought.
+
+    Args:
+        history: of this run; None without clouds.
+    """
+    unit = run.session.length_unit
+    if history is not None:
+        return plain_verdict(history, unit)
+    now, floor = (length_text(x, unit) for x in (run.residual_rms, run.noise_floor))
+    rest = f"rms over all views; the sensor's noise alone would leave {floor}."
+    changes = [change_of(run.ledger, i) for i in range(1, len(run.ledger))]
+    added = [effect for effect in run.effects if f"+ {effect}" in ", ".join(changes).split(", ")]
+    if not added:
+        return f"The views see the targets {now} off their place, {rest}"
+    before = length_text(run.ledger[0].residual_rms, unit)
+    return f"Adding {' and '.join(added)} brought the targets from {before} to {now} off their place, {rest}"
+
+
+def run_light(run: Run, history: ModelHistory | None, tolerance: float) -> Judged | None:
+    """Whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
+
+    None where neither surfaces nor targets were fitted.
+    """
+    unit = run.session.length_unit
+    if history is not None:
+        return judged(history, tolerance, unit)
+    if run.targets is None:
+        return None
+    rows = run.targets.rows
+    reach = float(np.nanquantile(rows.distances(rows.residual), 0.95))
+    allowed, told = length_text(tolerance, unit, 4), length_text(reach, unit)
+    words = f"{allowed}: 95 % of what was seen of the targets lies within {told} of their place under the model."
+    return Judged("good", f"Within {words}") if reach <= tolerance else Judged("bad", f"Not within {words}")

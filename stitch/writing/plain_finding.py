@@ -1,0 +1,25 @@
+"""What a diagnosis found in one sentence that everybody on the shop floor understands.
+
+Terminal, page, recording and review all say it so; the diagnosis' own sentence stands below as evidence.
+"""
+
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.units import length_text
+
+
+def plain_finding(found: Diagnosis, length_unit: str) -> str:
+    """What is missing, and how far the error should fall with it."""
+    named = " or ".join(found.effects)
+    match found.verdict:
+        case "adequate":
+            return "No effect is found missing: noise and the arm's scatter explain what is left."
+        case "cannot_tell":
+            return f"Something is missing in the model, and these views cannot tell whether it is {named}."
+        case "unknown_effect":
+            return "Something is missing in the model that no effect of the library explains."
+    validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
+    if validation is None:
+        return f"Missing in the model: {named}."
+    then = found.residual_rms * validation.inside**0.5
+    before, after = (length_text(rms, length_unit) for rms in (found.residual_rms, then))
+    return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
