@@ -1,0 +1,61 @@
+"""Runs on labelled points where people look: page, page of two runs, review, terminal."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from stitch.cli.main import main
+from viz.review.run_review import RunReview
+
+
+def told(capsys, *words):
+    """What a command says to people, as one line."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as ended:
+        assert not ended.code
+    return " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("kind", ["points", pytest.param("frames", marks=pytest.mark.slow)])
+def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, capsys):
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(2, views=24, offset=offset, probe=kind == "frames")
+    folder, before, run = write_labelled(tmp_path / "s", session, kind), tmp_path / "before", tmp_path / "after"
+    told(capsys, "run", folder, "-o", run, "--no-recording")
+    shutil.copytree(run, before)
+    diagnosed = told(capsys, "diagnose", run)
+    finding = json.loads((run / "diagnosis.json").read_text())
+    assert finding["plain"].startswith("Missing in the model: joint_offset. Adding it should bring the error from ")
+    state = RunReview(run).state()
+    assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
+    assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])
+    assert (run / "report.html").read_text().count(finding["plain"]) == 2  # on top, and where the evidence stands
+    added = told(capsys, "add", run, "joint_offset", "--no-recording")
+    result, ledger = (json.loads((run / f"{name}.json").read_text()) for name in ("result", "ledger"))
+    rms = [f"{1e3 * step['residual_rms']:.3g} µm" for step in ledger]
+    assert result["plain"].startswith(
+        f"Adding joint_offset brought the targets from {rms[0]} to {rms[1]} off their place"
+    )
+    state = RunReview(run).state()
+    assert result["plain"] in added
+    assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], False)
+    # The tolerance counts: 95 % of the distances as residuals.parquet has them, to a percent.
+    reach = np.quantile(pq.read_table(run / "residuals.parquet")["residual"].to_numpy(), 0.95)
+    for tolerance, light in ((1.01 * reach, "light good"), (0.99 * reach, "light bad")):
+        told(capsys, "report", run, "--no-diagnosis", "--tolerance", tolerance)
+        page = (run / "report.html").read_text()
+        assert f'class="{light}"' in page
+        assert result["plain"].replace("'", "&#39;") in page
+    of_two = told(capsys, "report", before, run, "--tolerance", 1.01 * reach)
+    assert f"by {rms[1]} instead of {rms[0]}, rms over the labelled points; the hand-eyes put the targets" in of_two
+    page = (run / "two-runs.html").read_text()
+    assert re.findall(r'class="light (\w+)"', page) == ["bad", "good"]
+    assert "views of B" in page and "<canvas" not in page
