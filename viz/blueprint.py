@@ -14,8 +14,8 @@ from viz.part_camera import Camera
 
 # Of the longest side of the part, from its middle: all of it is in the picture.
 _AWAY = 1.2
-# What is seen at distance 1, a little less than the whole picture.
-_HIGH, _WIDE = 0.9, 1.3
+# What is seen at distance 1, about.
+_HIGH, _WIDE = 1.1, 1.6
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
@@ -47,7 +47,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
-            _bars("bars", "Each view off the others (µm); grey: first model", "bars/first", "bars/views"),
+            _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
             _bars("bars/moved", "Each view moved by register (µm)"),
             _bar("colours/field", "Views disagree by (µm)"),
             row_shares=[7, 6, 6, 4],
@@ -110,9 +110,9 @@ def _cell(points: Array) -> rrb.Vertical:
     # Turned a little: the shortest way through a cell is often along the scanner's rays.
     across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
-    # So far off that height and width are in the picture, and what stands nearest too.
+    # So far off that height and width are in the picture.
     wide, deep = (float(np.ptp(points @ axis)) for axis in (np.cross(level, [0.0, 0.0, 1.0]), level))
-    away = deep / 2 + max(float(np.ptp(points[:, 2])) / _HIGH, wide / _WIDE)
+    away = deep / 4 + max(float(np.ptp(points[:, 2])) / _HIGH, wide / _WIDE)
     position = middle + away * np.array([level[0], level[1], 0.3])
     eye = rrb.EyeControls3D(position=position, look_target=middle, eye_up=[0, 0, 1])
     view = rrb.Spatial3DView(
@@ -132,7 +132,7 @@ def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
         _bars("steps/heldout_rms", "The same on views left out (µm)"),
     ]
     closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
-    return rrb.Vertical(rrb.Horizontal(*fell), *closed, name="How the error fell")
+    return rrb.Vertical(rrb.Horizontal(*fell), *closed, row_shares=[2, *[1 for _ in closed]], name="How the error fell")
 
 
 def _diagnosis() -> rrb.Horizontal:

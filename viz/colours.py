@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 # Okabe & Ito's colours: people who do not see red and green alike can tell them apart.
-BLUE, ORANGE, GREEN, DARK = "#0072B2", "#D55E00", "#009E73", "#707070"
+BLUE, ORANGE, GREEN, YELLOW, DARK = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#707070"
 # Of a few things that stand beside one another on dark and light, from the same set.
 COLOURS_OF_FEW = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167))
 # What stands beside or behind what matters.

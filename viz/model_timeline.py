@@ -137,8 +137,8 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
     means = _means((1 - share) * one.values + share * other.values) * scene.um
     recording.log("bars/views", rr.BarChart(means, color=_BAR))
     if share in (0.0, 1.0):
-        now = k + round(share)
-        factor = f"Displacements: {scene.magnified[now]:g} times larger than they are."
+        now, first = k + round(share), scene.history.models[0].name
+        factor = f"Displacements: {scene.magnified[now]:g} times larger than they are. Grey bars: {first}."
         text = f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; noise alone would leave "
         text += f"{steps[now].field.noise * scene.um:.2g} µm.\n\n{factor}"
         recording.log("now", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))

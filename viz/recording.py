@@ -70,8 +70,9 @@ class RerunRecorder:
             scene = model_scene(run, history, surface, cell)
             log_model(rec, run, scene)
             full = scene.limit * um
+            several = tuple(stage for stage, rms in self.rms.items() if len(rms) > 1)
             log_colour_bar(rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"])
-            rec.send_blueprint(model_blueprint(scene, camera, run, tuple(self.rms)))
+            rec.send_blueprint(model_blueprint(scene, camera, run, several))
         file.write()
 
 

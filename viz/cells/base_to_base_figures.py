@@ -12,8 +12,9 @@ from stitch.cells.base_to_base.contradiction import Comparison
 from stitch.cells.base_to_base.stand import Stand, rod_points
 from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult
 from stitch.frames import Array
+from viz.colours import BLUE, GREEN, ORANGE
 
-_ONE, _TWO, _ROD = "#4878a8", "#6a9955", "#b5523b"
+_ONE, _TWO, _ROD = BLUE, GREEN, ORANGE
 
 
 def plan(stand: Stand, result: BaseResult) -> Figure:
@@ -42,16 +43,30 @@ def _draw(ax: Axes, stand: Stand, result: BaseResult, i: int, j: int) -> None:
         ("base 2", T, _TWO, touched, stand.rod.names),
     ):
         _draw_base(ax, name, pose, size, colour, [i, j])
-        for place, label in zip(places[:, [i, j]], labels, strict=True):
+        for place in places[:, [i, j]]:
             ax.plot(*np.array([pose[[i, j], 3], place]).T, color=colour, lw=0.8, ls=":")
             ax.plot(*place, "o", color=colour, ms=6)
-            ax.annotate(label, place, xytext=(6, 6), textcoords="offset points", fontsize=9)
+        _name_places(ax, places[:, [i, j]], labels, pose[i, 3], size / 4)
     ax.add_patch(_ellipse(T[[i, j], 3], result.fit.covariance[3:, 3:][np.ix_([i, j], [i, j])]))
+
+
+def _name_places(ax: Axes, places: Array, labels: Sequence[str], middle: float, near: float) -> None:
+    """Names on the side that looks away from the middle; places that fall together share one."""
+    left = list(range(len(places)))
+    while left:
+        at = places[left[0]]
+        here = [k for k in left if np.linalg.norm(places[k] - at) < near]
+        left = [k for k in left if k not in here]
+        side = 1 if at[0] >= middle else -1
+        style = {"ha": "left" if side > 0 else "right", "textcoords": "offset points", "fontsize": 9}
+        ax.annotate(", ".join(labels[k] for k in here), at, xytext=(6 * side, 6), **style)
 
 
 def _draw_base(ax: Axes, name: str, T: Array, size: float, colour: str, plane: list[int]) -> None:
     """Axes of a base (4, 4) as far as they show in the plane, and its name."""
     origin = T[plane, 3]
+    # On the side to which no axis points.
+    below = T[plane[1], :3].sum() > -0.5
     for k, axis in enumerate("xyz"):
         arrow = size * T[plane, k]
         if np.hypot(*arrow) > size / 4:
@@ -60,7 +75,7 @@ def _draw_base(ax: Axes, name: str, T: Array, size: float, colour: str, plane: l
             ax.annotate(axis, origin + arrow, color=colour, fontsize=8)
             # Arrows do not count for the limits of the axes by themselves.
             ax.update_datalim([origin + arrow, origin - arrow])
-    ax.annotate(name, origin, xytext=(-6, -14), textcoords="offset points", color=colour, weight="bold")
+    ax.annotate(name, origin, xytext=(-6, -14 if below else 8), textcoords="offset points", color=colour, weight="bold")
 
 
 def _ellipse(at: Array, covariance: Array) -> Ellipse:

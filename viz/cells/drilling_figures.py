@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 from stitch.cells.drilling.drill_job import Hole, Job
 from stitch.cells.drilling.drill_solution import JobResult
 from stitch.frames import Array, transform
+from viz.colours import BLUE, GREEN, ORANGE
 
-_BEFORE, _AFTER, _DRILL = "#b5523b", "#6a9955", "#4878a8"
+_BEFORE, _AFTER, _DRILL = ORANGE, GREEN, BLUE
 # Of the panel's extent, that the largest error's arrow is drawn.
 _LONGEST = 0.25
 _ARROWS = {"angles": "xy", "scale_units": "xy", "scale": 1}  # as long as they are in the data's unit
@@ -66,7 +67,7 @@ def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Arra
     drives = np.array([d.position if after else d.hole.position for d in result.drives])
     ax.plot(*((drives - middle) @ side.T).T, "+", color=_DRILL, ms=9, label="hole to drill")
     ax.set_aspect("equal")
-    ax.margins(0.12)
+    ax.margins(0.12, 0.25)  # below and above, names and arrows have room
     ax.autoscale_view()
     ax.spines[["top", "right"]].set_visible(False)
 

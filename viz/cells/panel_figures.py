@@ -8,7 +8,7 @@ from stitch import frames
 from stitch.cells.panel.panel_job import Job
 from stitch.cells.panel.panel_solution import JobResult
 from stitch.frames import Array, Indices
-from viz.colours import SIGNED
+from viz.colours import BLUE, GREEN, ORANGE, SIGNED
 
 
 def expected_after(job: Job, result: JobResult) -> Array:
@@ -55,7 +55,13 @@ def _write_values(ax: Axes, at: Array, values: Array, clamp: Indices) -> None:
     for place, value, i in zip(at, values, clamp, strict=True):
         away = np.sign(place - at[clamp == i].mean(axis=0))
         align = {"ha": "left" if away[0] > 0 else "right", "va": "center"}
-        ax.annotate(f"{value:+.2f}", place, xytext=7 * away * [1, 0], textcoords="offset points", fontsize=7, **align)
+        ax.annotate(_signed(value), place, xytext=7 * away * [1, 0], textcoords="offset points", fontsize=7, **align)
+
+
+def _signed(value: float) -> str:
+    """With its sign, which nothing has not."""
+    text = f"{value:+.2f}".replace("-", "−")
+    return text[1:] if text[1:] == "0.00" else text
 
 
 def _draw_panel(ax: Axes, job: Job, result: JobResult) -> None:
@@ -80,8 +86,8 @@ def forces(job: Job) -> Figure:
     assert job.forces is not None
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     ax, place = figure.subplots(), np.arange(len(job.robots))
-    ax.bar(place - 0.2, job.forces[:, 5], 0.38, color="#4878a8", label="along z, into the panel")
-    ax.bar(place + 0.2, np.linalg.norm(job.forces[:, 3:5], axis=1), 0.38, color="#b5523b", label="in its plane")
+    ax.bar(place - 0.2, job.forces[:, 5], 0.38, color=BLUE, label="along z, into the panel")
+    ax.bar(place + 0.2, np.linalg.norm(job.forces[:, 3:5], axis=1), 0.38, color=ORANGE, label="in its plane")
     ax.set_xticks(place, job.robots)
     ax.set(ylabel="force (N)", xlabel="clamp")
     ax.axhline(0, color="k", lw=0.6)
@@ -95,7 +101,7 @@ def misfit(job: Job, result: JobResult) -> Figure:
     figure = Figure(figsize=(7, 2.4), layout="constrained")
     ax = figure.subplots()
     sizes = [np.sqrt(m.chi_square / m.redundancy) for m in result.models]
-    ax.bar(job.robots, sizes, color="#6a9955")
+    ax.bar(job.robots, sizes, color=GREEN)
     ax.axhline(1.0, color="0.4", ls="--", lw=1, label="tracker's sigma")
     ax.set(ylabel="rms (sigmas)", xlabel="robot")
     ax.legend(frameon=False)

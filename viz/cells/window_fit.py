@@ -15,7 +15,7 @@ from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.colours import SIGNED, signed_colours
+from viz.colours import BLUE, ORANGE, SIGNED, signed_colours
 from viz.identity import Row
 
 _MAP_POINTS, _RECORDED_POINTS, _WORST = 40_000, 400_000, 10
@@ -141,9 +141,9 @@ def histogram(part: Part) -> Figure:
     figure = Figure(figsize=(7, 2.4), layout="constrained")
     ax = figure.subplots()
     reach = max(2 * found.tolerance, 1.05 * float(np.quantile(np.abs(found.distance), 0.999)))
-    ax.hist(np.clip(found.distance, -reach, reach), bins=120, color="#4878a8", log=True)
+    ax.hist(np.clip(found.distance, -reach, reach), bins=120, color=BLUE, log=True)
     for side in (-1, 1):
-        ax.axvline(side * found.tolerance, color="#b5523b", ls="--", lw=1)
+        ax.axvline(side * found.tolerance, color=ORANGE, ls="--", lw=1)
     ax.set(xlabel="distance from the CAD (dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
     ax.spines[["top", "right"]].set_visible(False)
     return figure

@@ -13,9 +13,10 @@ from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
+from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
 from viz.identity import Row
 
-VERDICTS = {"good": "#4f9a4f", "bad": "#c43c28", "open": "#d9a400", "not measured": "#8a8a8a"}
+VERDICTS = {"good": GREEN, "bad": ORANGE, "open": YELLOW, "not measured": DARK}
 # Half width of a cut along the seam and half its extent across and down, mm.
 _SLICE, _ACROSS, _DOWN = 4.0, 32.0, 14.0
 _RECORDED_POINTS = 300_000
@@ -113,7 +114,7 @@ def _draw_cut(ax: Axes, job: SeamJob, station: Station, seam: Seam) -> None:
     local = frames.transform(T, job.scan.points)
     near = (np.abs(local) < [_ACROSS, _SLICE, _DOWN]).all(axis=1)
     a, _, h = local[near].T
-    ax.scatter(a, h, s=2, c=np.where(a < 0, "#4878a8", "#555555"), lw=0)
+    ax.scatter(a, h, s=2, c=np.where(a < 0, BLUE, DARK), lw=0)
     colour = VERDICTS[seam.verdict]
     for edge in (seam.inner, seam.outer):
         if edge is not None:
