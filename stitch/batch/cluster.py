@@ -17,6 +17,9 @@ _SETTINGS = {
     "distributed.scheduler.worker-saturation": 1.0,
     # A session may be given to a second worker, and no further while others are waiting.
     "distributed.scheduler.allowed-failures": 1,
+    # Sessions take seconds: nothing has to look at the workers a hundred times in each.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
 }
