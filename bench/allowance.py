@@ -109,6 +109,11 @@ def main() -> None:
             rows.append(numbers_of(seen, T, fit(seen, cad, start, wanted=wanted), cad, stock))
         lines.append(row(name, np.array(rows)))
         print(lines[-1], flush=True)
+        write(lines)
+
+
+def write(lines: list[str]) -> None:
+    """Put the table into the page."""
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(
         text.split(BEGIN)[0] + BEGIN + "\n" + "\n".join(lines) + "\n" + END + text.split(END)[1], encoding="utf-8"
