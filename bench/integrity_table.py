@@ -54,7 +54,7 @@ def many(rows: Sequence[Row]) -> None:
         "| wrong views | sessions | refused | all of them left out | some fused, said so | silent | right ones lost |"
     )
     print("|---|---|---|---|---|---|---|")
-    for case, own in cases(rows).items():
+    for case, own in cases(rows, lambda r: str(r["case"]).split(" ", 3)[3]).items():
         mixed = [r for r in own if r.get("mixed")]
         refused, silent = (
             sum(bool(x) for x in own_) for own_ in ((r["ended"] == "refused" for r in own), (r["silent"] for r in own))
