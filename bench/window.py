@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from data_synth import window_scans, window_views
@@ -92,7 +93,9 @@ def fit_table(door, pane, draws: int) -> list[str]:
 
 def write_map(scan, cad, T) -> None:
     figure = deviation_map(deviations(scan, cad, T, 0.5, cad.size / 60))
-    figure.savefig(PICTURES / "window-map.png", dpi=100)
+    path = PICTURES / "window-map.png"
+    figure.savefig(path, dpi=100)
+    Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def seam_table(door, draws: int) -> list[str]:

@@ -15,7 +15,7 @@ from viz.part_camera import Camera
 # Of the longest side of the part, from its middle: all of it is in the picture.
 _AWAY = 1.2
 # What is seen at distance 1, about.
-_HIGH, _WIDE = 1.1, 1.6
+_HIGH, _WIDE = 0.95, 1.4
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
