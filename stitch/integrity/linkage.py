@@ -5,7 +5,7 @@ with surfaces that cross, has correspondences too, but they do not close: it lin
 of the fit ignore it without a word. That is how a displaced view used to end at an rms of zero.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,8 +64,12 @@ class Linkage:
         return sum(link.count for link in own) / total if total else 0.0
 
 
-def linkage(overlaps: Overlaps) -> Linkage:
-    """Components, cut views and views held by a single pair, from the correspondences at the poses of `overlaps`."""
+def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
+    """Components, cut views and views held by a single pair, from the correspondences at the poses of `overlaps`.
+
+    Args:
+        holding_nothing: views whose scans hold no pose, however well they lie on the others.
+    """
     views = overlaps.gram.views
     found = {(m.v, m.w): len(m.residual) for m in overlaps.matches}
     links = []
@@ -73,6 +77,8 @@ def linkage(overlaps: Overlaps) -> Linkage:
         if overlaps.gram.labelled[i]:
             # Common targets have names: they always belong together.
             links.append(Link(int(v), int(w), _FEWEST, 1.0))
+        elif v in holding_nothing or w in holding_nothing:
+            continue
         elif found.get((int(v), int(w))):
             count = int(overlaps.gram.count[i])
             links.append(Link(int(v), int(w), count, count / found[int(v), int(w)]))

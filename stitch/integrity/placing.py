@@ -81,8 +81,11 @@ def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolera
 
 def shows_no_surface(scan: Scan) -> bool:
     """True for a scan of so few points, or of points in one line, that it fits anywhere."""
-    if scan.usable.sum() < _FEWEST:
-        return True
+    return bool(scan.usable.sum() < _FEWEST) or lies_in_a_line(scan)
+
+
+def lies_in_a_line(scan: Scan) -> bool:
+    """True for a scan of points in one straight line: on a flat part it lies on the surface, and holds nothing."""
     extent = np.linalg.svd(scan.points - scan.points.mean(axis=0), compute_uv=False)
     return bool(extent[1] < _LINE * extent[0])
 

@@ -14,7 +14,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.blunders import Block, Found, find_blunders, off_anyway
 from stitch.integrity.linkage import Linkage, linkage
-from stitch.integrity.placing import judge, place, surface_of
+from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
 from stitch.integrity.unlinked_views import needed_closure, placed_views
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
@@ -100,7 +100,8 @@ def snoop(
     """
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
-    linked = linkage(freed.overlaps)
+    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
+    linked = linkage(freed.overlaps, lines)
     tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
     needed = needed_closure(capture, freed.poses, linked, tolerance)
     placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
@@ -121,7 +122,7 @@ def snoop(
     if sure and usual is not None:
         again = find_blunders(model.with_usual(usual(freed)), alone)
         sure &= {b.view for b in again.blunders} | set(linked.unlinked)
-    groups = linkage(freed.overlaps).components
+    groups = linkage(freed.overlaps, lines).components
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
     misplaced = [m for m in standing_out if m.view in sure] + foreign
     return Snooping(

@@ -7,6 +7,7 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
+from stitch.integrity.placing import lies_in_a_line
 from stitch.integrity.relative_scans import relative_scans
 from stitch.integrity.snooping import snoop
 from stitch.measurement.scan import prepare_view
@@ -53,6 +54,19 @@ def test_a_scan_of_something_else_belongs_nowhere(cell):
     scans = (*own.scans[:OFF], waves, *own.scans[OFF + 1 :])
     found = snoop(replace(own, scans=scans), measured.T_mount, GATE)
     assert [(m.view, m.kind) for m in found.misplaced] == [(OFF, "foreign")]
+
+
+def test_a_scan_of_a_line_on_the_surface_holds_no_pose(cell):
+    """It lies on the surface of the others, as it would if it were turned about itself."""
+    measured, own = cell
+    scan = own.scans[OFF]
+    # Of the scan's own points those near one scan line, drawn into it.
+    along = scan.points[scan.usable][:400] - scan.points[scan.usable][:400].mean(axis=0)
+    direction = np.linalg.svd(along, full_matrices=False)[2][0]
+    line = scan.points.mean(axis=0) + np.linspace(-5, 5, 400)[:, None] * direction
+    assert lies_in_a_line(prepare_view("line", line)) and not lies_in_a_line(scan)
+    scans = (*own.scans[:OFF], prepare_view("line", line), *own.scans[OFF + 1 :])
+    assert snoop(replace(own, scans=scans), measured.T_mount, GATE).left_out == (OFF,)
 
 
 def test_motions_between_scans_are_those_of_the_cell(cell):
