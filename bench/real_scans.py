@@ -124,7 +124,7 @@ def speed() -> None:
     found = correct([c], m.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5])), 0.35 * part_size([c]))
     marks.append(time.perf_counter())
     poses = c.poses(found.hand_eye.T_mount)
-    register(c, poses, found.hand_eye.repeatability[0], found.overlaps[0].gate, start=found.freed[0])
+    register(c, poses, found.hand_eye.repeatability[0], found.overlaps[0].gate, start=found.freed[0].poses)
     marks.append(time.perf_counter())
     prepare, corrected, registered = np.diff(marks)
     points = sum(len(s.points) for s in c.scans)
