@@ -26,7 +26,9 @@ class Story:
         )
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(address, timeout=LONG)
+        # Clicks too: a viewer drawn by a busy processor keeps a page waiting.
+        self.page.set_default_timeout(LONG)
+        self.page.goto(address)
         self.expect("#scene.live").to_be_visible()
 
     def expect(self, place):
