@@ -7,7 +7,9 @@ Needs a Chromium on the path, a software renderer for Rerun (Mesa's Vulkan drive
 
 import argparse
 import io
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -89,7 +91,8 @@ def recording(run: Path) -> None:
     """Every tab of the recording, and the moments of `model`."""
     program = Path(sys.executable).with_name("rerun")
     arguments = [program, run / "recording.rrd", "--headless", "--port", str(_PORT), "--window-size", _WINDOW]
-    shown = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    shown = subprocess.Popen(arguments, **quiet, start_new_session=True)
     try:
         client = _loaded()
         for tab, name in enumerate(("before-after", "model", "missing", "cell", "error")):
@@ -109,7 +112,8 @@ def recording(run: Path) -> None:
                 picture = picture.crop((0, _TITLE, *picture.size))
                 keep(picture, f"recording-{name}" + ("" if moment is None else f"-{moment}"))
     finally:
-        shown.terminate()
+        # The viewer too, which the launcher leaves behind: the next recording would open in it.
+        os.killpg(shown.pid, signal.SIGTERM)
         shown.wait()
 
 
