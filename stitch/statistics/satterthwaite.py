@@ -12,7 +12,7 @@ import numpy as np
 from stitch.frames import Array
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.variance_components import VarianceFit
+from stitch.statistics.variance_components import VarianceFit, whitener
 from stitch.statistics.variance_prior import prior_information
 
 # More is as good as knowing it.
@@ -37,7 +37,7 @@ class Satterthwaite:
 
 def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     """From the fit without the columns that are asked for."""
-    half = np.linalg.inv(np.linalg.cholesky(mixed.covariance(null.variances)))
+    half = whitener(mixed, null.variances)
     white = null.variances[:, None, None, None] * (half @ mixed.components @ half.transpose(0, 2, 1))
     mean = half @ mixed.A
     U = column_space(mean.reshape(-1, mean.shape[2])).reshape(*mean.shape[:2], -1)
