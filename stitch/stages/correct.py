@@ -68,8 +68,12 @@ def close_in(
     recorder = recorder or Silent()
     picked = [[sample(scan, samples) for scan in capture.scans] for capture in captures]
     gates, history = list(gates), []
+    overlaps: list[Overlaps] = []
     for index in range(maximum):
-        overlaps = [collect(c, c.poses(T_mount), gate, s) for c, gate, s in zip(captures, gates, picked, strict=True)]
+        overlaps = [
+            collect(c, c.poses(T_mount), gate, s, before)
+            for c, gate, s, before in zip(captures, gates, picked, overlaps or [None] * len(captures), strict=True)
+        ]
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount)

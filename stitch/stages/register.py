@@ -71,8 +71,9 @@ def register(
     recorder = recorder or Silent()
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
     poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
+    overlaps: Overlaps | None = None
     for index in range(_MAXIMUM_ITERATIONS):
-        overlaps = collect(capture, poses, gate, picked)
+        overlaps = collect(capture, poses, gate, picked, overlaps)
         history.append(overlaps.gram.rms)
         recorder.iteration("register", index, poses, overlaps.gram.rms, gate)
         centre = overlaps.gram.centre

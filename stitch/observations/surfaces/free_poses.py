@@ -59,7 +59,7 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
         to_centre = frames.make(np.eye(3), -overlaps.gram.centre)
         poses = frames.inverse(to_centre) @ frames.exp(step) @ to_centre @ poses
         gate = min(gate, next_gate(overlaps, capture))
-        overlaps = collect(capture, poses, gate, picked)
+        overlaps = collect(capture, poses, gate, picked, overlaps)
         if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * overlaps.gram.scale:
             break
     return FreePoses(poses, np.zeros((len(poses), 6)), overlaps).seen_from(model_poses)

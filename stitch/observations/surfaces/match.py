@@ -53,12 +53,12 @@ def overlapping_pairs(
     probes = [sample(scan, min(at_most, _PROBES)) for scan in scans]
 
     def overlap(pair: tuple[int, int]) -> bool:
-        share = 0.0
         for a, b in (pair, pair[::-1]):
             if len(probes[a]):
-                distance, _, agree = search(scans[a], scans[b], probes[a], poses[a], poses[b], gate)
-                share = max(share, float(np.mean(np.isfinite(distance) & agree)))
-        return share >= _MINIMUM_OVERLAP
+                _, _, agree = search(scans[a], scans[b], probes[a], poses[a], poses[b], gate)
+                if np.mean(agree) >= _MINIMUM_OVERLAP:
+                    return True
+        return False
 
     pairs = list(combinations(range(len(scans)), 2))
     return [pair for pair, meets in zip(pairs, parallel(overlap, pairs), strict=True) if meets]

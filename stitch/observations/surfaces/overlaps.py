@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
@@ -17,6 +18,8 @@ FINE_SAMPLES = 3000
 # Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
 _GATE_SPACINGS = 1.5
 _GATE_SIGMAS = 4.0
+# Which pairs overlap is not asked again before a view has moved, or the gate closed, by so much of the gate.
+_SAME_PAIRS = 0.3
 
 
 @dataclass(frozen=True)
@@ -28,15 +31,26 @@ class Overlaps:
     gram: Gram
     gate: float
     targets: TargetPairs | None = None
+    probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
 
 
-def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> Overlaps:
+def collect(
+    capture: Capture, poses: Array, gate: float, samples: Sequence[Indices], before: Overlaps | None = None
+) -> Overlaps:
     """Match all overlapping pairs within `gate` and accumulate their normal equations.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+        before: of an iteration before; its pairs serve again where little has moved since they were found.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
+    if before is not None and before.probed is not None and _little_moved(before, poses, gate):
+        pairs, probed = before.pairs, before.probed
+    else:
+        pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
+        probed = np.array(poses), gate
     matches = list(match(capture.scans, poses, pairs, gate, samples))
     if not matches:
         raise NoResultError(
@@ -46,7 +60,17 @@ def collect(capture: Capture, poses: Array, gate: float, samples: Sequence[Indic
     centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
     surfaces = gram(matches, len(capture.scans), centre, robust_scale(matches))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
-    return Overlaps(pairs, matches, joined(surfaces, targets, capture.noise_factor), gate, targets)
+    return Overlaps(pairs, matches, joined(surfaces, targets, capture.noise_factor), gate, targets, probed)
+
+
+def _little_moved(before: Overlaps, poses: Array, gate: float) -> bool:
+    """Whether no view has moved, and the gate has not changed, by enough to make other pairs overlap."""
+    assert before.probed is not None
+    T, probed_gate = before.probed
+    to_centre = frames.make(np.eye(3), -before.gram.centre)
+    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
+    moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
+    return bool(max(moved.max(), abs(probed_gate - gate)) < _SAME_PAIRS * min(gate, probed_gate))
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:
