@@ -23,10 +23,11 @@ from unknown_worlds import PARTS
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
+from stitch.diagnosis.unnamed_errors import unnamed_errors
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (800,)
+DEVELOPMENT, HELD_OUT = (0, 1), (800, 801, 802, 803)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 
 
@@ -38,11 +39,12 @@ class Trial:
     hidden: tuple[str, ...]
     verdict: str
     named: tuple[str, ...]
+    follows: str  # what is said to repeat without a name
     seconds: float
 
     def __str__(self) -> str:
         hidden, named = ", ".join(self.hidden) or "nothing", " ".join(self.named)
-        return f"{self.cell}: {hidden} → {self.verdict} {named} ({self.seconds:.1f} s)"
+        return f"{self.cell}: {hidden} → {self.verdict} {named}{self.follows} ({self.seconds:.1f} s)"
 
     @property
     def single(self) -> bool:
@@ -53,6 +55,16 @@ class Trial:
     def alarm(self) -> bool:
         """A name or a group."""
         return bool(self.named)
+
+    @property
+    def joint(self) -> bool:
+        """One joint is said to follow a law without a name."""
+        return "above all" in self.follows
+
+    @property
+    def right_joint(self) -> bool:
+        """And it is that one."""
+        return self.joint and any(f"{name} " in self.follows for name in self.hidden)
 
     @property
     def right(self) -> bool:
@@ -72,7 +84,9 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         found = concluded(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
         cell = f"{a.cell.scene} {a.cell.seed}"
-        yield Trial(cell, hidden, found.verdict, names, time.process_time() - begun)
+        follows = unnamed_errors(linear) if found.verdict == "unknown_effect" else ()
+        words = ", ".join(u.words for u in follows)
+        yield Trial(cell, hidden, found.verdict, names, words, time.process_time() - begun)
 
 
 def shares(part: str, found: Sequence[Trial]) -> str:
@@ -85,6 +99,8 @@ def shares(part: str, found: Sequence[Trial]) -> str:
         lambda t: all(name in t.named for name in t.hidden) if t.hidden else False,
         lambda t: t.verdict == "unknown_effect",
         lambda t: t.verdict == "adequate",
+        lambda t: t.right_joint,
+        lambda t: t.joint and not t.right_joint,
     ]
     told = [f"{share(found, hit)}" for hit in columns]
     return f"| {part} | {' | '.join(told)} |"
@@ -119,8 +135,9 @@ def main() -> None:
         rows = [
             shares(part, list(told(part, cells, options.as_before, options.fewer))) for part in options.parts.split(",")
         ]
-    print("\n| world | wrong name | wrong group | right name | right name or group | all of it | unknown | adequate |")
-    print("|---|---|---|---|---|---|---|---|", *rows, sep="\n")
+    heads = ("wrong name", "wrong group", "right name", "right name or group", "all of it", "unknown", "adequate")
+    print(f"\n| world | {' | '.join(heads)} | right joint above all | wrong joint |")
+    print("|---" * (len(heads) + 3) + "|", *rows, sep="\n")
     print(f"\n{time.process_time():.0f} s of processor time")
 
 

@@ -25,10 +25,11 @@ def memory(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
 
 def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """A law outside every dictionary; couplings as often as three others."""
-    law = (["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")])[k % (len(UNNAMED) + 1)]
+    law = _in_turn(["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")], k)
     error = UNNAMED[law](a.cell.plan, rng)
     of_flange = error.shape[1] == 6 and law in IN_TIME
-    return World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error}), (law,)
+    world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
+    return world, (law,) if of_flange else (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))
 
 
 def effect(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
@@ -53,12 +54,12 @@ def two(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, .
 
 Part = Callable[[Asked, np.random.Generator, int], tuple[World, tuple[str, ...]]]
 PARTS: dict[str, tuple[Part, int]] = {
-    "nothing": (nothing, 24),
-    "memory": (memory, 24),
-    "unnamed": (unnamed, 32),
-    "effect": (effect, 42),
-    "beside": (beside, 21),
-    "two": (two, 21),
+    "nothing": (nothing, 100),
+    "memory": (memory, 100),
+    "unnamed": (unnamed, 120),
+    "effect": (effect, 126),
+    "beside": (beside, 42),
+    "two": (two, 42),
 }
 
 
@@ -69,7 +70,12 @@ def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> natur
 def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:
     """The k-th effect that this cell can have and show."""
     able = [name for name in LIBRARY if any(c.name == name for c in a.candidates)]
-    return able[k % len(able)]
+    return _in_turn(able, k)
+
+
+def _in_turn(names: Sequence[str], k: int) -> str:
+    """All names in turn, each turn one place on, so that every cell gets every name."""
+    return names[(k + k // len(names)) % len(names)]
 
 
 def _at(a: Asked, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> tuple[World, tuple[str, ...]]:

@@ -64,9 +64,12 @@ def visible(surface: PartSurface, camera: Camera) -> Seen:
     place = np.einsum("sc,sci->si", weight, flat[corner])
     column, row = ((place[:, :2] - low) * scale + 0.5).astype(np.int64).T
     pixel = (high - 1 - np.clip(row, 0, high - 1)) * wide + np.clip(column, 0, wide - 1)
-    order = np.lexsort((-place[:, 2], pixel))
-    shown, first = np.unique(pixel[order], return_index=True)
-    best = order[first]
+    # Painted from the back to the front: the last one that falls on a pixel stays.
+    order = np.argsort(place[:, 2])
+    front = np.full(high * wide, -1)
+    front[pixel[order]] = order
+    shown = np.flatnonzero(front >= 0)
+    best = front[shown]
     return Seen((high, wide), shown, corner[best], weight[best])
 
 

@@ -10,7 +10,8 @@ from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
-from stitch.diagnosis.selection.verdict import Selection, select, validated
+from stitch.diagnosis.selection.upheld import validated
+from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias

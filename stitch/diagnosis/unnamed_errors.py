@@ -4,12 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stitch.diagnosis.joint_laws import joint_laws
 from stitch.diagnosis.thresholds import ODDS
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
+_JOINTS = "follow the joints"
 _WANDERING, _STOPS = ("wandering rotation", "wandering translation"), ("stop rotation", "stop translation")
 
 
@@ -29,22 +31,37 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
     three nats (`variance_prior.py`), which the odds of 20 to 1 stand for.
     """
-    if linear.pose_errors is None or _gain(linear, linear.scatter_only.null.deviance) < ODDS:
+    if linear.pose_errors is None:
         return ()
+    law = _clear_law(linear)
+    if _gain(linear, linear.scatter_only.null.deviance) < ODDS:
+        return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
-        "follow the joints": tuple(n for n in names if n not in (*_WANDERING, *_STOPS)),
+        _JOINTS: tuple(n for n in names if n not in (*_WANDERING, *_STOPS)),
         "wander in time": _WANDERING,
         "are shared by the scans of a stop": _STOPS,
     }
     found = [
-        Unnamed(words, _gain(linear, _deviance_without(linear, kind)), words == "follow the joints")
+        Unnamed(words, _gain(linear, _deviance_without(linear, kind)), words == _JOINTS)
         for words, kind in kinds.items()
         if any(name in kind for name in names)
     ]
     wanted = sorted((u for u in found if u.log_bayes_factor > ODDS), key=lambda u: -u.log_bayes_factor)
+    if law is not None:
+        return (law, *(u for u in wanted if not u.joints))
     # Where each can stand in for the other, the likelier alone is said to be there.
     return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
+
+
+def _clear_law(linear: LinearModel) -> Unnamed | None:
+    """That of one joint beside all that the prior holds, likelier than 20 to 1 though it is the best of all joints'."""
+    laws = joint_laws(linear)
+    if not laws or laws[0].log_bayes_factor < ODDS + np.log(len(laws)):
+        return None
+    near = sorted(law.joint for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS)
+    which = " or ".join(f"joint {joint}" for joint in near)
+    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True)
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:

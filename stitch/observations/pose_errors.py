@@ -25,7 +25,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
-from stitch.statistics.kernels import alike_in_joints, alike_in_time, spread_over
+from stitch.statistics.kernels import SmoothErrors, alike_in_joints, alike_in_time, spread_over
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth, or
 # wanders, is usually smaller (rad, mm).
@@ -49,6 +49,7 @@ class PoseErrors:
     components: Array  # (c, 6V, 6V) per unit of each
     scales: Array  # (c,) that their σ usually has
     effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
+    of_joints: SmoothErrors | None = None  # what each joint alone may do without a name; in none of the components
 
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
@@ -71,9 +72,13 @@ class PoseErrors:
                 untouched = len(every) == len(those)
                 components.append(self.components[i] if untouched else np.sum([own @ own.T for own in those], axis=0))
         n = self.components.shape[1]
-        return PoseErrors(
-            tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n), self.scales[keep], left
-        )
+        names, kept = tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n)
+        return PoseErrors(names, kept, self.scales[keep], left, self.of_joints)
+
+    def beside(self, name: str, component: Array, scale: float) -> "PoseErrors":
+        """The same with a further component (n, n)."""
+        components = np.concatenate([self.components, component[None]])
+        return replace(self, names=(*self.names, name), components=components, scales=np.append(self.scales, scale))
 
 
 def white(views: int) -> PoseErrors:
@@ -90,7 +95,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white(sum(m.views.count for m in measurements))
-    found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
+    found, members, of_joints = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]](), None
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
@@ -100,7 +105,10 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
             found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM)
         constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
         links = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
-        found["smooth"] = (spread_over(links, alike_in_joints(joints)), _SMOOTH)
+        alike = alike_in_joints(joints)
+        found["smooth"] = (spread_over(links, alike), _SMOOTH)
+        if constant[0].name == _CONSTANT[0]:
+            of_joints = SmoothErrors(links[:, : joints.shape[1]], alike)
     flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
     halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
     unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}
@@ -112,7 +120,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         for name, half in halves.items():
             found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
     components = np.array([c for c, _ in found.values()])
-    return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]), members)
+    return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]), members, of_joints)
 
 
 def _carried(measurement: Measurement, centre: Array) -> Array:

@@ -68,12 +68,10 @@ def close_in(
     recorder = recorder or Silent()
     picked = [[sample(scan, samples) for scan in capture.scans] for capture in captures]
     gates, history = list(gates), []
-    overlaps: list[Overlaps] = []
+    before: Sequence[Overlaps | None] = [None] * len(captures)
     for index in range(maximum):
-        overlaps = [
-            collect(c, c.poses(T_mount), gate, s, before)
-            for c, gate, s, before in zip(captures, gates, picked, overlaps or [None] * len(captures), strict=True)
-        ]
+        every = zip(captures, gates, picked, before, strict=True)
+        before = overlaps = [collect(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount)

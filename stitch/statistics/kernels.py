@@ -1,5 +1,7 @@
 """Covariances between views: how alike two views err that are near in time, near in pose, or the same pose."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from stitch.frames import Array
@@ -25,6 +27,18 @@ def alike_in_time(time: Array) -> Array:
     """(V, V) of a process that forgets (Ornstein–Uhlenbeck), quick and slow; time (V,) in steps from view to view."""
     apart = np.abs(time[:, None] - time[None, :])
     return np.asarray(0.5 * np.exp(-apart / _QUICK) + 0.5 * np.exp(-apart / _SLOW))
+
+
+@dataclass(frozen=True)
+class SmoothErrors:
+    """Errors Σ_p f_p(view)·column_p of all views, with smooth processes f_p that nobody wrote down."""
+
+    columns: Array  # (6V, P) twists of the views per unit of each process
+    alike: Array  # (V, V) covariance of each
+
+    def of(self, p: int) -> Array:
+        """(6V, 6V) covariance of the twists by process p alone."""
+        return spread_over(self.columns[:, [p]], self.alike)
 
 
 def spread_over(columns: Array, alike: Array) -> Array:

@@ -4,21 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
+from scipy.stats import multivariate_normal
 
 from data_synth import kinematics
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.ordinary_arm import with_memory
+from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.joint_laws import joint_laws
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
+from stitch.diagnosis.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.surface_model import surface_model
+from stitch.statistics.variance_prior import NOISE, log_prior
 
 # Effects that move views as wholes; those of points take longer to ask for.
 ASKED = (
@@ -74,3 +80,47 @@ def test_poses_that_wander_get_no_name(cell):
         wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([6e-4, 0.6], 3)
         found, _ = said_of(cell, measured.T_base_flange @ frames.exp(wander))
         assert found.verdict == "unknown_effect" and not found.named
+
+
+@pytest.mark.parametrize(("law", "seed", "joint"), [("dress_pack", 2, 2), ("coupling", 1, 3), ("coupling", 3, 2)])
+def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law, seed, joint):
+    """0.3 mrad by laws of no library, which beside all joints and links at once look like one of them."""
+    measured, *_ = cell
+    off = 2 * UNNAMED[law](measured.plan, np.random.default_rng(seed))
+    assert np.flatnonzero(np.abs(off).sum(axis=0)) + 1 == joint
+    found, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
+    assert found.verdict == "unknown_effect" and not found.named
+    assert unnamed_errors(linear)[0].words == f"follow the joints, joint {joint} above all"
+
+
+def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
+    """Against the density of what the hand-eye leaves, by scipy: scatter, the law at many sizes, of all else little."""
+    measured, *_ = cell
+    off = 2 * UNNAMED["coupling"](measured.plan, np.random.default_rng(1))
+    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
+    law, errors = joint_laws(linear)[0], linear.pose_errors
+    free = null_space(linear.mixed.A[0].T).T
+    R, usual = free @ linear.observation.channel.reduction, errors.scales[errors.names.index("smooth")]
+    every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
+    own, scales = R @ errors.of_joints.of(law.joint - 1) @ R.T, np.append(errors.scales, usual)
+
+    def likely(variances, components):
+        covariance = np.tensordot(variances, components, axes=1)
+        prior = log_prior(np.log(variances), scales[: len(variances) - NOISE - 1])[0]
+        return multivariate_normal(cov=covariance).logpdf(free @ linear.mixed.z[0]) - 0.5 * prior
+
+    without = likely(linear.null.variances, every)
+    scatter = linear.null.variances[: NOISE + 1]
+    tried = [
+        np.concatenate([scatter * share, 1e-3 * errors.scales**2, [times * usual**2]])
+        for share in (0.3, 1.0)
+        for times in np.geomspace(1e-2, 1e4, 100)
+    ]
+    by_hand = max(likely(variances, [*every, own]) for variances in tried) - without
+    assert 5 < by_hand < law.log_bayes_factor + 0.02
+
+
+def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):
+    measured, *_ = cell
+    _, linear = said_of(cell, measured.T_base_flange)
+    assert max(law.log_bayes_factor for law in joint_laws(linear)) < 1

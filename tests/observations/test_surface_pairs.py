@@ -42,6 +42,20 @@ def test_views_that_face_away_do_not_overlap(blade_capture):
     assert all(2 not in pair for pair in overlapping_pairs(capture.scans, far, 2.0))
 
 
+def test_pairs_serve_again_until_something_has_moved(blade_capture, overlaps):
+    """Little motion: all correspondences as if pairs had been looked for; far away, or with another gate: they are."""
+    measured, capture = blade_capture
+    samples = [sample(s, 400) for s in capture.scans]
+    near = capture.poses(measured.T_mount) @ frames.make(np.eye(3), np.array([0.0, 0.1, 0.0]))
+    again, anew = (collect(capture, near, 2.0, samples, before) for before in (overlaps, None))
+    assert again.probed[0] is overlaps.probed[0] and anew.probed[0] is not overlaps.probed[0]
+    assert again.pairs == anew.pairs and np.array_equal(again.gram.matrix, anew.gram.matrix)
+    apart = near.copy()
+    apart[2, :3, 3] += 1e4
+    assert all(2 not in pair for pair in collect(capture, apart, 2.0, samples, overlaps).pairs)
+    assert collect(capture, near, 4.0, samples, overlaps).probed[1] == 4.0
+
+
 def test_pair_equations_against_finite_differences(blade_capture, overlaps):
     """Moving view v by a twist changes every residual of its pairs by B·δ, normals turning along."""
     measured, capture = blade_capture

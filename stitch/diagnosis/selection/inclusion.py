@@ -8,6 +8,7 @@ the other's part: then the smallest set is sought without which the views cannot
 from collections.abc import Sequence
 from dataclasses import replace
 
+from stitch.diagnosis import joint_laws
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import score
 from stitch.diagnosis.selection.ranking import Ranked, certain, contends, rank, ranked_one
@@ -59,6 +60,8 @@ def wanted_group(linear: LinearModel, candidates: Sequence[Candidate], tests: in
         removed.add(max(others, key=lambda name: _factor(linear.without({*removed, name}), known[best.name])))
     base = linear.without(removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
+    if joint_laws.contends(base, again[0].log_posterior):
+        return ()
     near = [r for r in again if contends(r) and r.log_posterior > again[0].log_posterior - ODDS]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
     return tuple(near) if len(near) > 1 else again

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stitch.diagnosis import joint_laws
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
 from stitch.diagnosis.selection.forward_selection import forward_selection
@@ -12,16 +13,12 @@ from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
 from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
-    BEYOND_CHANCE,
     LOG_BAYES_FACTOR,
     MANY_VIEWS,
     ODDS,
     PRIOR_PHYSICAL,
-    STEADY,
 )
 from stitch.diagnosis.unnamed_errors import unnamed_errors
-from stitch.diagnosis.validation.cross_validation import CrossValidation
-from stitch.diagnosis.validation.halves import Halves
 from stitch.observations.linear_model import LinearModel
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
@@ -64,11 +61,10 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return replace(unknown, notes=tuple(refused.values()))
         best = found.effects[0] if found.effects else best
         second = found.effects[1] if len(found.effects) > 1 else None
-    elif stray is not None and stray.log_posterior > best.log_posterior + ODDS:
+    elif _outdone(base, best, stray):
         # Two known effects at once may look like none of them: try the best with a second one.
         second = _second(linear, candidates, best)
-        more = 0.0 if second is None else second.score.log_bayes_factor + np.log(PRIOR_PHYSICAL / len(ranked))
-        if stray.log_posterior > best.log_posterior + more + ODDS:
+        if second is None or _outdone(base, best, stray, second, len(ranked)):
             return unknown
     if _order_open(base, best, empirical):
         return unknown
@@ -91,48 +87,21 @@ def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
     return None
 
 
-def validated(
-    selection: Selection,
-    found: dict[str, CrossValidation | None],
-    in_halves: dict[str, Halves | None],
-    wrong_anyway: bool,
-) -> tuple[Selection, tuple[str, ...]]:
-    """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
-    one may be.
+def _outdone(
+    base: LinearModel, best: Ranked, stray: Ranked | None, second: Ranked | None = None, tests: int = 1
+) -> bool:
+    """True where something without a name does what an effect of the library does, with a second one or alone.
 
-    What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
-    beyond chance.
+    A shape without a cause must be 20 to 1 likelier; a joint that follows the joint angles by no law must be 20 to 1
+    less likely, as all others that might have the name.
+
+    Args:
+        tests: effects among which the second was chosen.
     """
-    if selection.verdict != "missing_effect":
-        return selection, selection.notes
-    verdicts, notes = list[str](), list(selection.notes)
-    for named in (selection.named[0], selection.second):
-        if named is None:
-            continue
-        refusal = _refused(named, found.get(named.name), in_halves.get(named.name), wrong_anyway)
-        if refusal is None:
-            if named is selection.named[0]:
-                return selection, selection.notes
-            return replace(selection, named=(named,), second=None), tuple(notes)
-        verdicts.append(refusal[0])
-        notes.append(refusal[1])
-    nothing = Selection(verdicts[0], (), selection.ranked, selection.empirical)
-    return nothing, tuple(notes[: len(selection.notes) + 1])
-
-
-def _refused(
-    named: Ranked, left_out: CrossValidation | None, halves: Halves | None, wrong_anyway: bool
-) -> tuple[str, str] | None:
-    """Verdict and reason if an effect does not stand the test of views left out."""
-    otherwise = "unknown_effect" if wrong_anyway else "adequate"
-    if left_out is not None and left_out.steadiness < STEADY:
-        note = f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
-        return "unknown_effect" if named.adjusted < BEYOND_CHANCE else otherwise, note
-    if left_out is not None and not left_out.helps:
-        share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
-        return otherwise, f"{named.name} would not help on views left out (mean square pose error {share} of now)"
-    objection = None if halves is None else halves.objection(named.name)
-    return None if objection is None else (otherwise, objection)
+    more = 0.0 if second is None else second.score.log_bayes_factor + float(np.log(PRIOR_PHYSICAL / tests))
+    if stray is not None and stray.log_posterior > best.log_posterior + more + ODDS:
+        return True
+    return joint_laws.contends(base, best.log_posterior + more)
 
 
 def _order_open(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) -> bool:

@@ -1,0 +1,65 @@
+"""Laws without a name as rivals of those that have one: what a single joint does by no law that anybody wrote down.
+
+A name is worth no more than what it is compared with. All joints and links following the pose at once (`smooth` in the
+prior of pose errors) is a poor rival: it may do so much that it is believed to do little of anything. One joint that is
+off by a smooth function of the joint angles is what a coupling, a hose, a worn tooth or a gear with play really does,
+and where it explains the views about as well as an effect of the library, these views cannot tell which it is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.frames import Array
+from stitch.observations.error_model import with_errors
+from stitch.observations.linear_model import LinearModel
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.variance_components import at_variances, fit_variances
+
+# Of how many usual variances such a law may be where the search for its size begins.
+_TIMES = (0.01, 1.0, 30.0)
+# What a size that is wanted costs beside one that is known: ∫ of its prior over log σ against the value at the maximum.
+_WIDTH = 3.0
+
+
+@dataclass(frozen=True)
+class JointLaw:
+    """One joint that follows the joint angles by a law without a name."""
+
+    joint: int  # counted from 1
+    log_bayes_factor: float  # over everything else that may be there, at the likeliest size
+
+
+def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
+    """What such a law of each joint explains beside a model, likeliest first; () without joints or prior of errors.
+
+    Its size is fitted with all others; `contends` charges it for the width of its prior.
+    """
+    errors = base.pose_errors
+    if errors is None or errors.of_joints is None:
+        return ()
+    scale = float(errors.scales[errors.names.index("smooth")])
+    found = []
+    for k in range(errors.of_joints.columns.shape[1]):
+        half = base.reduce(errors.of_joints.of(k))
+        mixed = with_errors(base.mixed, errors.beside(f"joint {k + 1}", base.reduce(half.T), scale))
+        found.append(JointLaw(k + 1, 0.5 * (base.null.deviance - _deviance(base, mixed, scale**2))))
+    return tuple(sorted(found, key=lambda law: -law.log_bayes_factor))
+
+
+def contends(base: LinearModel, log_posterior: float) -> bool:
+    """Whether what has this log posterior in the same model is less than 20 to 1 likelier than a law of one joint."""
+    laws = joint_laws(base)
+    if not laws:
+        return False
+    own = laws[0].log_bayes_factor - _WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws)))
+    return own > log_posterior - ODDS
+
+
+def _deviance(base: LinearModel, mixed: MixedModel, usual: float) -> float:
+    """At its minimum, sought from the likeliest of several starts."""
+    nulls = [at.null.variances for at in (base, *base.elsewhere)]
+    starts: list[Array] = [np.append(null, times * usual) for null in nulls for times in _TIMES]
+    best = min(starts, key=lambda start: at_variances(mixed, start).deviance)
+    return fit_variances(mixed, start=best).deviance

@@ -1,0 +1,53 @@
+"""Whether a name stands before the views that took no part in choosing it."""
+
+from dataclasses import replace
+
+from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.thresholds import BEYOND_CHANCE, STEADY
+from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation.halves import Halves
+
+
+def validated(
+    selection: Selection,
+    found: dict[str, CrossValidation | None],
+    in_halves: dict[str, Halves | None],
+    wrong_anyway: bool,
+) -> tuple[Selection, tuple[str, ...]]:
+    """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
+    one may be.
+
+    What is left then is below what matters, unless the scatter is one that no arm has, or the one view stands out
+    beyond chance.
+    """
+    if selection.verdict != "missing_effect":
+        return selection, selection.notes
+    verdicts, notes = list[str](), list(selection.notes)
+    for named in (selection.named[0], selection.second):
+        if named is None:
+            continue
+        refusal = _refused(named, found.get(named.name), in_halves.get(named.name), wrong_anyway)
+        if refusal is None:
+            if named is selection.named[0]:
+                return selection, selection.notes
+            return replace(selection, named=(named,), second=None), tuple(notes)
+        verdicts.append(refusal[0])
+        notes.append(refusal[1])
+    nothing = Selection(verdicts[0], (), selection.ranked, selection.empirical)
+    return nothing, tuple(notes[: len(selection.notes) + 1])
+
+
+def _refused(
+    named: Ranked, left_out: CrossValidation | None, halves: Halves | None, wrong_anyway: bool
+) -> tuple[str, str] | None:
+    """Verdict and reason if an effect does not stand the test of views left out."""
+    otherwise = "unknown_effect" if wrong_anyway else "adequate"
+    if left_out is not None and left_out.steadiness < STEADY:
+        note = f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
+        return "unknown_effect" if named.adjusted < BEYOND_CHANCE else otherwise, note
+    if left_out is not None and not left_out.helps:
+        share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
+        return otherwise, f"{named.name} would not help on views left out (mean square pose error {share} of now)"
+    objection = None if halves is None else halves.objection(named.name)
+    return None if objection is None else (otherwise, objection)
