@@ -25,6 +25,10 @@ ADDED_VARIABLE = (
     "a cloud that is narrow sideways explains nothing."
 )
 SHAPE = "Mean displacement in bins with two sigmas. Bars that all reach zero follow nothing."
+COURSES = (
+    "How far a joint is off as one joint turns, the others where these views had them; beside its mean, with two "
+    "sigmas. Dashes: where views stood. Beyond them nothing is known."
+)
 ALIASES = (
     "1 in a row: in these views the effect of the column can do the same, and only other views or an artefact "
     "tell the two apart."

@@ -57,7 +57,8 @@ class _Picture(NamedTuple):
 def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     """File name → picture, in the order of the page."""
     predicted = "What the views show against what the first candidate effects predict"
-    return {
+    courses = _Picture("Where in its range a joint errs without a name", draw.joint_courses(found), captions.COURSES)
+    return ({"joint_courses": courses} if found.curves else {}) | {
         "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
         "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
         "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),

@@ -9,7 +9,7 @@ from rich.table import Table
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.streams import emit
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.sentences import amounts_of
+from stitch.diagnosis.sentences import amounts_of, curve_text
 from stitch.pipeline import diagnose
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
@@ -118,6 +118,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
         _show_missed(terminal, found, length_unit)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
         terminal.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
+    for curve in found.curves[:2]:
+        terminal.print(curve_text(curve), soft_wrap=True)
     for p in found.next[:3]:
         terminal.print(f"Next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
 

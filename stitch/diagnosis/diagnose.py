@@ -9,6 +9,8 @@ from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.joint_curves import joint_curves
+from stitch.diagnosis.joint_laws import clear_laws
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
@@ -45,8 +47,11 @@ def diagnose_state(state: State) -> Diagnosis:
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
         unnamed = unnamed_errors(linear) if selection.verdict == "unknown_effect" else ()
+        curves = joint_curves(clear_laws(linear)) if selection.verdict == "unknown_effect" else ()
+        beyond = implausible(linear, limit)
         # Where it is said what repeats, scatter is the rest; else all of it.
-        rotation, translation = np.sqrt((linear if unnamed else linear.scatter_only).null.variances[:2])
+        rest = linear if unnamed and (curves or not beyond) else linear.scatter_only
+        rotation, translation = np.sqrt(rest.null.variances[:2])
         found = Diagnosis(
             verdict=selection.verdict,
             effects=tuple(r.name for r in selection.named),
@@ -63,8 +68,9 @@ def diagnose_state(state: State) -> Diagnosis:
             linear=linear,
             notes=notes,
             scatter_limit=limit,
-            implausible=implausible(linear, limit),
+            implausible=beyond,
             unnamed=unnamed,
+            curves=curves,
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from stitch.diagnosis.covariate_dependence import Dependence
 from stitch.diagnosis.design.next_view import Proposal
+from stitch.diagnosis.joint_curves import JointCurve
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
@@ -52,6 +53,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
+    curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, as other joints turn
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

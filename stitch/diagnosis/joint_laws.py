@@ -6,7 +6,7 @@ off by a smooth function of the joint angles is what a coupling, a hose, a worn 
 and where it explains the views about as well as an effect of the library, these views cannot tell which it is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.variance_components import at_variances, fit_variances
+from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
 # Of how many usual variances such a law may be where the search for its size begins.
 _TIMES = (0.01, 1.0, 30.0)
@@ -29,6 +29,7 @@ class JointLaw:
 
     joint: int  # counted from 1
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size
+    model: LinearModel  # with the law as the last of its pose errors, all sizes fitted
 
 
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
@@ -43,8 +44,11 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
     found = []
     for k in range(errors.of_joints.columns.shape[1]):
         half = base.reduce(errors.of_joints.of(k))
-        mixed = with_errors(base.mixed, errors.beside(f"joint {k + 1}", base.reduce(half.T), scale))
-        found.append(JointLaw(k + 1, 0.5 * (base.null.deviance - _deviance(base, mixed, scale**2))))
+        every = errors.beside(f"joint {k + 1}", base.reduce(half.T), scale)
+        mixed = with_errors(base.mixed, every)
+        fit = _fit(base, mixed, scale**2)
+        model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
+        found.append(JointLaw(k + 1, 0.5 * (base.null.deviance - fit.deviance), model))
     return tuple(sorted(found, key=lambda law: -law.log_bayes_factor))
 
 
@@ -57,9 +61,20 @@ def contends(base: LinearModel, log_posterior: float) -> bool:
     return own > log_posterior - ODDS
 
 
-def _deviance(base: LinearModel, mixed: MixedModel, usual: float) -> float:
-    """At its minimum, sought from the likeliest of several starts."""
+def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
+    """Laws of single joints of which one is there beside all that the prior holds; likeliest first, () if none is.
+
+    The best must be 20 to 1 likelier than none though it is the best of all joints'; with it come those that 20 to 1
+    does not tell from it.
+    """
+    laws = joint_laws(linear)
+    if not laws or laws[0].log_bayes_factor < ODDS + np.log(len(laws)):
+        return ()
+    return tuple(law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS)
+
+
+def _fit(base: LinearModel, mixed: MixedModel, usual: float) -> VarianceFit:
+    """At the maximum, sought from the likeliest of several starts."""
     nulls = [at.null.variances for at in (base, *base.elsewhere)]
     starts: list[Array] = [np.append(null, times * usual) for null in nulls for times in _TIMES]
-    best = min(starts, key=lambda start: at_variances(mixed, start).deviance)
-    return fit_variances(mixed, start=best).deviance
+    return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis.joint_laws import joint_laws
+from stitch.diagnosis.joint_laws import clear_laws
 from stitch.diagnosis.thresholds import ODDS
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
@@ -55,13 +55,10 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
 
 
 def _clear_law(linear: LinearModel) -> Unnamed | None:
-    """That of one joint beside all that the prior holds, likelier than 20 to 1 though it is the best of all joints'."""
-    laws = joint_laws(linear)
-    if not laws or laws[0].log_bayes_factor < ODDS + np.log(len(laws)):
-        return None
-    near = sorted(law.joint for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS)
-    which = " or ".join(f"joint {joint}" for joint in near)
-    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True)
+    """That of one joint beside all that the prior holds."""
+    laws = clear_laws(linear)
+    which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
+    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True) if laws else None
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:

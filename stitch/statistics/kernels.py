@@ -18,9 +18,13 @@ def alike_in_joints(joints: Array) -> Array:
     The product over joints of (1 + k)/2, with k a Gaussian on the circle (analysis-of-variance kernel; Durrande et
     al. 2013, J. Multivariate Analysis 115:57; periodic: MacKay 1998).
     """
-    apart = joints[:, None, :] - joints[None, :, :]
-    alone = np.exp(-2 * np.sin(apart / 2) ** 2 / _REACH**2)
-    return np.asarray(np.prod((1 + alone) / 2, axis=2))
+    return np.asarray(np.prod(alike_joint_by_joint(joints, joints), axis=2))
+
+
+def alike_joint_by_joint(some: Array, others: Array) -> Array:
+    """(S, O, n) factors of that product between joints (S, n) and (O, n), rad."""
+    apart = some[:, None, :] - others[None, :, :]
+    return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / _REACH**2)) / 2)
 
 
 def alike_in_time(time: Array) -> Array:

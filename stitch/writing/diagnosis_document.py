@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.joint_curves import JointCurve
 from stitch.writing.json_file import rows_of_fields
 from stitch.writing.plain_finding import plain_finding
 
@@ -27,12 +28,25 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
             *(_untested(name, needs) for name, needs in d.missing.items()),
         ],
         "depends_on": rows_of_fields(d.depends_on, "covariate score p_value bins mean sigma shape"),
+        "joint_laws": [_curve(curve) for curve in d.curves],
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
         "notes": list(d.notes),
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,
+    }
+
+
+def _curve(curve: JointCurve) -> dict[str, Any]:
+    """Where in the range of one joint another errs by no known law; angles in degrees, errors in rad."""
+    return {
+        "joint": curve.joint,
+        "covariate": curve.name,
+        "share": curve.share,
+        "angle_deg": np.degrees(curve.angle).tolist(),
+        "error": curve.error.tolist(),
+        "sigma": curve.sigma.tolist(),
     }
 
 

@@ -16,7 +16,9 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":
-            return "Something is missing in the model that no effect of the library explains."
+            joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
+            where = f": {joints} errs by a law that has no name" if joints else ""
+            return f"Something is missing in the model that no effect of the library explains{where}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
     if validation is None:
         return f"Missing in the model: {named}."

@@ -15,7 +15,8 @@ from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
-from stitch.diagnosis.joint_laws import joint_laws
+from stitch.diagnosis.joint_curves import joint_curves
+from stitch.diagnosis.joint_laws import clear_laws, joint_laws
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unnamed_errors import unnamed_errors
@@ -124,3 +125,18 @@ def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):
     measured, *_ = cell
     _, linear = said_of(cell, measured.T_base_flange)
     assert max(law.log_bayes_factor for law in joint_laws(linear)) < 1
+
+
+def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
+    measured, *_ = cell
+    q = measured.plan.joints
+    off = np.zeros_like(q)
+    off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
+    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
+    course = joint_curves(clear_laws(linear))[0]
+    true = 4e-4 * np.sin(2 * course.angle) - off[:, 2].mean()
+    assert (course.joint, course.name) == (3, "j4_deg") and course.share > 0.9
+    assert np.all(np.abs(course.error - true) < 3 * course.sigma)
+    # Where views stood the sigma is worth something: a fifth of what there is.
+    inside = course.sigma[(course.angle > np.quantile(q[:, 3], 0.1)) & (course.angle < np.quantile(q[:, 3], 0.9))]
+    assert inside.max() < 0.2 * np.ptp(true)
