@@ -43,6 +43,9 @@ def diagnose_run(
         show(found, unit)
         if found.verdict == "cannot_tell":
             console().print(f"Fitted as one, if that helps: stitch add {shlex.quote(str(run))} --group", soft_wrap=True)
+        elif found.curves:
+            told = f"A formula for it, if there is one: stitch explain {shlex.quote(str(run))} -o mine.py"
+            console().print(told, soft_wrap=True)
 
 
 def next_measurement(
