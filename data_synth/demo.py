@@ -1,5 +1,6 @@
 """`stitch demo`: a blade cell with a hand-eye that is a little wrong and an effect that nobody told it of."""
 
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -29,7 +30,8 @@ def demo(
     """
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
-    from stitch.cli.run import run
+    from stitch.cli.run_options import RunOptions
+    from stitch.cli.run_sessions import run_sessions
 
     session = folder / "blade"
     if folder.exists() and not truth_path(session).is_file():
@@ -41,7 +43,7 @@ def demo(
     write_session(session, measured, "blade")
     write_truth(truth_path(session), measured, seed)
     _say("\nstitch run: correct the hand-eye, register, fuse")
-    run([session], output=folder / "run", recording=False)
+    run_sessions([session], RunOptions(output=folder / "run", recording=False, says_next=False))
     _say("\nstitch diagnose: what is missing?")
     diagnose_run(folder / "run")
     _say("\nstitch add --suggested: add it, fit everything anew, ask again")
@@ -50,6 +52,7 @@ def demo(
     reveal(folder / "run", truth_path(session))
     for name in ("stitched.ply", "recording.rrd", "report.html"):
         _say(f"  {folder / 'run' / name}")
+    _say(f"Next: stitch review {shlex.quote(str(folder / 'run'))}")
 
 
 def _say(text: str) -> None:

@@ -124,7 +124,7 @@ def show(found: Diagnosis, length_unit: str) -> None:
     for curve in found.curves[:2]:
         terminal.print(curve_text(curve), soft_wrap=True)
     for p in found.next[:3]:
-        terminal.print(f"Next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
+        terminal.print(f"To measure next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
 
 
 def _show_missed(terminal: Console, found: Diagnosis, length_unit: str) -> None:

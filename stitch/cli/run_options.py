@@ -20,3 +20,4 @@ class RunOptions:
     mesh: bool = False
     tolerance: float | None = None
     as_json: bool = False
+    says_next: bool = True  # the last line names the next command; a command that calls this on its way names its own

@@ -54,7 +54,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     if asked.as_json:
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        show(runs, target)
+        show(runs, target, asked.says_next)
 
 
 def _given(asked: RunOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:

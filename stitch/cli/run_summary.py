@@ -19,8 +19,8 @@ from stitch.units import METRES, known_text, length_text
 _FILES = ("stitched.ply", "mesh.ply", "recording.rrd", "report.html")
 
 
-def show(runs: list[Run], target: Path) -> None:
-    """For people, on standard error."""
+def show(runs: list[Run], target: Path, says_next: bool = True) -> None:
+    """For people, on standard error; the next command only where it is the reader's to give."""
     terminal = console()
     for result in runs:
         for note in result.notes[: len(result.left_out)]:
@@ -40,6 +40,8 @@ def show(runs: list[Run], target: Path) -> None:
         terminal.print(line, soft_wrap=True)
     folders = [target] if len(runs) == 1 else [target / result.session.name for result in runs]
     _files(terminal, folders)
+    if says_next:
+        terminal.print(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}", soft_wrap=True)
 
 
 def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
@@ -85,4 +87,3 @@ def _files(terminal: Console, folders: list[Path]) -> None:
         for name in _FILES:
             if (folder / name).exists():
                 terminal.print(f"  {folder / name}", soft_wrap=True)
-    terminal.print(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}", soft_wrap=True)
