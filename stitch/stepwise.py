@@ -12,6 +12,7 @@ from stitch.diagnosis.validation.group_validation import group_share
 from stitch.pipeline import change, diagnose
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
+from stitch.writing.plain_finding import plain_finding
 
 
 def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
@@ -28,7 +29,7 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
     given = set(state.model.effects)
     found = diagnose(state)
     for _ in range(at_most):
-        lines += [found.sentence, *(f"{note}." for note in found.notes if note not in found.sentence)]
+        lines += [*_told(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
         if found.verdict != "missing_effect":
             break
         tried = change(state, [*state.model.effects, found.effects[0]])
@@ -52,20 +53,25 @@ def suggest_group(state: State) -> tuple[Run | None, list[str], Diagnosis]:
     """
     found = diagnose(state)
     if found.verdict != "cannot_tell":
-        return None, [found.sentence, "There is no group of effects that these views cannot tell apart."], found
+        return None, [*_told(found), "There is no group of effects that these views cannot tell apart."], found
     names = " + ".join(found.effects)
     asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
     share, sigma = group_share(found.linear, asked)
     judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
     if share > 1 - sigma:
-        return None, [found.sentence, f"{names} together do not help on views left out: {judged}."], found
+        return None, [*_told(found), f"{names} together do not help on views left out: {judged}."], found
     tried = change(state, [*state.model.effects, *found.effects])
     told = (
         f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
         "tell its parts apart, so that none of their values means anything alone"
     )
     tried = replace(tried, notes=(f"{told}.", *tried.notes))
-    return tried, [found.sentence, f"{told}."], diagnose(state_of(tried))
+    return tried, [*_told(found), f"{told}."], diagnose(state_of(tried))
+
+
+def _told(found: Diagnosis) -> list[str]:
+    """For everybody first, then the evidence, as `stitch diagnose` says it."""
+    return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 
 
 def _without_idle(result: Run, given: set[str]) -> tuple[Run, list[str]]:
