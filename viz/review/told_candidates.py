@@ -13,14 +13,17 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
 
     Args:
         um: micrometres in one length_unit.
+
+    An older diagnosis has one sentence for everything: it stands once.
     """
+    plain = document.get("plain")
     candidates = document.get("candidates", [])
     follows = [row for row in document.get("depends_on", []) if row["p_value"] is not None and row["p_value"] < 0.05]
     return {
         "verdict": document["verdict"],
         "named": document["effects"],
-        "plain": document.get("plain") or document["sentence"],
-        "sentence": document["sentence"],
+        "plain": plain or document["sentence"],
+        "sentence": document["sentence"] if plain else "",
         "candidates": [_candidate(row, um) for row in candidates if row["observable"]],
         "unseen": [row["effect"] for row in candidates if not row["observable"] and not row.get("needs")],
         "untested": [{"effect": row["effect"], "needs": row["needs"]} for row in candidates if row.get("needs")],

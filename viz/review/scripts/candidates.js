@@ -22,7 +22,8 @@ export function showCandidates(state, ask, busy) {
   found.candidates.length > FIRST && element("button", { type: "button", "aria-expanded": String(all), onclick: () => { all = !all; showCandidates(state, ask, busy); } },
       all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`)].filter(Boolean);
   const open = all || root.querySelector("#tried[open]") !== null;
-  root.replaceChildren(element("h3", {}, found.plain), element("p", { class: "soft" }, found.sentence),
+  root.replaceChildren(element("h3", {}, found.plain),
+    ...(found.sentence ? [element("p", { class: "soft" }, found.sentence)] : []),
     ...(found.verdict === "adequate" ? [element("details", { id: "tried", open }, element("summary", {}, "Candidate effects that were tried"), ...table)] : table),
     ...[limits(found)].filter(Boolean));
 }

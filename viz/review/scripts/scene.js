@@ -8,7 +8,7 @@ let viewer = null, model = null, diagnosed = null;
 // Show the part of a state; true if it was made anew. `fade`: from the model before to the present one.
 export async function show(state) {
   if (!state.part) { root.classList.remove("live"); model = null; return false; }
-  const mark = state.pictured.join() + (state.diagnosis ? state.diagnosis.sentence : "");
+  const mark = state.pictured.join() + (state.diagnosis ? state.diagnosis.plain + state.diagnosis.sentence : "");
   if (state.model === model && mark === diagnosed) return false;
   const told = await read("part");
   if (viewer && told.model === model) {
