@@ -1,4 +1,4 @@
-"""Pictures of `stitch review`, click by click, and what it needs: python bench/review_pictures.py [--session FOLDER].
+"""Pictures of `stitch review`, click by click, and what it needs: python -m bench.review_pictures [--session FOLDER].
 
 Writes docs/pictures/review-*.png: the demo's cell with joint compliance hidden (seed 3), from opening to the error that
 fell, a note, an effect of one's own, undo; in dark and on a phone. Prints start-up time, memory and the time of every
@@ -7,45 +7,21 @@ pictures.
 """
 
 import argparse
-import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
-import time
-import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
-from PIL import Image
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
-from stitch.cli.main import main as stitch
+from bench.report_pictures import call
+from bench.review_clicks import LONG, Camera, after, story
+from bench.review_server import choices, memory, served
 from stitch.cli.printing import printing_browser
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
-COLOURS = 256
 DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
-LONG = 900_000  # ms that a command may take
 WIDE, PHONE = {"width": 1360, "height": 900}, {"width": 412, "height": 900}
-OWN = '''from stitch.effects import effect, number
-
-
-@effect("sensor", needs=["humidity_percent"], k=number("mm", typical=0.02, limit=1.0))
-def humidity_bias(points, view, k):
-    """x = x* + u·k·(humidity − first humidity)"""
-    return points + view.along(points) * (k * view.since_first("humidity_percent"))
-'''
-
-
-def command(*words: object) -> None:
-    """A command of stitch that ends well."""
-    try:
-        stitch([str(word) for word in words])
-    except SystemExit as ended:
-        if ended.code:
-            raise
 
 
 @contextmanager
@@ -57,127 +33,6 @@ def named_folder():
         yield folder
     finally:
         shutil.rmtree(folder)
-
-
-@contextmanager
-def served(run: Path):
-    """`stitch review RUN`; its address and process, with the seconds until it answers."""
-    words = [sys.executable, "-c", "from stitch.cli.main import main; main()", "review", str(run), "--no-browser"]
-    begun = time.monotonic()
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    try:
-        address = process.stderr.readline().strip()
-        print(f"listens after {time.monotonic() - begun:.1f} s, {processor_seconds(process):.1f} s of one core")
-        yield address, process
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def processor_seconds(process: subprocess.Popen[str]) -> float:
-    """What a process has used so far, where /proc tells: a busy machine does not count."""
-    try:
-        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return float("nan")
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def memory(process: subprocess.Popen[str]) -> str:
-    """Present and largest resident memory of the server, where /proc tells."""
-    try:
-        status = Path(f"/proc/{process.pid}/status").read_text()
-    except OSError:
-        return "memory unknown"
-    sizes = {line.split(":")[0]: int(line.split()[1]) / 1e3 for line in status.splitlines() if line.startswith("Vm")}
-    return f"{sizes['VmRSS']:.0f} MB, {sizes['VmHWM']:.0f} MB at most"
-
-
-def choices(address: str, process: subprocess.Popen[str]) -> None:
-    """What the fields of everything, of a view and of a place cost the server."""
-    for choice in ({}, {"views": ["v003"]}, {"place": [0.0, 0.0, 0.0], "within": 50.0}):
-        before = processor_seconds(process)
-        asked = urllib.request.Request(f"{address}chosen", json.dumps(choice).encode(), method="POST")
-        told = json.load(urllib.request.urlopen(asked))["chosen"]
-        cost = processor_seconds(process) - before
-        print(f"choice {choice}: rms {told['rms'] or 0:.1f} µm, {cost:.2f} s of one core; {memory(process)}")
-
-
-class Camera:
-    """A page, and pictures of it."""
-
-    def __init__(self, page: Page, keep: bool) -> None:
-        self.page, self.keep, self.begun = page, keep, time.monotonic()
-        self.wrong: list[str] = []
-        page.on("console", lambda told: self.wrong.append(told.text) if told.type == "error" else None)
-        page.on("pageerror", lambda error: self.wrong.append(str(error)))
-
-    def shoot(self, name: str, place: str | None = None) -> None:
-        """A picture of what is seen, `place` in its middle."""
-        print(f"{name}: {time.monotonic() - self.begun:.1f} s since the last")
-        if self.keep:
-            if place is not None:
-                self.page.locator(place).scroll_into_view_if_needed()
-            self.page.wait_for_timeout(1500)
-            raw = FOLDER / f".{name}.new.png"
-            self.page.screenshot(path=raw)
-            picture = Image.open(raw).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-            picture.save(FOLDER / f"review-{name}.png", optimize=True)
-            raw.unlink()
-        self.begun = time.monotonic()
-
-    def click(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=True).click()
-
-    def says(self, place: str, text: str) -> None:
-        expect(self.page.locator(place)).to_contain_text(text, timeout=LONG)
-
-
-def story(camera: Camera, effect: str | None) -> None:
-    """From opening to the error that fell, and back."""
-    page = camera.page
-    expect(page.locator("#scene.live")).to_be_visible(timeout=LONG)
-    camera.says("#plots", "signed mean")
-    camera.shoot("1-open")
-    # Where a joint bends under load, its angle tells.
-    bars = page.locator("#plots [data-key^='j2 ']")
-    (bars if bars.count() else page.locator("#plots .plot:not(.wide) .bins button")).nth(1).click()
-    camera.says("#chosen", "residuals: rms")
-    camera.shoot("2-chosen")
-    camera.click("Find what is missing")
-    camera.says("#missing", "candidate effect")
-    expect(page.locator("#missing .main").first).to_be_enabled(timeout=LONG)
-    effect = effect or page.locator("#missing tr.best td").first.inner_text()
-    camera.shoot("3-missing", "#missing .best")
-    camera.click(f"Show the part as {effect} should leave it")
-    page.wait_for_timeout(1500)
-    camera.shoot("4-predicted", "#missing .best")
-    camera.click(f"Add {effect}")
-    camera.says("#doing", "fit ")
-    camera.shoot("5-adding", "#missing .best")
-    camera.says("#ledger", f"+ {effect}")
-    camera.shoot("6-fell", "#undo")
-
-
-def after(camera: Camera) -> None:
-    """A note, an effect of one's own, undo."""
-    page = camera.page
-    page.locator("#note").fill("joints 2 and 3 are soft: tell the maker of the arm")
-    page.locator("#by").fill("reviewer")
-    camera.click("Keep")
-    camera.says("#ledger", "tell the maker")
-    page.locator("#own-title").click()
-    page.locator("#own").fill(OWN)
-    page.locator("#own-trust").check()
-    camera.click("Check")
-    camera.says("#own-told", "It is an effect")
-    camera.shoot("7-own", "#own-told")
-    camera.click("Try it: diagnose with it")
-    camera.says("#own-told", "Tried")
-    page.locator("#undo").click()
-    camera.says("#ledger", "− joint_compliance")
-    camera.says("#redo", "Redo: add joint_compliance")
-    camera.shoot("8-undone", "#undo")
 
 
 def looks(browser: Browser, address: str) -> None:
@@ -203,8 +58,8 @@ def main() -> None:
     with named_folder() as folder, sync_playwright() as driver:
         session = given.session or folder / "blade"
         if given.session is None:
-            command("synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3")
-        command("run", session, "-o", folder / "run", "--no-recording")
+            call(["synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3"])
+        call(["run", session, "-o", folder / "run", "--no-recording"])
         root = ["--no-sandbox"] if os.geteuid() == 0 else []
         browser = driver.chromium.launch(executable_path=printing_browser(), args=[*root, *DRAWN])
         with served(folder / "run") as (address, process):

@@ -64,7 +64,7 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
         f"| {amounts_of(c.ranked)} |"
         for i, c in enumerate(shown)
     ]
-    lines += ["", *(f"- Next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
+    lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     text = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     rec.log("diagnosis/verdict", text, static=True)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])

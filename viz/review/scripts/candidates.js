@@ -68,6 +68,6 @@ function limits(found) {
   if (found.follows.length) told.push(`What is left follows ${found.follows.slice(0, 3).map(f => `${f.covariate} (p = ${f.p})`).join(", ")}.`);
   if (found.unseen.length) told.push(`These views cannot show: ${found.unseen.join(", ")}.`);
   for (const u of found.untested) told.push(`Not tested without ${u.needs.join(", ")}: ${u.effect}.`);
-  for (const n of found.next) told.push(`Next: ${n.do} (separates ${n.separates.join(" and ")}).`);
+  for (const n of found.next) told.push(`To measure next: ${n.do} (separates ${n.separates.join(" and ")}).`);
   return told.length ? element("details", {}, element("summary", {}, "What could not have been seen, and what to measure next"), ...told.map(t => element("p", {}, t))) : null;
 }

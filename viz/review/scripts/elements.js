@@ -17,4 +17,5 @@ export const at = id => document.getElementById(id);
 
 // Three digits, as the page of a run has them.
 export const digits = x => x == null ? "–" : x === 0 ? "0" : Number(x.toPrecision(3)).toString().replace("-", "−");
-export const um = x => x == null ? "–" : `${digits(x)} µm`;
+// Millimetres above one, micrometres below.
+export const um = x => x == null ? "–" : Math.abs(x) >= 999.5 ? `${digits(x / 1e3)} mm` : `${digits(x)} µm`;
