@@ -23,7 +23,7 @@ from stitch.cells.window.joined_scans import join
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.seam import Limits, Station, measure_seam
 from stitch.measurement.scan import prepare_view
-from viz.cells.window_fit import deviation_map
+from viz.cells.window_fit_figures import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES = ROOT / "docs" / "window.md", ROOT / "docs" / "pictures"
@@ -92,7 +92,7 @@ def fit_table(door, pane, draws: int) -> list[str]:
 
 
 def write_map(scan, cad, T) -> None:
-    figure = deviation_map(deviations(scan, cad, T, 0.5, cad.size / 60))
+    figure = deviation_map(deviations(scan, cad, T, 0.5, cad.size / 60), "mm")
     path = PICTURES / "window-map.png"
     figure.savefig(path, dpi=100)
     Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)

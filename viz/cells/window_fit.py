@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from matplotlib.figure import Figure
 
 from stitch import frames
 from stitch.cells.window.allowance import allowance_sentence
@@ -15,10 +14,11 @@ from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.colours import BLUE, ORANGE, SIGNED, signed_colours
+from viz.cells.window_fit_figures import deviation_map, histogram
+from viz.colours import signed_colours
 from viz.identity import Row
 
-_MAP_POINTS, _RECORDED_POINTS, _WORST = 40_000, 400_000, 10
+_RECORDED_POINTS, _WORST = 400_000, 10
 
 
 def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
@@ -30,7 +30,7 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
         caption = (
             "The scan on the CAD, seen along the part's thinnest axis, outer and inner side alike. Red stands outside "
             f"{cad}, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
-            "whose mean is beyond it."
+            "whose mean is beyond it. Lengths in the unit of the CAD, whose file names none."
         )
         pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
         caption = "All points with a place on the CAD. What lies far out is a deformed place, and did not pull the fit."
@@ -114,39 +114,6 @@ def _allowances(parts: list[Part]) -> list[Table]:
 def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:
     cells, verdict = found.cells, "bad" if found.outside[k] else "good"
     return *(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]), verdict
-
-
-def deviation_map(found: Deviations) -> Figure:
-    """Points along the thinnest axis, coloured by their distance; cells beyond the tolerance ringed."""
-    extent = np.ptp(found.points, axis=0)
-    i, j = np.sort(np.argsort(extent)[1:])
-    figure = Figure(figsize=(9, min(9 * extent[j] / extent[i] + 0.8, 9)), layout="constrained")
-    ax = figure.subplots()
-    pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
-    order = pick[np.argsort(np.abs(found.distance[pick]))]
-    colours = {"c": found.distance[order], "cmap": SIGNED, "vmin": -found.tolerance, "vmax": found.tolerance}
-    drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
-    bad = found.cells.middle[found.outside]
-    ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
-    figure.colorbar(drawn, label="outside (+) or inside (−) the CAD", extend="both", shrink=0.8)
-    # White means no deviation, so the ground cannot be white.
-    ax.set_facecolor("0.78")
-    ax.set(aspect="equal", xlabel=f"{'xyz'[i]} of the part", ylabel=f"{'xyz'[j]} of the part")
-    return figure
-
-
-def histogram(part: Part) -> Figure:
-    """Distances of all points, with the tolerance."""
-    found = part.deviations
-    figure = Figure(figsize=(7, 2.4), layout="constrained")
-    ax = figure.subplots()
-    reach = max(2 * found.tolerance, 1.05 * float(np.quantile(np.abs(found.distance), 0.999)))
-    ax.hist(np.clip(found.distance, -reach, reach), bins=120, color=BLUE, log=True)
-    for side in (-1, 1):
-        ax.axvline(side * found.tolerance, color=ORANGE, ls="--", lw=1)
-    ax.set(xlabel="distance from the CAD (dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
-    ax.spines[["top", "right"]].set_visible(False)
-    return figure
 
 
 def record(job: FitJob, parts: list[Part], path: Path) -> None:

@@ -140,7 +140,7 @@ def loop(job: SeamJob, seams: list[Seam]) -> Figure:
         ax.annotate(seam.station, at + 1.9 * towards, ha="center", va="center", fontsize=11)
     for verdict in dict.fromkeys(s.verdict for s in seams):
         ax.plot([], [], color=VERDICTS[verdict], lw=3, label=verdict)
-    ax.set(aspect="equal", xlabel="mm", ylabel="mm")
+    ax.set(aspect="equal", xlabel="in the plane of the stations (mm)", ylabel="upwards in it (mm)")
     ax.margins(0.15)
     ax.legend(frameon=False, loc="center")
     ax.spines[["top", "right"]].set_visible(False)
