@@ -4,17 +4,9 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.table import Table
 
-from data_synth.judgement import judge
-from data_synth.nature import LAWS
-from data_synth.scene import load_scene
-from data_synth.simulate import Measured, simulate
-from data_synth.write import write_session, write_truth
 from stitch.errors import InputError
-from stitch.system.console import console
 
 
 def synth(
@@ -39,49 +31,13 @@ def synth(
         raise InputError(f"--views {views}: stitching needs at least 2")
     if seed < 0:
         raise InputError(f"--seed {seed}: use 0 or more")
-    target = truth or truth_path(out)
-    if target.suffix != ".json":
+    if truth is not None and truth.suffix != ".json":
         # The part's mesh lies beside it under the same name.
-        raise InputError(f"--truth {target}: name a file that ends in .json")
-    measured = make(scene, hidden_of(hide or []), seed, views)
-    write_session(out, measured, out.name)
-    write_truth(target, measured, seed)
-    points = sum(len(cloud.points) for cloud in measured.clouds)
-    summary = f"{len(measured.clouds)} views, {points:,} points → {out}\ntruth → {target}"
-    console().print(summary, soft_wrap=True)
+        raise InputError(f"--truth {truth}: name a file that ends in .json")
+    # Loaded by who makes something: whoever asks for help has it at once.
+    from data_synth.made_session import made_session
 
-
-def make(scene: str | Path, hidden: dict[str, float], seed: int, views: int | None = None) -> Measured:
-    """Simulate a scene by its name.
-
-    Raises:
-        InputError: no such scene or law, a wrong value in it; NoResultError: views that the arm cannot reach.
-    """
-    try:
-        return simulate(load_scene(scene), hidden, seed, views)
-    except ValueError as error:
-        raise InputError(f"scene {scene}: {error}") from None
-
-
-def hidden_of(options: list[str]) -> dict[str, float]:
-    """EFFECT or EFFECT=AMPLITUDE → amplitudes; 1 is a size that a real cell could have."""
-    hidden = {}
-    for option in options:
-        name, _, size = option.partition("=")
-        if name not in LAWS:
-            raise InputError(f"--hide {option}: nature knows {', '.join(LAWS)}")
-        try:
-            hidden[name] = float(size) if size else 1.0
-        except ValueError:
-            hidden[name] = np.nan
-        if not np.isfinite(hidden[name]):
-            raise InputError(f"--hide {option}: {size!r} is not a number")
-    return hidden
-
-
-def truth_path(session: Path) -> Path:
-    """Where the truth of a session lies unless told otherwise."""
-    return session.with_name(session.name + ".truth.json")
+    made_session(scene, out, hide or [], seed, views, truth)
 
 
 def reveal(
@@ -95,6 +51,11 @@ def reveal(
     Examples:
       stitch reveal runs/blade cells/blade.truth.json
     """
+    from rich.table import Table
+
+    from data_synth.judgement import judge
+    from stitch.system.console import console
+
     judged = judge(run, truth)
     if as_json:
         print(json.dumps(judged, indent=1))

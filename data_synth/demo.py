@@ -6,11 +6,8 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from data_synth.commands import make, reveal, truth_path
-from data_synth.write import write_session, write_truth
 from stitch.errors import InputError
 
 # What the demo may hide: each is visible on a blade that is turned and tilted in front of a scanner.
@@ -28,6 +25,12 @@ def demo(
       stitch demo
       stitch demo elsewhere --seed 4
     """
+    # Loaded by who runs something: whoever asks for help has it at once.
+    import numpy as np
+
+    from data_synth.commands import reveal
+    from data_synth.made_session import make, truth_path
+    from data_synth.write import write_session, write_truth
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run_options import RunOptions

@@ -1,22 +1,11 @@
 """`stitch check SESSION`: read everything, compute nothing, say what is there or what is wrong."""
 
-import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.table import Table
 
 from stitch.cli.options import Json
-from stitch.cli.streams import emit
-from stitch.errors import InputError
-from stitch.integrity.deep_check import deep_check
-from stitch.measurement.session import Session
-from stitch.reading.session_folder import load_session
-from stitch.system.console import console
-from stitch.writing.json_file import to_json
 
 
 def check(
@@ -33,67 +22,10 @@ def check(
       stitch check blade-17
       stitch check --deep blade-17 --json
     """
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.checked_sessions import checked, deeply_checked
+
     if deep:
-        _deep(sessions, as_json)
-        return
-    facts, errors = [], []
-    for path in sessions:
-        try:
-            facts.append(summary(load_session(path)))
-        except InputError as error:
-            errors.append(str(error))
-    if as_json:
-        emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
+        deeply_checked(sessions, as_json)
     else:
-        _print(facts)
-    for line in errors:
-        print(f"stitch: {line}", file=sys.stderr)
-    if errors:
-        raise typer.Exit(2)
-
-
-def _deep(sessions: list[Path], as_json: bool) -> None:
-    """Every usual mistake tried on each session: what is wrong, in which views, how to fix it."""
-    found = {str(path): deep_check(load_session(path)) for path in sessions}
-    documents = [
-        {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
-        for path, problems in found.items()
-    ]
-    if as_json:
-        emit(to_json(documents[0] if len(documents) == 1 else documents))
-    else:
-        for path, problems in found.items():
-            for line in [p.line() for p in problems] or ["nothing wrong was found"]:
-                console().print(f"{path}: {line}", soft_wrap=True)
-    if any(p.certain for problems in found.values() for p in problems):
-        raise typer.Exit(2)
-
-
-def summary(session: Session) -> dict[str, object]:
-    """What a session holds, in plain numbers."""
-    clouds = [view.cloud.points for view in session.views if view.cloud is not None]
-    sighted = [view.sighting.points for view in session.views if view.sighting is not None]
-    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds or sighted]
-    return {
-        "session": session.name,
-        "mount": session.mount,
-        "length_unit": session.length_unit,
-        "views": len(session.views),
-        "points": int(sum(len(points) for points in clouds)),
-        "targets": len({name for view in session.views if view.sighting for name in view.sighting.targets}),
-        "sightings": sum(len(view.sighting.targets) for view in session.views if view.sighting),
-        "median_range": round(float(np.median(ranges)), 3) if ranges else None,
-        "joints": session.views[0].joints is not None,
-        "robot": session.robot.name if session.robot else None,
-        "hand_eye_given": session.scanner.T_mount is not None,
-        "covariates": sorted({name for view in session.views for name in view.covariates}),
-    }
-
-
-def _print(facts: list[dict[str, object]]) -> None:
-    terminal = console()
-    for fact in facts:
-        table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
-        for key, value in fact.items():
-            table.add_row(key, ", ".join(value) if isinstance(value, list) else str(value))
-        terminal.print(table)
+        checked(sessions, as_json)

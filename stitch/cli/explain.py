@@ -6,15 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
-from stitch.cli.streams import emit
-from stitch.diagnosis.diagnose import linear_model_of
-from stitch.errors import InputError, NoResultError
-from stitch.explanation.explain import NAME, Explanation, explain
-from stitch.stored.load_state import load_state
-from stitch.system.console import console
-from stitch.system.whole_file import whole
-from stitch.units import length_text
-from stitch.writing.json_file import to_json
+from stitch.errors import InputError
 
 
 def explain_run(
@@ -38,42 +30,7 @@ def explain_run(
         raise InputError(f"{output}: effects stand in a Python file; to fix: name it {output.with_suffix('.py').name}")
     if output is not None and output.exists():
         raise InputError(f"{output}: there is such a file; to fix: name another, or move it away")
-    state = load_state(run, effects_file, thin=True, trust=trust)
-    if NAME in state.model.effects:
-        raise InputError(
-            f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"
-        )
-    found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
-    heldout = state.residual_rms * found.heldout_share**0.5 if found.found else None
-    if output is not None and found.found:
-        with whole(output) as file:
-            file.write_text(found.source, encoding="utf-8")
-    if as_json:
-        emit(to_json(_document(found, heldout)))
-    else:
-        _show(found, heldout, state.session.length_unit, run, output)
-    if not found.found and output is not None:
-        raise NoResultError(f"{run}: no formula holds, nothing was written to {output}")
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.explained_run import explained_run
 
-
-def _document(found: Explanation, heldout: float | None) -> dict[str, object]:
-    return {
-        "found": found.found,
-        "formula": found.formula,
-        "place": found.place,
-        "heldout_rms": heldout,
-        "p_value": found.p_value if found.found else None,
-        "sentence": found.why,
-    }
-
-
-def _show(found: Explanation, heldout: float | None, unit: str, run: Path, output: Path | None) -> None:
-    terminal = console()
-    terminal.print(found.why, soft_wrap=True)
-    if heldout is None:
-        return
-    terminal.print(f"Added, it should leave {length_text(heldout, unit)} on views left out.", soft_wrap=True)
-    if output is None:
-        terminal.print(f"Next: stitch explain {run} -o mine.py", soft_wrap=True)
-    else:
-        terminal.print(f"Next: read {output}, then stitch add {run} {NAME} --effects-file {output}", soft_wrap=True)
+    explained_run(run, output, effects_file, trust=trust, as_json=as_json)

@@ -1,25 +1,15 @@
 """`stitch export RUN`: what a run found in the words of other programs."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stitch.cli.export_program import export_program
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
-from stitch.cli.streams import results
 from stitch.errors import InputError
-from stitch.export.arm_formats import ARM_FORMATS
-from stitch.export.arm_model import arm_of
-from stitch.export.cloud_formats import CLOUD_FORMATS, coloured_cloud
-from stitch.export.compensated_program import LIMIT_MM
-from stitch.export.hand_eye import hand_eye_of
-from stitch.export.hand_eye_formats import FORMATS, ros_launch
-from stitch.system.whole_file import whole
-from stitch.units import MICROMETRES
+from stitch.export.export_options import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
-_KINDS = f"hand-eye: {', '.join(FORMATS)}; arm: {', '.join(ARM_FORMATS)}; cloud: {', '.join(CLOUD_FORMATS)}"
+_KINDS = f"hand-eye: {', '.join(HAND_EYE)}; arm: {', '.join(ARM)}; cloud: {', '.join(CLOUD)}"
 
 
 def export_run(
@@ -70,39 +60,15 @@ def export_run(
         raise InputError(f"{output}: exists already; name another file, or remove it")
     if output is not None and not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}; to fix: make it, or name another")
+    if program is None and to not in (*HAND_EYE, *ARM, *CLOUD):
+        raise InputError(f"--to {to}: to fix: one of {_KINDS}")
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.export_program import export_program
+    from stitch.cli.exported_run import exported_run
+    from stitch.export.arm_model import arm_of
+
     if program is not None:
         arm = arm_of(run, effects_file, trust)
         export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
-    elif to in ARM_FORMATS:
-        _text(ARM_FORMATS[to](arm_of(run, effects_file, trust)), to, output)
-    elif to in FORMATS:
-        eye = hand_eye_of(run, parent, child)
-        # ROS 1 knows launch files in XML only.
-        old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
-        _text(ros_launch(eye) if old else FORMATS[to](eye), to, output)
-    elif to in CLOUD_FORMATS:
-        _cloud(run, to, output)
     else:
-        raise InputError(f"--to {to}: to fix: one of {_KINDS}")
-
-
-def _text(text: str, to: str, output: Path | None) -> None:
-    if output is None:
-        results().write(text)
-        return
-    with whole(output) as file:
-        file.write_text(text, encoding="utf-8")
-    print(f"{to} to {output}", file=sys.stderr)
-
-
-def _cloud(run: Path, to: str, output: Path | None) -> None:
-    if output is None or output.suffix.lower() != f".{to}":
-        raise InputError(f"--to {to}: where to? to fix: name the file with -o NAME.{to}")
-    write, lost = CLOUD_FORMATS[to]
-    cloud = coloured_cloud(run)
-    with whole(output) as file:
-        write(cloud, file)
-    span = cloud.span * MICROMETRES[cloud.length_unit]
-    told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
-    told += [f"{to} does not hold {lost}"] if lost else []
-    print("; ".join(told), file=sys.stderr)
+        exported_run(run, str(to), output, parent, child, effects_file, trust=trust)

@@ -7,10 +7,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.streams import results
-from stitch.controllers.importer import import_file
 from stitch.errors import InputError
-from stitch.intake.import_table import import_table, is_table_of_poses
-from stitch.intake.stated import Stated
 from stitch.system.whole_file import whole
 
 
@@ -54,6 +51,11 @@ def import_command(
     """
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; name another file, or remove it")
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.controllers.importer import import_file
+    from stitch.intake.import_table import import_table, is_table_of_poses
+    from stitch.intake.stated import Stated
+
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
     stated = Stated(None, names, rotation, angles, file_unit, inverse=inverse or None)
     if stated != Stated() or is_table_of_poses(file):

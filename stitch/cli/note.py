@@ -8,10 +8,7 @@ import typer
 from stitch.cli.options import Json, RunFolder
 from stitch.cli.streams import emit
 from stitch.errors import InputError
-from stitch.stored.run_documents import read_ledger
 from stitch.system.console import console
-from stitch.writing.json_file import to_json, write_json
-from stitch.writing.run_folder import held
 
 _LONGEST = 2000
 
@@ -34,6 +31,11 @@ def note(
         raise InputError("TEXT: is empty; to fix: say what to remark")
     if len(text) > _LONGEST:
         raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
+    # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.stored.run_documents import read_ledger
+    from stitch.writing.json_file import to_json, write_json
+    from stitch.writing.run_folder import held
+
     with held(run):
         steps = read_ledger(run)
         at = len(steps) - 1 if step is None else step

@@ -11,15 +11,12 @@ from stitch.controllers.program import Program
 from stitch.errors import InputError, NoResultError
 from stitch.export.arm_model import ArmModel
 from stitch.export.compensation import Compensation, compensated
+from stitch.export.export_options import LIMIT_MM
 from stitch.export.program_copy import moved_texts
 from stitch.export.program_targets import Targets, targets_of
 from stitch.frames import Array
 
-# Largest believable move, mm: an industrial arm that nobody calibrated is off by 1 to 2 mm (IRB 1600: at most 2.2 mm,
-# Nubiola & Bonev 2013, Robotics and Computer-Integrated Manufacturing 29:236); more than twice that is another arm, a
-# wrong frame or a wrong tool.
-LIMIT_MM = 5.0
-# The rotation that goes with it, mrad for each mm: what moves a hand of half a metre by so much.
+# The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
 _MRAD_PER_MM = 2.0
 # Largest turn of one joint, rad: near a singular pose joints turn far for a small move.
 _LARGEST_TURN = np.radians(3.0)

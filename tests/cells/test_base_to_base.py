@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cells.base_to_base import fit, project, read_stand, solve
 from stitch.cells.base_to_base.contradiction import compare_distances
 from stitch.cells.base_to_base.stand import Stand, Touched
+from stitch.cells.base_to_base.stand_file import read_stand
+from stitch.cells.base_to_base.stand_fit import fit
+from stitch.cells.base_to_base.stand_projection import project
+from stitch.cells.base_to_base.stand_solution import solve
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 

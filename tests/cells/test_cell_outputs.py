@@ -231,7 +231,8 @@ def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monk
 
 def test_expected_shape_is_what_the_commanded_clamps_do():
     """A clamp that is lifted by what its three points need leaves nothing; one point alone cannot turn it."""
-    from stitch.cells.panel import read_job, solve_job
+    from stitch.cells.panel.panel_job import read_job
+    from stitch.cells.panel.panel_solution import solve_job
 
     job = read_job(JOBS["panel"])
     result = solve_job(job)

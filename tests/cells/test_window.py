@@ -251,7 +251,7 @@ def test_expected_region_without_points_is_no_fit(pane_cad):
     box = Box("corner", np.array([-1e3, -1e3, -1e3]), np.array([1e3, 1e3, 1e3]))
     assert coverage(box, pane_cad, np.array([[5e3, 0, 0.0]]), np.array([[0, 1.0, 0]])) == 0.0
     with pytest.raises(InputError, match="not found"):
-        from stitch.cells.window import read_fit_job
+        from stitch.cells.window.window_jobs import read_fit_job
 
         read_fit_job("nowhere.toml")
 

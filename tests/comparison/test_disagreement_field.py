@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_synth.commands import make
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
+from data_synth.made_session import make
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch import frames

@@ -5,7 +5,7 @@ import tomllib
 import pytest
 
 from data_synth import scene
-from data_synth.commands import hidden_of, make
+from data_synth.made_session import hidden_of, make
 from stitch.cli.main import main
 from stitch.errors import InputError
 

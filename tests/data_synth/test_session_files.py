@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from data_synth import nature
-from data_synth.commands import make, synth, truth_path
+from data_synth.commands import synth
 from data_synth.fixtures.edits import edit
 from data_synth.fixtures.quiet_scenes import clean
+from data_synth.made_session import make, truth_path
 from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.errors import InputError, NoResultError

@@ -14,8 +14,9 @@ LIGHT = DEAR | {"numpy", "scipy", "pyarrow", "asyncio"}
 def loaded(code):
     """Modules of a process that has run some code."""
     told = f"import json, sys\n{code}\nprint('modules', json.dumps(list(sys.modules)))"
-    out = subprocess.run([sys.executable, "-c", told], capture_output=True, check=True, text=True).stdout
-    return set(json.loads(out.rpartition("modules ")[2]))
+    out = subprocess.run([sys.executable, "-c", told], capture_output=True, check=False, text=True)
+    assert not out.returncode, out.stderr
+    return set(json.loads(out.stdout.rpartition("modules ")[2]))
 
 
 @pytest.mark.parametrize(
@@ -26,9 +27,32 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
     assert not loaded(f"import {module}") & (DEAR | also_without)
 
 
-@pytest.mark.parametrize("line", ["--version", "--help", "run --help", "batch --help"])
-def test_help_loads_no_mathematics(line):
+@pytest.mark.parametrize("line", ["--version", "--help"])
+def test_the_list_of_commands_loads_no_mathematics(line):
     code = f"from stitch.cli.main import main\ntry:\n    main({line.split()})\nexcept SystemExit:\n    pass"
+    assert not loaded(code) & LIGHT
+
+
+def test_no_command_s_help_loads_mathematics():
+    """In one process, one after another: the first that loads something dear is named."""
+    code = f"""
+import sys
+import typer
+from stitch.cli.main import build
+
+def helps(group, words=()):
+    for name in group.commands:
+        command = group.commands[name]
+        yield " ".join((*words, name)), command.get_help(typer.Context(command, info_name=name))
+        yield from helps(command, (*words, name)) if hasattr(command, "commands") else ()
+
+told = 0
+for name, text in helps(typer.main.get_command(build())):
+    dear = {LIGHT!r} & set(sys.modules)
+    assert not dear, f"stitch {{name}} --help loads {{sorted(dear)}}"
+    told += "Examples:" in text
+assert told > 25, told
+"""
     assert not loaded(code) & LIGHT
 
 

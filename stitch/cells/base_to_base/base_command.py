@@ -1,20 +1,11 @@
 """`stitch base FILE`: where the second robot stands as seen from the first."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.table import Table
 
-from stitch import frames
-from stitch.cells.base_to_base import BaseResult, read_stand, rod_session, solve
-from stitch.cells.base_to_base.stand_solution import describe, document
-from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption, show
-from stitch.errors import NoResultError
-from stitch.system.console import console
-from stitch.writing.session_files import write_session
+from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption
 
 
 def base(
@@ -30,45 +21,7 @@ def base(
     Examples:
       stitch base stand.toml --report page.html
     """
-    stand = read_stand(file)
-    try:
-        result = solve(stand)
-    except NoResultError:
-        # The page shows which readings contradict each other.
-        show("base", None, report, stand, None)
-        raise
-    if session is not None:
-        write_session(session, rod_session.session(stand, result))
-    show("base", recording, report, stand, result)
-    if as_json:
-        print(json.dumps(document(result), indent=1))
-    else:
-        _print(result)
+    # Loaded by who solves something: whoever asks for help has it at once.
+    from stitch.cells.base_to_base.solved_stand import solved_stand
 
-
-def _print(result: BaseResult) -> None:
-    terminal = console()
-    unit, solution = result.length_unit, result.fit
-    table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
-    for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
-        table.add_column(heading)
-    table.add_row("least squares", *_pose(solution.T_base1_base2))
-    table.add_row("  sigma", _numbers(solution.sigma[3:], 5), _numbers(solution.sigma[:3], 6))
-    if result.projection is not None:
-        table.add_row("projection", *_pose(result.projection.T_base1_base2))
-    terminal.print(table)
-    terminal.print(f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings.")
-    for comparison in result.comparisons:
-        terminal.print(describe(comparison, unit) + ".")
-    if result.no_projection:
-        terminal.print(f"No projection: {result.no_projection}.")
-    for row in solution.T_base1_base2:
-        print(" ".join(f"{value:.9g}" for value in row))
-
-
-def _pose(T: np.ndarray) -> tuple[str, str]:
-    return _numbers(T[:3, 3], 5), _numbers(frames.log(T)[:3], 6)
-
-
-def _numbers(values: np.ndarray, digits: int) -> str:
-    return "  ".join(f"{value:.{digits}f}" for value in values)
+    solved_stand(file, recording, report, session, as_json)

@@ -1,0 +1,109 @@
+"""What `stitch add` and `stitch drop` do: another model for a run, everything fitted anew, the ledger for people."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from stitch.cli.diagnosed_run import write_diagnosis
+from stitch.cli.ledger_summary import show_ledger
+from stitch.cli.recorders import recorder_for
+from stitch.cli.streams import emit
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.effects.in_session import known, require
+from stitch.errors import InputError
+from stitch.pipeline import change
+from stitch.runs.run import Run
+from stitch.runs.state import State, state_of
+from stitch.stepwise import suggest, suggest_group
+from stitch.stored.load_state import load_state
+from stitch.system.console import console
+from stitch.writing import run_folder
+from stitch.writing.json_file import to_json
+from stitch.writing.result_document import result_document
+
+
+def add_named(
+    run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
+) -> None:
+    """Add effects by their names.
+
+    Raises:
+        InputError, NoResultError: as `stitch add` ends.
+    """
+    with run_folder.held(run):
+        state = load_state(run, effects_file, trust=trust)
+        used = state.model.effects
+        for name in effects:
+            require(state.measurement, known(name))
+            if name in used:
+                raise InputError(f"{name} is in the model of {run} already; to fix: leave it out")
+        _change(run, state, [*used, *effects], recording, as_json)
+
+
+def add_chosen(
+    run: Path, at_most: int | None, effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
+) -> None:
+    """Add what a diagnosis chooses: at most so many effects one by one, or None: the group that it cannot tell apart.
+
+    Raises:
+        InputError, NoResultError: as `stitch add` ends.
+    """
+    with run_folder.held(run):
+        state = load_state(run, effects_file, trust=trust)
+        chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
+        _suggested(run, state, chosen, recording, as_json)
+
+
+def _suggested(
+    run: Path, state: State, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
+) -> None:
+    """Write and show what a diagnosis chose; what was tried on the way leaves no recording, the end does."""
+    result, lines, found = chosen
+    for line in lines:
+        console().print(line, soft_wrap=True)
+    if result is not None:
+        with run_folder.changed(run) as scratch:
+            if recording:
+                # The same fit once more from where it ended, for the recording; it takes the last step's place.
+                before = replace(state_of(result), ledger=result.ledger[:-1])
+                again = change(before, result.effects, recorder_for(scratch, recording))
+                result = replace(again, notes=result.notes)
+            run_folder.write_with_page(result, scratch)
+        _show(result, as_json)
+    elif as_json:
+        emit((run / "result.json").read_text(encoding="utf-8").rstrip())
+    else:
+        console().print("Nothing was added: the model is as it was.", soft_wrap=True)
+    write_diagnosis(found, state if result is None else state_of(result), run)
+
+
+def drop_named(
+    run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
+) -> None:
+    """Take effects out by their names.
+
+    Raises:
+        InputError, NoResultError: as `stitch drop` ends.
+    """
+    with run_folder.held(run):
+        state = load_state(run, effects_file, trust=trust)
+        used = state.model.effects
+        for name in effects:
+            if name not in used:
+                raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
+        kept = [name for name in used if name not in effects]
+        _change(run, state, kept, recording, as_json)
+
+
+def _change(run: Path, state: State, effects: list[str], recording: bool, as_json: bool) -> None:
+    """Give the run folder the model with these effects, and show it."""
+    with run_folder.changed(run) as scratch:
+        result = change(state, effects, recorder_for(scratch, recording))
+        run_folder.write_with_page(result, scratch)
+    _show(result, as_json)
+
+
+def _show(result: Run, as_json: bool) -> None:
+    if as_json:
+        emit(to_json(result_document(result)))
+    else:
+        show_ledger(result)

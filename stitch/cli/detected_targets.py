@@ -1,0 +1,60 @@
+"""What `stitch detect` does: boards and balls in the scans of a session, as a table."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from stitch.cli.looked_for import looked_for
+from stitch.cli.streams import emit, results
+from stitch.errors import InputError
+from stitch.intake.targets_in_scans import points_columns, scans_of, targets_in, views_of_targets
+from stitch.measurement.labelled_points import Sighting
+from stitch.reading.session_folder import load_session
+from stitch.system.whole_file import whole
+from stitch.writing.session_files import table_text, write_table
+
+
+def detected_targets(
+    session: Path, board: list[str] | None, ball: list[str] | None, output: Path | None, as_json: bool
+) -> None:
+    """Find targets and write them.
+
+    Raises:
+        InputError, NoResultError: as `stitch detect` ends.
+    """
+    wanted = looked_for(board, ball)
+    if wanted.nothing:
+        raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
+    if output is not None and (output.exists() or output.is_symlink()):
+        raise InputError(f"{output}: exists already; to fix: remove it, or name another file")
+    loaded = load_session(session)
+    found, notes = targets_in(scans_of(loaded), wanted)
+    views = [view.name for view in loaded.views]
+    columns = points_columns(views, found)
+    if output is not None:
+        with whole(output) as scratch:
+            write_table(scratch, columns)
+    for note in notes:
+        print(f"{note}.", file=sys.stderr)
+    if as_json:
+        emit(json.dumps(_document(session, views, found, notes), indent=1))
+    elif output is None:
+        results().write(table_text(columns))
+    showing = sum(bool(s.targets) for s in found)
+    count = len(views_of_targets(found))
+    where = output or "standard output"
+    print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
+    if output == session / "points.csv":
+        print(f"next: stitch run {session}", file=sys.stderr)
+
+
+def _document(session: Path, views: list[str], found: list[Sighting], notes: list[str]) -> dict[str, object]:
+    return {
+        "session": str(session),
+        "views": {view: len(s.targets) for view, s in zip(views, found, strict=True)},
+        "targets": views_of_targets(found),
+        "median_sigma": float(np.median(np.concatenate([s.sigma for s in found]))),
+        "notes": notes,
+    }

@@ -1,0 +1,137 @@
+"""What `stitch diagnose` and `stitch next` do: a diagnosis into the run folder and for people."""
+
+import shlex
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from stitch.cli.streams import emit
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.sentences import amounts_of, curve_text
+from stitch.pipeline import diagnose
+from stitch.runs.state import State
+from stitch.stored.load_state import load_state
+from stitch.system.console import console
+from stitch.units import length_text
+from stitch.writing.diagnosis_document import diagnosis_document
+from stitch.writing.json_file import to_json, write_json
+from stitch.writing.plain_finding import plain_finding
+from stitch.writing.run_folder import extend, held
+
+_SHOWN = 6
+
+
+def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+    """Diagnose a run and show what was found.
+
+    Raises:
+        InputError, NoResultError: as `stitch diagnose` ends.
+    """
+    found, document, unit = _diagnosed(run, effects_file, trust)
+    if as_json:
+        emit(to_json(document))
+    else:
+        show(found, unit)
+        if found.verdict == "cannot_tell":
+            console().print(f"Fitted as one, if that helps: stitch add {shlex.quote(str(run))} --group", soft_wrap=True)
+        elif found.curves:
+            told = f"A formula for it, if there is one: stitch explain {shlex.quote(str(run))} -o mine.py"
+            console().print(told, soft_wrap=True)
+
+
+def next_for_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+    """Diagnose a run and say what to measure next.
+
+    Raises:
+        InputError, NoResultError: as `stitch next` ends.
+    """
+    found, document, _ = _diagnosed(run, effects_file, trust)
+    if as_json:
+        emit(to_json({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}))
+        return
+    terminal = console()
+    if not found.next:
+        terminal.print(_nothing_next(found), soft_wrap=True)
+    for p in found.next:
+        terminal.print(f"To separate {' from '.join(p.separates)}: {p.do}.", soft_wrap=True)
+
+
+def _nothing_next(found: Diagnosis) -> str:
+    if found.verdict == "adequate":
+        return "Nothing is missing: there is nothing to tell apart."
+    if len(found.effects) > 1:
+        return f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}."
+    return "Nothing has to be told apart: no two candidate effects are aliases in these views."
+
+
+def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
+    with held(run):
+        state = load_state(run, effects_file, thin=True, trust=trust)
+        found = diagnose(state)
+        return found, write_diagnosis(found, state, run), state.session.length_unit
+
+
+def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, object]:
+    """diagnosis.json and what other packages make of it."""
+    document = diagnosis_document(found)
+    write_json(document, run / "diagnosis.json")
+    extend("stitch.diagnosis_reports", found, state, run)
+    return document
+
+
+def show(found: Diagnosis, length_unit: str) -> None:
+    """For everybody first, then the evidence, the candidate effects, what the poses follow, what to do next."""
+    terminal = console()
+    terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
+    terminal.print(found.sentence, soft_wrap=True)
+    table = Table(title="Candidate effects", title_justify="left")
+    for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
+        table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
+    for s in found.candidates[:_SHOWN]:
+        table.add_row(*_row(found, s, length_unit))
+    terminal.print(table)
+    for s in found.candidates[:3]:
+        if s.ranked.score.observable:
+            alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
+            told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; aliases: {alike}" if alike else "")
+            terminal.print(told, soft_wrap=True)
+    unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
+    if unseen:
+        terminal.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True)
+    lacking = sorted({need for needs in found.missing.values() for need in needs})
+    for need in lacking:
+        names = ", ".join(name for name, needs in found.missing.items() if need in needs)
+        terminal.print(f"Not tested without {need}: {names}.", soft_wrap=True)
+    if found.verdict == "adequate":
+        _show_missed(terminal, found, length_unit)
+    for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
+        terminal.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
+    for curve in found.curves[:2]:
+        terminal.print(curve_text(curve), soft_wrap=True)
+    for p in found.next[:3]:
+        terminal.print(f"To measure next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
+
+
+def _show_missed(terminal: Console, found: Diagnosis, length_unit: str) -> None:
+    """What effects too small to be seen could still do to the hand-eye."""
+    known = sorted(((s.hand_eye, s.name) for s in found.candidates if s.hand_eye is not None), reverse=True)
+    told = ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3])
+    if told:
+        terminal.print(
+            "An effect too small to be seen could still displace the hand-eye, at the part by as much as: "
+            f"{told}. Its sigma does not hold that.",
+            soft_wrap=True,
+        )
+
+
+def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
+    if not s.ranked.score.observable:
+        return [s.name, "not seen", "–", "–", "–"]
+    left = ["–", "–"]
+    if s.cross_validation is not None:
+        left = [
+            length_text(found.residual_rms * x**0.5, length_unit, zeros=True)
+            for x in (s.cross_validation.inside, s.cross_validation.heldout)
+        ]
+    return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

@@ -1,0 +1,60 @@
+"""What `stitch explain` does: a formula of what is left in a run, as a file and for people."""
+
+from pathlib import Path
+
+from stitch.cli.streams import emit
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.errors import InputError, NoResultError
+from stitch.explanation.explain import NAME, Explanation, explain
+from stitch.stored.load_state import load_state
+from stitch.system.console import console
+from stitch.system.whole_file import whole
+from stitch.units import length_text
+from stitch.writing.json_file import to_json
+
+
+def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+    """Look for a formula, write it and show it.
+
+    Raises:
+        InputError, NoResultError: as `stitch explain` ends.
+    """
+    state = load_state(run, effects_file, thin=True, trust=trust)
+    if NAME in state.model.effects:
+        raise InputError(
+            f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"
+        )
+    found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
+    heldout = state.residual_rms * found.heldout_share**0.5 if found.found else None
+    if output is not None and found.found:
+        with whole(output) as file:
+            file.write_text(found.source, encoding="utf-8")
+    if as_json:
+        emit(to_json(_document(found, heldout)))
+    else:
+        _show(found, heldout, state.session.length_unit, run, output)
+    if not found.found and output is not None:
+        raise NoResultError(f"{run}: no formula holds, nothing was written to {output}")
+
+
+def _document(found: Explanation, heldout: float | None) -> dict[str, object]:
+    return {
+        "found": found.found,
+        "formula": found.formula,
+        "place": found.place,
+        "heldout_rms": heldout,
+        "p_value": found.p_value if found.found else None,
+        "sentence": found.why,
+    }
+
+
+def _show(found: Explanation, heldout: float | None, unit: str, run: Path, output: Path | None) -> None:
+    terminal = console()
+    terminal.print(found.why, soft_wrap=True)
+    if heldout is None:
+        return
+    terminal.print(f"Added, it should leave {length_text(heldout, unit)} on views left out.", soft_wrap=True)
+    if output is None:
+        terminal.print(f"Next: stitch explain {run} -o mine.py", soft_wrap=True)
+    else:
+        terminal.print(f"Next: read {output}, then stitch add {run} {NAME} --effects-file {output}", soft_wrap=True)

@@ -1,0 +1,107 @@
+"""What `stitch init` does: guesses told, what cannot be told asked for, a session written."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from stitch.cli.streams import emit
+from stitch.errors import InputError
+from stitch.intake.bag_session import write_bag_session
+from stitch.intake.first_session import FirstSession, first_session
+from stitch.intake.guesses import Guess
+from stitch.intake.session_draft import require_free, write_draft
+from stitch.intake.stated import Stated
+
+# Guesses that are asked for one by one; the fields of `Stated` bear the same names.
+_ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
+
+
+def of_scans(folder: Path, out: Path, stated: Stated, yes: bool, as_json: bool) -> None:
+    """A session of scans and poses; what they do not tell is asked on a terminal, or guessed with `yes`.
+
+    Raises:
+        InputError, NoResultError: as `stitch init` ends.
+    """
+    require_free(out, not stated.targets.nothing)
+    first = first_session(folder, stated)
+    _tell(first.guesses)
+    if not yes:
+        first = _asked(folder, out, first, stated)
+    write_draft(out, first)
+    _end(out, len(first.pairing.used), first.guesses, as_json)
+
+
+def of_bag(bag: Path, out: Path, topic: str | None, named: str | None, as_json: bool) -> None:
+    """A session of a bag: what its messages do not say is not asked, flags state it.
+
+    Raises:
+        InputError, NoResultError: as `stitch init` ends.
+    """
+    frames = tuple(name.strip() for name in named.split(",")) if named else ()
+    if named and len(frames) not in (2, 3):
+        raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
+    made = write_bag_session(bag, out, topic, frames)
+    _tell(made.guesses)
+    _end(out, made.views, made.guesses, as_json)
+
+
+def _end(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None:
+    if as_json:
+        emit(json.dumps(_document(out, views, guesses), indent=1))
+    print(f"{out / 'session.toml'} and views.csv: {views} views", file=sys.stderr)
+    print(f"next: stitch run {out}", file=sys.stderr)
+
+
+def _tell(guesses: Sequence[Guess]) -> None:
+    for guess in guesses:
+        print(f"{'' if guess.told else '? '}{guess.line}", file=sys.stderr)
+
+
+def _asked(folder: Path, out: Path, first: FirstSession, stated: Stated) -> FirstSession:
+    """On a terminal what cannot be told is asked, and judged anew; elsewhere it is refused.
+
+    Raises:
+        InputError: names the flags that would tell it; or a person does not want the session.
+    """
+    untold = [guess for guess in first.guesses if not guess.told]
+    if not sys.stdin.isatty():
+        if untold:
+            flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
+            what = ", ".join(guess.what for guess in untold)
+            raise InputError(
+                f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes"
+            )
+        return first
+    answers: dict[str, Any] = {guess.what: _answer(guess) for guess in untold if guess.what in _ASKED}
+    if any(answers[guess.what] != _own(guess) for guess in untold if guess.what in answers):
+        # What was kept counts as stated too: the person has seen it.
+        first = first_session(folder, replace(stated, **answers))
+        _tell(first.guesses)
+    if not typer.confirm("Write the session?", default=True, err=True):
+        raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
+    return first
+
+
+def _answer(guess: Guess) -> str:
+    """What a person says instead of a guess, or the guess."""
+    text = f"{guess.what} cannot be told from these views; enter another, or keep"
+    return str(typer.prompt(text, default=_own(guess), err=True)).strip()
+
+
+def _own(guess: Guess) -> str:
+    """The word of a guess, as its flag takes it."""
+    return guess.value.split(",")[0]
+
+
+def _document(out: Path, views: int, guesses: Sequence[Guess]) -> dict[str, object]:
+    return {
+        "session": str(out),
+        "views": views,
+        "told": all(guess.told for guess in guesses),
+        "guesses": [guess.as_dict() for guess in guesses],
+    }

@@ -1,0 +1,100 @@
+"""What `stitch report` does: the page of one run, or of two."""
+
+from pathlib import Path
+
+from stitch.cli.compared_run import write_comparison
+from stitch.cli.diagnosed_run import write_diagnosis
+from stitch.cli.printing import print_page
+from stitch.comparison.two_runs import TwoRuns, sentence, two_runs
+from stitch.errors import InputError
+from stitch.pipeline import diagnose
+from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import stored_run
+from stitch.system.console import console
+from stitch.writing import run_folder
+
+
+def page_of_one(
+    run: Path,
+    with_diagnosis: bool,
+    tolerance: float | None,
+    printer: str | None,
+    effects_file: Path | None,
+    trust: bool,
+) -> None:
+    """Write the page of a run, on paper too where there is a printer.
+
+    Raises:
+        InputError, NoResultError: as `stitch report` ends.
+    """
+    page = run / "report.html"
+    with run_folder.held(run):
+        state = load_state(run, effects_file, trust=trust)
+        run_folder.extend("stitch.reports", stored_run(run, state), page, tolerance)
+        if with_diagnosis:
+            thin = load_state(run, effects_file, thin=True, trust=trust)
+            write_comparison(thin, run)
+            write_diagnosis(diagnose(thin), thin, run)
+        _told(_printed(page, printer))
+
+
+def page_of_two(
+    run: Path,
+    other: Path,
+    output: Path | None,
+    tolerance: float | None,
+    printer: str | None,
+    effects_file: Path | None,
+    trust: bool,
+) -> None:
+    """Write the page of two runs, on paper too where there is a printer.
+
+    Raises:
+        InputError, NoResultError: as `stitch report` ends.
+    """
+    states = [load_state(folder, effects_file, trust=trust) for folder in _different(run, other)]
+    runs = [stored_run(folder, state) for folder, state in zip((run, other), states, strict=True)]
+    both = two_runs(runs, _names(run, other))
+    written = _two(both, other, output, tolerance, printer)
+    console().print(sentence(both), soft_wrap=True, style="bold")
+    _told(written)
+
+
+def _told(written: list[Path]) -> None:
+    for path in written:
+        console().print(f"  {path}", soft_wrap=True)
+
+
+def _two(both: TwoRuns, other: Path, output: Path | None, tolerance: float | None, printer: str | None) -> list[Path]:
+    """Write the page of two runs; returns its files."""
+    if output is None:
+        with run_folder.held(other):
+            run_folder.extend("stitch.two_run_reports", both, other / "two-runs.html", tolerance)
+            return _printed(other / "two-runs.html", printer)
+    if output.suffix != ".html" or output.is_dir():
+        raise InputError(f"--output {output}: no place for a page; to fix: name a file that ends in .html")
+    if not output.parent.is_dir():
+        raise InputError(f"--output {output}: its folder does not exist; to fix: make it first")
+    run_folder.extend("stitch.two_run_reports", both, output, tolerance)
+    return _printed(output, printer)
+
+
+def _printed(page: Path, printer: str | None) -> list[Path]:
+    """The page, and beside it the same on paper if there is a printer."""
+    if printer is None:
+        return [page]
+    paper = page.with_suffix(".pdf")
+    print_page(printer, page, paper)
+    return [page, paper]
+
+
+def _different(run: Path, other: Path) -> tuple[Path, Path]:
+    if run.resolve() == other.resolve():
+        raise InputError(f"{run} and {other} are one run; to fix: name two, or one alone for its own page")
+    return run, other
+
+
+def _names(run: Path, other: Path) -> tuple[str, str]:
+    """Names that tell the two folders apart."""
+    run, other = run.resolve(), other.resolve()
+    return (str(run), str(other)) if run.name == other.name else (run.name, other.name)
