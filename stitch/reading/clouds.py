@@ -15,11 +15,12 @@ from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, r
 from stitch.reading.organised import grid_shape, measured
 from stitch.reading.pcd import read_pcd
 from stitch.reading.text_file import require_file, shortened
+from stitch.reading.zdf import read_zdf
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT = (".xyz", ".csv", ".txt", ".asc")
 # Kinds that are read, by the ending of the file's name.
-CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz", *DEPTH_SUFFIXES)
+CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz", ".zdf", *DEPTH_SUFFIXES)
 
 
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
@@ -33,7 +34,14 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     require_file(path, "name a file in the column cloud of views.csv")
     readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": read_ply, ".pcd": read_pcd}
     readers |= dict.fromkeys(_TEXT, _read_text) | dict.fromkeys(MESHES, read_mesh)
-    readers |= {".npy": read_array, ".ptx": read_ptx, ".e57": read_e57, ".las": read_las, ".laz": read_las}
+    readers |= {
+        ".npy": read_array,
+        ".ptx": read_ptx,
+        ".e57": read_e57,
+        ".las": read_las,
+        ".laz": read_las,
+        ".zdf": read_zdf,
+    }
     readers |= dict.fromkeys(DEPTH_SUFFIXES, read_depth_columns)
     kind = path.suffix.lower()
     reader = readers.get(kind)

@@ -14,6 +14,7 @@ from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_dept
 from stitch.reading.organised import grid_shape
 from stitch.reading.pcd import read_pcd
 from stitch.reading.text_file import shortened
+from stitch.reading.zdf import read_zdf_image
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _COLOUR = re.compile(r"colou?r|rgb|image|gr[ae]y|intensity|texture|left|2d", re.IGNORECASE)
@@ -63,6 +64,9 @@ def _read(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
         return read_depth(path), None
     if kind == ".npy":
         return _of_array(path)
+    if kind == ".zdf":
+        points, colours = read_zdf_image(path)
+        return points, None if colours is None else _grey(colours)
     shape = grid_shape(path) if kind in (".ply", ".pcd") else None
     if shape is None:
         return None, None

@@ -12,6 +12,7 @@ from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
 from stitch.runs.run import FusedCloud
 from stitch.writing.tables import write_cloud
+from tests.needs import needs
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-200, 900, (300, 3)).astype(np.float32).astype(float)
@@ -60,7 +61,7 @@ def test_pcd_by_open3d(cloud):
 
 @pytest.mark.parametrize("kind", ["las", "laz"])
 def test_las_by_laspy(cloud, kind):
-    laspy = pytest.importorskip("laspy")
+    laspy = needs("laspy", "formats")
     export, _ = cloud
     read = laspy.read(export(kind))
     assert np.abs(read.xyz - POINTS).max() <= 0.5e-6  # 900 units in steps of 32 bits and whole powers of ten
@@ -69,7 +70,7 @@ def test_las_by_laspy(cloud, kind):
 
 
 def test_e57_by_pye57_in_metres(cloud):
-    pye57 = pytest.importorskip("pye57")
+    pye57 = needs("pye57", "formats")
     export, metres = cloud
     read = pye57.E57(export("e57")).read_scan(0, colors=True, ignore_missing_fields=True)
     assert np.allclose(np.column_stack([read[f"cartesian{a}"] for a in "XYZ"]), POINTS * metres)

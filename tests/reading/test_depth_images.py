@@ -8,6 +8,7 @@ import pytest
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 from stitch.reading.range_image import read_range_image
+from tests.needs import needs
 
 cv2 = pytest.importorskip("cv2")
 FX, FY, CX, CY = 310.0, 305.0, 15.5, 9.25
@@ -75,7 +76,7 @@ def test_floating_point_depth_in_metres(tmp_path, monkeypatch, name):
         np.save(tmp_path / name, metres)
     else:
         if name.endswith(".exr"):
-            pytest.importorskip("OpenEXR")
+            needs("OpenEXR", "formats")
             monkeypatch.setenv("OPENCV_IO_ENABLE_OPENEXR", "1")
         assert cv2.imwrite(str(tmp_path / name), metres)
     assert np.allclose(read_cloud(tmp_path / name, 1000.0).points, expected(DEPTH), atol=1e-4)

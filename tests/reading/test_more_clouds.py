@@ -9,6 +9,8 @@ import pytest
 
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
+from stitch.reading.range_image import read_range_image
+from tests.needs import needs
 
 CORNERS = np.array([[0.0, 0, 100], [10, 0, 100], [0, 10, 100], [10, 10, 100]])
 FACES = [(0, 1, 2), (1, 3, 2)]
@@ -108,7 +110,7 @@ def test_nan_in_a_list_of_points_is_refused(tmp_path):
 
 
 def test_las_and_e57_by_their_packages(tmp_path):
-    laspy, pye57 = pytest.importorskip("laspy"), pytest.importorskip("pye57")
+    laspy, pye57 = needs("laspy", "formats"), needs("pye57", "formats")
     las = laspy.create(point_format=0)
     las.header.scales = [1e-4] * 3
     las.x, las.y, las.z = CORNERS.T
@@ -120,7 +122,35 @@ def test_las_and_e57_by_their_packages(tmp_path):
     assert np.allclose(read_cloud(tmp_path / "s.e57").points, CORNERS)
 
 
-@pytest.mark.parametrize(("name", "package"), [("s.las", "laspy"), ("s.e57", "pye57")])
+def zdf(path, points, **more):
+    """A file in the layout that Zivid's sample programs read."""
+    h5py = needs("h5py", "formats")
+    with h5py.File(path, "w") as file:
+        for name, values in {"pointcloud": points, **more}.items():
+            file[f"data/{name}"] = values
+    return path
+
+
+def test_zdf_is_an_image_of_points(tmp_path):
+    """Pixels that measured nothing are no points; colours make it a range image."""
+    points = np.full((3, 4, 3), np.nan, np.float32)
+    points[1, :] = CORNERS[:4]
+    colours = np.zeros((3, 4, 4), np.uint8)
+    colours[1, 2] = (90, 120, 150, 255)
+    path = zdf(tmp_path / "s.zdf", points, rgba_image=colours)
+    cloud = read_cloud(path, 1e-3)
+    assert np.allclose(cloud.points, CORNERS[:4] * 1e-3) and cloud.scalars["blue"].tolist() == [0, 0, 150, 0]
+    image = read_range_image(path)
+    assert image.points.shape == (3, 4, 3) and np.isnan(image.points[0]).all()
+    assert np.unravel_index(image.grey.argmax(), image.grey.shape) == (1, 2)
+
+
+def test_zdf_of_another_layout_says_how_to_get_in(tmp_path):
+    with pytest.raises(InputError, match=r"no data/pointcloud .* save it as PLY"):
+        read_cloud(zdf(tmp_path / "s.zdf", np.zeros((4, 3))))
+
+
+@pytest.mark.parametrize(("name", "package"), [("s.las", "laspy"), ("s.e57", "pye57"), ("s.zdf", "h5py")])
 def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch, name, package):
     (tmp_path / name).write_bytes(b"x" * 100)
     monkeypatch.setitem(__import__("sys").modules, package, None)
