@@ -47,7 +47,7 @@ def detected_targets(
     where = output or "standard output"
     print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
     if output == session / "points.csv":
-        print(f"next: stitch run {session}", file=sys.stderr)
+        print(f"Next: stitch run {session}", file=sys.stderr)
 
 
 def _document(session: Path, views: list[str], found: list[Sighting], notes: list[str]) -> dict[str, object]:

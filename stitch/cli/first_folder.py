@@ -54,7 +54,7 @@ def _end(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None
     if as_json:
         emit(json.dumps(_document(out, views, guesses), indent=1))
     print(f"{out / 'session.toml'} and views.csv: {views} views", file=sys.stderr)
-    print(f"next: stitch run {out}", file=sys.stderr)
+    print(f"Next: stitch run {out}", file=sys.stderr)
 
 
 def _tell(guesses: Sequence[Guess]) -> None:

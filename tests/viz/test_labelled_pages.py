@@ -47,6 +47,7 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     state = RunReview(run).state()
     assert result["plain"] in added
     assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], False)
+    assert state["labelled"]
     # The tolerance counts: 95 % of the distances as residuals.parquet has them, to a percent.
     reach = np.quantile(pq.read_table(run / "residuals.parquet")["residual"].to_numpy(), 0.95)
     for tolerance, light in ((1.01 * reach, "light good"), (0.99 * reach, "light bad")):

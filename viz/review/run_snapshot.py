@@ -83,6 +83,9 @@ def _read(run: Path, version: str) -> Snapshot:
         "name": result.get("name", Path(result["session"]).name),
         "sentence": result.get("plain") or result["verdict"],
         "evidence": result["verdict"],
+        "length_unit": result["length_unit"],
+        # A run without clouds says null; an older one says nothing.
+        "labelled": result.get("disagreement", {}) is None,
         "residual": result["residual_rms"] * um,
         "heldout": None if result["heldout_rms"] is None else result["heldout_rms"] * um,
         "floor": result["noise_floor"] * um,

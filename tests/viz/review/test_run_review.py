@@ -49,7 +49,7 @@ def test_undo_and_redo_are_read_from_the_ledger(steps, undo, redo):
 def test_what_is_shown_is_what_the_files_say(run):
     found, result = read_snapshot(run), json.loads((run / "result.json").read_text())
     assert found.state["residual"] == pytest.approx(1e3 * result["residual_rms"])
-    assert found.state["sentence"] == result["plain"]
+    assert found.state["sentence"] == result["plain"] and not found.state["labelled"]
     page = (run / "report.html").read_text()
     assert found.state["sentence"] in page
     assert json.loads(found.part)["steps"][1]["mean"] == pytest.approx(found.state["steps"][1]["mean"])

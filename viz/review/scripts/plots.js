@@ -94,13 +94,13 @@ function places() {
   const fair = table.count.map((n, i) => [n, i]).filter(([n]) => n > 50).map(([, i]) => i);
   const worst = fair.sort((a, b) => table.rms[b] - table.rms[a]).slice(0, 4);
   return element("div", { class: "plot", role: "group", "aria-label": "Places of the part" },
-    element("h3", {}, "Places of the part"), element("p", { class: "soft" }, "where it is worst; reference frame"),
+    element("h3", {}, "Places of the part"), element("p", { class: "soft" }, `where it is worst; x, y, z in ${state.length_unit}, reference frame`),
     element("div", { class: "places" }, ...worst.map(i => {
       const place = table.label[i].replace(/[()]/g, "").split(",").map(Number);
       const pressed = Boolean(choice.place) && place.every((x, k) => x === choice.place[k]);
       return element("button", { type: "button", "data-key": `place ${i}`, "aria-pressed": String(pressed),
-        onclick: () => pressed ? choosePlace(null) : choosePlace(place, 0, `the place ${table.label[i]}`) },
-      `${table.label[i]}: ${um(table.rms[i])}`);
+        onclick: () => pressed ? choosePlace(null) : choosePlace(place, 0, `the place ${table.label[i].replaceAll("-", "−")}`) },
+      `${table.label[i].replaceAll("-", "−")}: ${um(table.rms[i])}`);
     })));
 }
 

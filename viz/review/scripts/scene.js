@@ -51,7 +51,7 @@ export function showNumbers(state) {
   const tile = (value, words, old) => element("div", { class: "tile" },
     element("b", {}, um(value)), element("small", {}, words), old != null && value != null && fell(value, old));
   at("tiles").replaceChildren(
-    tile(state.residual, "rms between views, in the fit", before && before.residual),
+    tile(state.residual, state.labelled ? "rms of labelled points, in the fit" : "rms between views, in the fit", before && before.residual),
     tile(state.heldout, "rms on views left out", before && before.heldout),
     tile(state.floor, "noise floor of the sensor"));
 }
