@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, edges_of, values_of_views, view_properties
+from stitch.comparison.tables import Comparison, Table, edges_of, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
@@ -42,7 +42,7 @@ def compare_targets(state: State) -> Comparison:
         tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
     names = tuple(view.name for view in state.session.views)
-    return Comparison(tuple(tables), rms, rms, names, values_of_views(state.measurement.views))
+    return Comparison(tuple(tables), rms, rms, names, {name: values for name, _, values in _of_views(state)})
 
 
 def _offsets(state: State) -> _Offsets:
@@ -110,9 +110,13 @@ def _table(
 
 def _properties(state: State, rows: _Offsets) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
-    views = state.measurement.views
     out = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
+    return out + [(name, unit, values[rows.view]) for name, unit, values in _of_views(state) if np.ptp(values) > 1e-9]
+
+
+def _of_views(state: State) -> list[tuple[str, str, Array]]:
+    """Name, unit and value of every property, per view."""
+    views = state.measurement.views
     moves = np.degrees(views.joints - views.previous)
     of_view = [(f"last move of j{i + 1}", "deg", moves[:, i]) for i in range(moves.shape[1])]
-    of_view += [*view_properties(views), ("order", "view", np.arange(views.count, dtype=float))]
-    return out + [(name, unit, values[rows.view]) for name, unit, values in of_view if np.ptp(values) > 1e-9]
+    return [*of_view, *view_properties(views), ("order", "view", np.arange(views.count, dtype=float))]

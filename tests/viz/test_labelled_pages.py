@@ -11,6 +11,7 @@ import pytest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
+from viz.review.chosen_field import Choice
 from viz.review.run_review import RunReview
 
 
@@ -48,6 +49,13 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     assert result["plain"] in added
     assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], False)
     assert state["labelled"]
+    # Chosen in a plot, the numbers are those of `stitch compare`.
+    told(capsys, "compare", run)
+    tables = json.loads((run / "compare.json").read_text())["tables"]
+    for table in (next(t for t in tables if t["name"] == name) for name in ("order", "j2")):
+        chosen = RunReview(run).chosen(Choice(bins={table["name"]: (1, 1)}))["chosen"]
+        assert (chosen["correspondences"], chosen["views"]) == (table["count"][1], table["views"][1])
+        assert chosen["rms"] == pytest.approx(1e3 * table["rms"][1], rel=0.02)
     # The tolerance counts: 95 % of the distances as residuals.parquet has them, to a percent.
     reach = np.quantile(pq.read_table(run / "residuals.parquet")["residual"].to_numpy(), 0.95)
     for tolerance, light in ((1.01 * reach, "light good"), (0.99 * reach, "light bad")):

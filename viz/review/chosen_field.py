@@ -77,7 +77,7 @@ def chosen_field(
     Raises:
         InputError: a view, a property or a bin that the run does not have.
     """
-    mask = _chosen(rows, choice, comparison)
+    mask = chosen_rows(rows, choice, comparison)
     overall, e = _overall(rows, weights, mask) * um, rows.residual[mask] * um
     seen = overall[np.isfinite(overall)]
     return {
@@ -106,8 +106,12 @@ def _overall(rows: ResidualRows, weights: PatchWeights, mask: Mask) -> Array:
         return np.asarray(np.where(count > 0, size / np.maximum(count, 1), np.nan))
 
 
-def _chosen(rows: ResidualRows, choice: Choice, comparison: dict[str, Any] | None) -> Mask:
-    """(N,) sides that meet all that was stated."""
+def chosen_rows(rows: ResidualRows, choice: Choice, comparison: dict[str, Any] | None) -> Mask:
+    """(N,) sides that meet all that was stated.
+
+    Raises:
+        InputError: a view, a property or a bin that the run does not have.
+    """
     mask = np.ones(len(rows.view), bool)
     if choice.views:
         if unknown := sorted(choice.views - set(rows.views)):

@@ -1,4 +1,4 @@
-"""The residuals of a run, from its residuals.parquet: both sides of every correspondence, and what is known of each."""
+"""The residuals of a run, from its residuals.parquet: both sides of every correspondence, or every labelled point."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,10 @@ _COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "residual")
 
 @dataclass(frozen=True)
 class ResidualRows:
-    """N sides of correspondences under the present model; the first half are of `view`, the second of `partner`."""
+    """N sides of correspondences under the present model, the first half of `view`, the second of `partner`.
+
+    Or N labelled points, each once, by its 3D distance.
+    """
 
     views: tuple[str, ...]
     view: Indices  # (N,)
@@ -71,6 +74,27 @@ def read_rows(run: Path, result: dict[str, Any]) -> ResidualRows | None:
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
     return _both_sides(table, result, 1 / step)
+
+
+def read_sightings(run: Path, result: dict[str, Any]) -> ResidualRows:
+    """Every labelled point as a row: the 3D distance from its place, and where that is.
+
+    Args:
+        result: result.json of the same run.
+
+    Raises:
+        InputError: a damaged file.
+    """
+    try:
+        table = pq.read_table(run / "residuals.parquet", columns=["view", *_COLUMNS])
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
+    names = tuple(row["view"] for row in result["views"])
+    number = {name: v for v, name in enumerate(names)}
+    values = np.column_stack([table[name].to_numpy() for name in _COLUMNS])
+    view = np.array([number[name] for name in table["view"].to_pylist()], np.int64)
+    poses = np.array([row["pose"] for row in result["views"]], float)
+    return ResidualRows(names, view, values[:, 6], values[:, :3], values[:, 3:6], poses, share=1.0)
 
 
 def _both_sides(table: pa.Table, result: dict[str, Any], share: float) -> ResidualRows:

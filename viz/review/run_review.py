@@ -3,31 +3,22 @@
 import re
 import threading
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
-from viz.review.chosen_field import Choice, PatchWeights, chosen_field, patch_weights
-from viz.review.residual_rows import ResidualRows, read_rows
+from viz.review.chosen_field import Choice
+from viz.review.known_residuals import KnownResiduals, known_residuals
 from viz.review.run_snapshot import Snapshot, read_snapshot, version_of
 
 # A person's own file in the run folder, which no command takes away.
 OWN_EFFECTS = "review_effects.py"
 _NAME = re.compile(r"[A-Za-z_]\w{0,80}")
 _LONGEST_NOTE, _LONGEST_NAME = 2000, 80
-
-
-class _Rows(NamedTuple):
-    """Residuals of a model, how they count for the patches of the part, and the field of all of them."""
-
-    model: str
-    rows: ResidualRows
-    weights: PatchWeights
-    all: dict[str, Any]
 
 
 @dataclass
@@ -39,7 +30,7 @@ class RunReview:
     trust: bool = False  # the file that the model names
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _last: Snapshot | None = None
-    _rows: _Rows | None = None
+    _rows: KnownResiduals | None = None
 
     @property
     def version(self) -> str:
@@ -94,7 +85,7 @@ class RunReview:
             self.chosen(Choice())
 
     def chosen(self, choice: Choice) -> dict[str, Any]:
-        """Field and numbers of a choice.
+        """Field and numbers of a choice; of labelled points numbers alone.
 
         Raises:
             InputError: the run has no such view, property or bin, or no field.
@@ -104,19 +95,9 @@ class RunReview:
         with self._lock:
             if self._rows is None or self._rows.model != found.model:
                 self._rows = None  # two at once would take twice the memory
-                self._rows = self._read_rows(found, um)
+                self._rows = known_residuals(self.run, found, um)
             known = self._rows
-        if choice.place is not None and not choice.within:
-            choice = replace(choice, within=2 * known.weights.radius)
-        chosen = chosen_field(known.rows, known.weights, choice, found.comparison, um)
-        return {"model": found.model, "all": known.all, "chosen": chosen}
-
-    def _read_rows(self, found: Snapshot, um: float) -> _Rows:
-        rows = read_rows(self.run, found.result)
-        if rows is None or found.part is None:
-            raise InputError(f"{self.run}: has no surfaces to show a part of")
-        weights = patch_weights(rows, found.part)
-        return _Rows(found.model, rows, weights, all=chosen_field(rows, weights, Choice(), None, um))
+        return {"model": found.model, "all": known.all, "chosen": known.chosen(choice, found.comparison, um)}
 
     def arguments(self, kind: str, asked: dict[str, Any]) -> list[str]:
         """The command of what a page asked for.

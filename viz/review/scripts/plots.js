@@ -3,7 +3,8 @@ import { at, digits, element, um } from "./elements.js";
 import { showChoice } from "./scene.js";
 import { send } from "./server.js";
 
-const FIRST = 5, VIEWS = "view", PLACES = "place on the part";
+// More bars than this are thinner than a finger, and slow.
+const FIRST = 5, MOST = 60, VIEWS = "view", PLACES = "place on the part";
 let choice = empty(), state = null, all = false, asked = 0;
 
 function empty() { return { views: [], bins: {}, place: null, within: 0, name: "" }; }
@@ -43,16 +44,20 @@ function draw() {
 function views() {
   const table = state.comparison.find(t => t.name === VIEWS);
   if (!table) return "";
-  const most = Math.max(...table.rms.map(x => x ?? 0), 1e-9);
-  return card("Views", "rms of each against the others (µm)", "wide", table.label.map((name, i) => bar({
-    key: `view ${name}`, height: (table.rms[i] ?? 0) / most, from: 0, pressed: choice.views.includes(name),
-    label: `view ${name}: rms ${um(table.rms[i])}`,
+  const rms = Object.fromEntries(table.label.map((name, i) => [name, table.rms[i] ?? 0]));
+  const worst = new Set([...table.label].sort((a, b) => rms[b] - rms[a]).slice(0, MOST));
+  const shown = table.label.filter(name => worst.has(name)), most = Math.max(...shown.map(name => rms[name]), 1e-9);
+  const what = state.labelled ? "rms of the labelled points of each" : "rms of each against the others";
+  const few = shown.length < table.label.length ? `: the ${shown.length} farthest off of ${table.label.length}` : "";
+  return card("Views", `${what} (µm)${few}`, "wide", shown.map((name, i) => bar({
+    key: `view ${name}`, height: rms[name] / most, from: 0, pressed: choice.views.includes(name),
+    label: `view ${name}: rms ${um(rms[name])}`,
     toggle: range => {
-      const before = choice.views, last = table.label.indexOf(before[before.length - 1]);
-      const span = range && last >= 0 ? table.label.slice(Math.min(i, last), Math.max(i, last) + 1) : [name];
+      const before = choice.views, last = shown.indexOf(before[before.length - 1]);
+      const span = range && last >= 0 ? shown.slice(Math.min(i, last), Math.max(i, last) + 1) : [name];
       choice.views = before.includes(name) ? before.filter(v => v !== name) : [...new Set([...before, ...span])];
     },
-  })), table.label[0], table.label[table.label.length - 1]);
+  })), shown[0], shown[shown.length - 1]);
 }
 
 function plot(table, follows) {
@@ -141,8 +146,8 @@ function numbers(name, told, problem) {
   }
   const { chosen, all } = told;
   root.replaceChildren(clear, element("p", {}, element("b", {}, `Chosen: ${name}`)),
-    element("p", {}, `${chosen.views} of ${all.views} views, ${chosen.correspondences.toLocaleString("en")} residuals: rms ${um(chosen.rms)} (all: ${um(all.rms)}), `
-      + `on average over the part ${um(chosen.mean)} (all: ${um(all.mean)})`
+    element("p", {}, `${chosen.views} of ${all.views} views, ${chosen.correspondences.toLocaleString("en")} residuals: rms ${um(chosen.rms)} (all: ${um(all.rms)})`
+      + (chosen.mean == null ? "" : `, on average over the part ${um(chosen.mean)} (all: ${um(all.mean)})`)
       // Both sides of every correspondence count: without a choice among them the mean is zero.
-      + (Math.abs(chosen.signed) < 1e-6 ? "." : `, signed mean ${um(chosen.signed)}.`)));
+      + (Math.abs(chosen.signed ?? 0) < 1e-6 ? "." : `, signed mean ${um(chosen.signed)}.`)));
 }
