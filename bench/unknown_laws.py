@@ -23,7 +23,7 @@ from unknown_worlds import PARTS
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")

@@ -9,8 +9,6 @@ from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.joint_curves import joint_curves
-from stitch.diagnosis.joint_laws import clear_laws
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
@@ -19,7 +17,9 @@ from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
-from stitch.diagnosis.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.joint_curves import joint_curves
+from stitch.diagnosis.unknown.joint_laws import clear_laws
+from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget

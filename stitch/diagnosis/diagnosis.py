@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from stitch.diagnosis.covariate_dependence import Dependence
 from stitch.diagnosis.design.next_view import Proposal
-from stitch.diagnosis.joint_curves import JointCurve
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
-from stitch.diagnosis.unnamed_errors import Unnamed
+from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.diagnosis.unknown.unnamed_errors import Unnamed
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array

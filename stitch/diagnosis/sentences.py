@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.joint_curves import JointCurve
 from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import angle_text, length_text, rounded
 

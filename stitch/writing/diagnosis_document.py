@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.joint_curves import JointCurve
+from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.writing.json_file import rows_of_fields
 from stitch.writing.plain_finding import plain_finding
 

@@ -15,11 +15,11 @@ from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
-from stitch.diagnosis.joint_curves import joint_curves
-from stitch.diagnosis.joint_laws import clear_laws, joint_laws
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.joint_curves import joint_curves
+from stitch.diagnosis.unknown.joint_laws import clear_laws, joint_laws
+from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model

@@ -8,11 +8,11 @@ the other's part: then the smallest set is sought without which the views cannot
 from collections.abc import Sequence
 from dataclasses import replace
 
-from stitch.diagnosis import joint_laws
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import score
 from stitch.diagnosis.selection.ranking import Ranked, certain, contends, rank, ranked_one
 from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.unknown import joint_laws
 from stitch.observations.linear_model import LinearModel
 
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis import joint_laws
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
 from stitch.diagnosis.selection.forward_selection import forward_selection
@@ -18,7 +17,8 @@ from stitch.diagnosis.thresholds import (
     ODDS,
     PRIOR_PHYSICAL,
 )
-from stitch.diagnosis.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown import joint_laws
+from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.observations.linear_model import LinearModel
 
 # Errors of one and two periods a turn have a name; those of three and four have not.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.joint_laws import JointLaw
+from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array
 from stitch.model.term import term_of

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis.joint_laws import clear_laws
 from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.unknown.joint_laws import clear_laws
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
