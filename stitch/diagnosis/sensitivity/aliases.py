@@ -39,7 +39,7 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     for i, y in enumerate(patterns):
         for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):
             if i != j:
-                out[i, j] = _imitated(y, white * scored.candidate.forms[0].sizes)
+                out[i, j] = imitated(y, white * scored.candidate.forms[0].sizes)
     return out
 
 
@@ -49,12 +49,13 @@ def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = 0.
     return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
 
 
-def _imitated(y: Array, X: Array) -> float:
+def imitated(y: Array, X: Array) -> float:
+    """How much of a pattern (n,) columns (n, p) of plausible size can do, 0 … 1; nothing at all is like nothing."""
     length = float(np.linalg.norm(y))
     if length == 0 or not X.size:
         return 0.0
     # Ridge at ten plausible sizes: what is invisible cannot be blown up to imitate anything.
     M = X.T @ X + 0.01 * np.eye(X.shape[1])
     fitted = X @ np.linalg.solve(M, X.T @ y)
-    reach = length * max(float(np.linalg.norm(fitted)), 1e-300)
-    return float(np.clip(float(fitted @ y) / reach, 0.0, 1.0))
+    alike = float(np.linalg.norm(fitted))
+    return float(np.clip(fitted / alike @ (y / length), 0.0, 1.0)) if alike > 0 else 0.0
