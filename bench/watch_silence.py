@@ -10,7 +10,7 @@ from stitch.watch.regressors import DAY, believed, regressors
 from stitch.watch.slope_odds import STEADY, STILL, slope_odds
 from stitch.watch.state_bank import MEMBERS, empty_bank, predicted, updated, with_parameters
 
-HALLS, CELLS = 12, 50
+HALLS, CELLS = 100, 50
 _PARAMETERS = 12
 _CHANNELS = ["air_temperature_c"]
 
