@@ -20,15 +20,21 @@ from scipy.stats import binomtest
 from unknown_cells import Asked, asked, seen
 from unknown_worlds import PARTS
 
+from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
 DEVELOPMENT, HELD_OUT = (0, 1), (800, 801, 802, 803)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
+# Worlds with several effects, asked again after each that is named.
+AGAIN, ASKED_AGAIN = ("beside", "two"), 4
+OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
 
 
 @dataclass(frozen=True)
@@ -38,12 +44,14 @@ class Trial:
     cell: str
     hidden: tuple[str, ...]
     verdict: str
+    also: tuple[str, ...]  # what else is there: the errors of an ordinary arm
     named: tuple[str, ...]
+    then: tuple[str, ...]  # named when asked again with what was named added
     follows: str  # what is said to repeat without a name
     seconds: float
 
     def __str__(self) -> str:
-        hidden, named = ", ".join(self.hidden) or "nothing", " ".join(self.named)
+        hidden, named = ", ".join(self.hidden) or "nothing", " ".join((*self.named, *(f"then {n}" for n in self.then)))
         return f"{self.cell}: {hidden} → {self.verdict} {named}{self.follows} ({self.seconds:.1f} s)"
 
     @property
@@ -67,9 +75,19 @@ class Trial:
         return self.joint and any(f"{name} " in self.follows for name in self.hidden)
 
     @property
+    def wrong(self) -> bool:
+        """Nothing of what is named is there."""
+        return not any(name in (*self.hidden, *self.also) for name in self.named)
+
+    @property
     def right(self) -> bool:
         """What is hidden, or one of it, is named or in the group."""
         return any(name in self.hidden for name in self.named)
+
+    @property
+    def whole(self) -> bool:
+        """All that is hidden is named in the end."""
+        return bool(self.hidden) and set(self.hidden) <= {*self.named, *self.then}
 
 
 def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: int = 1) -> Iterator[Trial]:
@@ -83,20 +101,36 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         linear = linear.scatter_only if as_before else linear
         found = concluded(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
+        then = tuple(named_after(linear, a.candidates, found)) if part in AGAIN else ()
+        also = () if world.arm is None else OF_THE_ARM
         cell = f"{a.cell.scene} {a.cell.seed}"
         follows = unnamed_errors(linear) if found.verdict == "unknown_effect" else ()
         words = ", ".join(u.words for u in follows)
-        yield Trial(cell, hidden, found.verdict, names, words, time.process_time() - begun)
+        yield Trial(cell, hidden, found.verdict, also, names, then, words, seconds=time.process_time() - begun)
+
+
+def named_after(linear: LinearModel, candidates: Sequence[Candidate], found: Selection) -> Iterator[str]:
+    """What is named next, and next again, when the effect that was named is added, as `stitch add` would."""
+    for _ in range(ASKED_AGAIN):
+        if found.verdict != "missing_effect":
+            return
+        form = found.named[0].score.form
+        linear = linear.conditioned_on(form.columns, form.sizes)
+        candidates = [c for c in candidates if c.name != found.named[0].name]
+        found = concluded(linear, candidates, USUAL)
+        if found.verdict == "missing_effect":
+            yield found.named[0].name
 
 
 def shares(part: str, found: Sequence[Trial]) -> str:
     """A row of the table, every share with its 95 % Wilson interval."""
     columns: list[Callable[[Trial], bool]] = [
-        lambda t: t.single and not t.right,
-        lambda t: t.verdict == "cannot_tell" and not t.right,
+        lambda t: t.single and t.wrong,
+        lambda t: t.verdict == "cannot_tell" and t.wrong,
         lambda t: t.single and t.right,
         lambda t: t.right,
-        lambda t: all(name in t.named for name in t.hidden) if t.hidden else False,
+        lambda t: t.whole,
+        lambda t: any(name not in (*t.hidden, *t.also) for name in t.then),
         lambda t: t.verdict == "unknown_effect",
         lambda t: t.verdict == "adequate",
         lambda t: t.right_joint,
@@ -135,7 +169,16 @@ def main() -> None:
         rows = [
             shares(part, list(told(part, cells, options.as_before, options.fewer))) for part in options.parts.split(",")
         ]
-    heads = ("wrong name", "wrong group", "right name", "right name or group", "all of it", "unknown", "adequate")
+    heads = (
+        "wrong name",
+        "wrong group",
+        "right name",
+        "right name or group",
+        "all of it, asked again",
+        "wrong when asked again",
+        "unknown",
+        "adequate",
+    )
     print(f"\n| world | {' | '.join(heads)} | right joint above all | wrong joint |")
     print("|---" * (len(heads) + 3) + "|", *rows, sep="\n")
     print(f"\n{time.process_time():.0f} s of processor time")
