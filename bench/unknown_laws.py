@@ -12,12 +12,11 @@ view; --fewer N takes the first N-th of the trials.
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.stats import binomtest
 from unknown_cells import Asked, asked, seen
+from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import PARTS
 
 from stitch.diagnosis.candidates import Candidate
@@ -35,59 +34,6 @@ USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two"), 4
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One draw and what was said of it."""
-
-    cell: str
-    hidden: tuple[str, ...]
-    verdict: str
-    also: tuple[str, ...]  # what else is there: the errors of an ordinary arm
-    named: tuple[str, ...]
-    then: tuple[str, ...]  # named when asked again with what was named added
-    follows: str  # what is said to repeat without a name
-    seconds: float
-
-    def __str__(self) -> str:
-        hidden, named = ", ".join(self.hidden) or "nothing", " ".join((*self.named, *(f"then {n}" for n in self.then)))
-        return f"{self.cell}: {hidden} → {self.verdict} {named}{self.follows} ({self.seconds:.1f} s)"
-
-    @property
-    def single(self) -> bool:
-        """One name, right or wrong."""
-        return self.verdict == "missing_effect"
-
-    @property
-    def alarm(self) -> bool:
-        """A name or a group."""
-        return bool(self.named)
-
-    @property
-    def joint(self) -> bool:
-        """One joint is said to follow a law without a name."""
-        return "above all" in self.follows
-
-    @property
-    def right_joint(self) -> bool:
-        """And it is that one."""
-        return self.joint and any(f"{name} " in self.follows for name in self.hidden)
-
-    @property
-    def wrong(self) -> bool:
-        """Nothing of what is named is there."""
-        return not any(name in (*self.hidden, *self.also) for name in self.named)
-
-    @property
-    def right(self) -> bool:
-        """What is hidden, or one of it, is named or in the group."""
-        return any(name in self.hidden for name in self.named)
-
-    @property
-    def whole(self) -> bool:
-        """All that is hidden is named in the end."""
-        return bool(self.hidden) and set(self.hidden) <= {*self.named, *self.then}
 
 
 def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: int = 1) -> Iterator[Trial]:
@@ -122,31 +68,6 @@ def named_after(linear: LinearModel, candidates: Sequence[Candidate], found: Sel
             yield found.named[0].name
 
 
-def shares(part: str, found: Sequence[Trial]) -> str:
-    """A row of the table, every share with its 95 % Wilson interval."""
-    columns: list[Callable[[Trial], bool]] = [
-        lambda t: t.single and t.wrong,
-        lambda t: t.verdict == "cannot_tell" and t.wrong,
-        lambda t: t.single and t.right,
-        lambda t: t.right,
-        lambda t: t.whole,
-        lambda t: any(name not in (*t.hidden, *t.also) for name in t.then),
-        lambda t: t.verdict == "unknown_effect",
-        lambda t: t.verdict == "adequate",
-        lambda t: t.right_joint,
-        lambda t: t.joint and not t.right_joint,
-    ]
-    told = [f"{share(found, hit)}" for hit in columns]
-    return f"| {part} | {' | '.join(told)} |"
-
-
-def share(found: Sequence[Trial], hit: Callable[[Trial], bool]) -> str:
-    """k of n with its interval."""
-    k = sum(hit(t) for t in found)
-    low, high = binomtest(k, len(found)).proportion_ci(0.95, method="wilson")
-    return f"{k}/{len(found)} [{low:.2f}, {high:.2f}]"
-
-
 def told(part: str, cells: Sequence[Asked], as_before: bool, fewer: int) -> Iterator[Trial]:
     """The trials of a part, printed as they come."""
     for t in trials(part, cells, as_before, fewer):
@@ -169,18 +90,7 @@ def main() -> None:
         rows = [
             shares(part, list(told(part, cells, options.as_before, options.fewer))) for part in options.parts.split(",")
         ]
-    heads = (
-        "wrong name",
-        "wrong group",
-        "right name",
-        "right name or group",
-        "all of it, asked again",
-        "wrong when asked again",
-        "unknown",
-        "adequate",
-    )
-    print(f"\n| world | {' | '.join(heads)} | right joint above all | wrong joint |")
-    print("|---" * (len(heads) + 3) + "|", *rows, sep="\n")
+    print("", HEAD, *rows, sep="\n")
     print(f"\n{time.process_time():.0f} s of processor time")
 
 
