@@ -90,7 +90,7 @@ def poses_to_add(run: Run) -> Array:
     found = run.targets
     if found is None or not run.terms:
         return np.zeros((0, run.measurement.views.joints.shape[1]))
-    joints = nearby(run.measurement)[:_TRIED]
+    joints = nearby(run.measurement.views.joints)[:_TRIED]
     _, columns, covariance = candidate_rows(
         candidate_measurement(run.measurement, joints), found.rows, found.landmarks, found.variances, run.terms
     )

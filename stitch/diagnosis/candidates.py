@@ -63,12 +63,13 @@ class Candidate:
         return self.effect.tier == "empirical"
 
 
-def candidates_of(linear: LinearModel) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
-    """Physical, user and empirical effects that are not in the model, and what each unavailable one lacks."""
+def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
+    """Physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones lack."""
     used = linear.model.effects
     library = [e for e in EFFECTS.values() if e.name not in used]
     missing = {e.name: lacks for e in library if (lacks := lacking(linear.measurement, e))}
-    effects = [e for e in library if e.name not in missing] + empirical_effects(linear.measurement.views)
+    effects = [e for e in library if e.name not in missing]
+    effects += empirical_effects(linear.measurement.views) if empirical else []
     terms = [_grid_terms(linear, effect) for effect in effects]
     responses = iter(linear.responses([term for own in terms for term in own]))
     tried = [_candidate(linear, own, [next(responses) for _ in own]) for own in terms]
@@ -103,11 +104,15 @@ def _candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[R
 
 
 def _forms(linear: LinearModel, term: Term, response: Array) -> list[Form]:
-    """All parameters together, then those that can be true alone."""
-    free, columns = ~term.gridded, linear.reduce(response)
+    columns = linear.reduce(response)
+    return [Form(term, keep, response[:, keep], columns[:, keep], term.typical[keep]) for keep in free_masks(term)]
+
+
+def free_masks(term: Term) -> list[Mask]:
+    """(P,) parameters that are free in each form of an effect: all together, then those that can be true alone."""
+    free = ~term.gridded
     alone = [free & np.isin(np.arange(len(free)), g) for g in _groups(term.effect, term.parameters)]
-    keeps = [free, *(keep for keep in alone if (keep != free).any())]
-    return [Form(term, keep, response[:, keep], columns[:, keep], term.typical[keep]) for keep in keeps]
+    return [free, *(keep for keep in alone if (keep != free).any())]
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.form_trial import FormTrial, gain_at_null, residuals, try_form
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
 
@@ -131,7 +131,12 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
 
 
 def form_weights(candidate: Candidate) -> Array:
-    """(F,) share of the prior of each form: the full forms share one half, those of single joints the other."""
-    kept = np.array([form.keep.sum() for form in candidate.forms])
+    """(F,) share of the prior of each form."""
+    return weights_of([form.keep for form in candidate.forms])
+
+
+def weights_of(masks: Sequence[Mask]) -> Array:
+    """(F,) the same by free parameters (P,): the full forms share one half, those of single joints the other."""
+    kept = np.array([keep.sum() for keep in masks])
     whole = kept == kept[0]
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))

@@ -41,6 +41,14 @@ _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "
 _CONSTANT = ("joint_offset", "link_geometry")
 
 
+def usual_sizes(length_unit: str) -> dict[str, float]:
+    """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
+    arm = ("joint_offset", "link_geometry", "joint_compliance", *_FAMILY.values())
+    translation = _TRANSLATION * _PER_MM[length_unit]
+    wandering = {"wandering rotation": _ROTATION**2, "wandering translation": translation**2}
+    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2} | wandering
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """Components of the covariance of the twists of all views of a rig, session after session."""

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.session import Mount, Session, View
@@ -16,7 +17,7 @@ from stitch.reading.plausible import check_scale
 from stitch.reading.points_csv import read_points, read_targets
 from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
-from stitch.reading.views_csv import Row, read_views
+from stitch.reading.views_csv import Row, read_views, row_at
 from stitch.system.steps import steps
 from stitch.units import METRES
 
@@ -24,11 +25,12 @@ from stitch.units import METRES
 _FEWEST = 3
 
 
-def load_session(path: Path | str, scans: bool = True) -> Session:
+def load_session(path: Path | str, scans: bool = True, start: Array | None = None) -> Session:
     """Read and check a session folder.
 
     Args:
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
+        start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
 
     Raises:
         InputError: anything missing, contradictory or implausible; names file, line or view, and the mend.
@@ -39,7 +41,7 @@ def load_session(path: Path | str, scans: bool = True) -> Session:
     unit = choice(file, document, "length_unit", tuple(METRES))
     mount = choice(file, document, "mount", get_args(Mount))
     robot = session_toml.robot(file, document.get("robot"), unit)
-    rows = read_views(path / "views.csv", robot)
+    rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
     sightings = _sightings(path, [row.name for row in rows]) if scans else {}
     views = _views(path, rows, METRES[cloud_unit] / METRES[unit] if scans else None, sightings)

@@ -79,6 +79,24 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     return rows
 
 
+def row_at(file: Path, robot: Robot | None, joints: Array) -> Row:
+    """The row of a view that stands in no table, at joint angles (n,) rad.
+
+    Args:
+        file: session.toml.
+
+    Raises:
+        InputError: no robot, or one with another number of joints.
+    """
+    if robot is None:
+        raise InputError(f"{file}: no [robot], so that joint angles mean nothing; to fix: state its DH rows or URDF")
+    if len(joints) != robot.n_joints:
+        raise InputError(
+            f"{file}: {len(joints)} joint angles, but the robot has {robot.n_joints}; to fix: give one a joint"
+        )
+    return Row(0, "start", "", forward(robot, joints), joints, np.zeros(len(joints)), time_s=None, covariates={})
+
+
 def _require_later(file: Path, line: int, time_s: float, latest: float) -> None:
     """Refuse rows out of order: direction of approach, settling and drifts count on it."""
     if time_s < latest:

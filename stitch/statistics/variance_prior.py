@@ -14,12 +14,12 @@ NOISE = 2
 _SPIKE = 0.1
 # The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
-_USUAL_FACTOR, FACTOR_SPREAD = float(np.log(2.0)), 1.5
+USUAL_NOISE_FACTOR, FACTOR_SPREAD = 2.0, 1.5
 
 
 def log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]:
     """−2 log prior of the log variances (c,), and its slope."""
-    off = (log_variances[NOISE] - _USUAL_FACTOR) / FACTOR_SPREAD
+    off = (log_variances[NOISE] - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD
     value, slope = -float(log_variances[:NOISE].sum()) + off**2, -np.ones(len(log_variances))
     slope[NOISE] = 2 * off / FACTOR_SPREAD
     if scales is not None:

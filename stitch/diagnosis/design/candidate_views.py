@@ -11,6 +11,7 @@ from stitch.diagnosis.design.candidate_targets import candidate_rows
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
+from stitch.measurement.capture import place
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
 from stitch.measurement.torques import PAYLOAD, Torques, torques_of
@@ -44,11 +45,17 @@ class CandidateViews:
 def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> CandidateViews | None:
     """Poses in which the scanner would see the part about as it has before; None if poses cannot show the effects."""
     zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
-    joints = _reachable(linear, seen)
+    T_mount, centre = linear.model.T_mount, seen.freed.overlaps.gram.centre
+
+    def poses_of(joints: Array) -> Array:
+        assert linear.measurement.robot is not None
+        T = kinematics.forward(linear.measurement.robot, joints)
+        return place("candidates", (), T, linear.measurement.mount).poses(T_mount)
+
+    joints = reachable(linear.measurement.views.joints, poses_of, seen.capture.poses(T_mount), centre)[:_TRIED]
     if moves_points(zero) or not len(joints):
         return None
-    measurement, bare = candidate_measurement(linear.measurement, joints), Model(linear.model.T_mount)
-    centre = seen.freed.overlaps.gram.centre
+    measurement, bare = candidate_measurement(linear.measurement, joints), Model(T_mount)
     to_centre = frames.make(np.eye(3), -centre)
     own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
     extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
@@ -60,7 +67,7 @@ def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> Can
 
 def _of_targets(linear: LinearModel, seen: Targets, a: Score, b: Score) -> CandidateViews:
     """Poses near those driven, in which all targets are seen."""
-    joints = nearby(linear.measurement)[:_TRIED]
+    joints = nearby(linear.measurement.views.joints)[:_TRIED]
     measurement = candidate_measurement(linear.measurement, joints)
     zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
     rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, linear.null.variances, zero)
@@ -83,31 +90,32 @@ def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews |
     return None if of is None else of(linear, linear.observation, a, b)
 
 
-def nearby(measurement: Measurement) -> Array:
-    """(K, n) joint angles near those that were driven, within the limits that were kept."""
+def nearby(seen: Array) -> Array:
+    """(K, n) joint angles near those that were driven (V, n), within the limits that were kept."""
     rng = np.random.default_rng(0)
-    seen = measurement.views.joints
     joints = seen[rng.integers(0, len(seen), _SAMPLES)] + rng.uniform(-_SPREAD, _SPREAD, (_SAMPLES, seen.shape[1]))
     limit = np.maximum(_LIMIT, np.abs(seen).max(axis=0))
     return np.asarray(joints[(np.abs(joints) < limit).all(axis=1)])
 
 
-def _reachable(linear: LinearModel, seen: Surfaces) -> Array:
-    """(K, n) joint angles in which the scanner sees the part about as it has before."""
-    measurement, T_mount = linear.measurement, linear.model.T_mount
-    assert measurement.robot is not None
-    joints = nearby(measurement)
-    T = kinematics.forward(measurement.robot, joints)
-    poses = (frames.inverse(T) if measurement.eye_to_hand else T) @ T_mount
-    centre = seen.freed.overlaps.gram.centre[None]
-    place = frames.transform(frames.inverse(poses), centre)[:, 0]
-    before = frames.transform(frames.inverse(seen.capture.poses(T_mount)), centre)[:, 0]
+def reachable(seen: Array, poses_of: Callable[[Array], Array], seen_from: Array, centre: Array) -> Array:
+    """(K, n) joint angles in which the scanner sees the part about as it has before.
+
+    Args:
+        seen: (V, n) joint angles that were driven.
+        poses_of: T_reference_scanner (K, 4, 4) at joint angles (K, n).
+        seen_from: the same (V, 4, 4) of the views that there are.
+        centre: (3,) of what they see, reference frame.
+    """
+    joints = nearby(seen)
+    poses = poses_of(joints)
+    there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
+    before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]
     margin = _MARGIN * np.linalg.norm(before, axis=1).mean()
-    inside = ((place > before.min(axis=0) - margin) & (place < before.max(axis=0) + margin)).all(axis=1)
+    inside = ((there > before.min(axis=0) - margin) & (there < before.max(axis=0) + margin)).all(axis=1)
     # A view direction far from all others would share no surface with them.
-    towards, known = poses[:, :3, 2], seen.capture.poses(T_mount)[:, :3, 2]
-    inside &= (towards @ known.T).max(axis=1) > _TURNED
-    return np.asarray(joints[inside][:_TRIED])
+    inside &= (poses[:, :3, 2] @ seen_from[:, :3, 2].T).max(axis=1) > _TURNED
+    return np.asarray(joints[inside])
 
 
 def candidate_measurement(measurement: Measurement, joints: Array) -> Measurement:

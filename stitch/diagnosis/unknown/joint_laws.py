@@ -18,9 +18,9 @@ from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
 # Of how many usual variances such a law may be where the search for its size begins.
-_TIMES = (0.01, 1.0, 30.0)
+TIMES = (0.01, 1.0, 30.0)
 # What a size that is wanted costs beside one that is known: ∫ of its prior over log σ against the value at the maximum.
-_WIDTH = 3.0
+WIDTH = 3.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def contends(base: LinearModel, log_posterior: float) -> bool:
     laws = joint_laws(base)
     if not laws:
         return False
-    own = laws[0].log_bayes_factor - _WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws)))
+    own = laws[0].log_bayes_factor - WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws)))
     return own > log_posterior - ODDS
 
 
@@ -76,5 +76,5 @@ def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
 def _fit(base: LinearModel, mixed: MixedModel, usual: float) -> VarianceFit:
     """At the maximum, sought from the likeliest of several starts."""
     nulls = [at.null.variances for at in (base, *base.elsewhere)]
-    starts: list[Array] = [np.append(null, times * usual) for null in nulls for times in _TIMES]
+    starts: list[Array] = [np.append(null, times * usual) for null in nulls for times in TIMES]
     return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))

@@ -79,7 +79,7 @@ def fit_hand_eye(
         for c, f, extra in zip(captures, freed, columns.twists, strict=True)
     ]
     rig, scatter = rig_model(parts), [estimate(e.channel, e.further) for e in parts]
-    prior = _prior(captures, freed, T_mount, columns)
+    prior = weak_prior(captures, freed, T_mount, columns.prior)
     pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
     weighed = rig.weighed(scatter, prior)
     x = weighed.solve(rig.z, pull)
@@ -93,7 +93,7 @@ def fit_hand_eye(
         inflation=_inflation(covariance, weighed.covariance),
         repeatability=tuple(scatter),
         heldout_ratio=_heldout_ratio(parts, scatter, (prior, pull), x),
-        shares=_shares(sources, covariance),
+        shares=shares_of(sources, covariance),
         values=columns.values + x[6:],
         values_covariance=covariance[6:, 6:],
     )
@@ -120,7 +120,7 @@ def _inflation(covariance: Array, alone: Array) -> float:
     return float(max(1.0, np.exp(ratio / len(covariance))))
 
 
-def _shares(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
+def shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
     """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1."""
     scale = np.sqrt(np.diag(covariance)[:6])
     unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
@@ -155,11 +155,15 @@ def _heldout_ratio(
     return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
 
 
-def _prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, columns: Columns) -> Array:
-    """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else."""
+def weak_prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, effects: Array) -> Array:
+    """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else.
+
+    Args:
+        effects: (P,) standard deviations of the prior of effects fitted with the hand-eye.
+    """
     ranges = [
         np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
         for c, f in zip(captures, freed, strict=True)
     ]
     distance = float(np.median(np.concatenate(ranges)))
-    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, columns.prior**-2.0]))
+    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, effects**-2.0]))

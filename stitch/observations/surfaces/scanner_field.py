@@ -20,7 +20,7 @@ from stitch.observations.surfaces.point_gram import PointGram, seen_twists, stre
 # effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.
 ALARM_SHARE = 0.5
 # What counts in a covariance is taken from them, with a log-normal prior.
-_USUAL_SHARE, _SPREAD, _SHARES = 0.3, 0.7, (0.01, 10.0)
+USUAL_SHARE, _SPREAD, _SHARES = 0.3, 0.7, (0.01, 10.0)
 # Neighbouring distances share points and normals: so many times the variance of independent ones.
 _CORRELATION = 3.0
 # Combinations that the overlaps show less than this share of the clearest tell nothing.
@@ -82,11 +82,11 @@ def _shown(sums: PointGram, twists: Array, freed: FreePoses, noise: float) -> Ar
     def deviance(log_shares: Array) -> float:
         squares = np.exp(2 * log_shares)[cause.astype(np.int64)]
         spread = (told * squares) @ told.T + np.diag(_CORRELATION * g.variance * values)
-        prior = (log_shares - np.log(_USUAL_SHARE)) / _SPREAD
+        prior = (log_shares - np.log(USUAL_SHARE)) / _SPREAD
         return float(np.linalg.slogdet(spread)[1] + seen @ np.linalg.solve(spread, seen) + prior @ prior)
 
     bounds = [tuple(np.log(_SHARES))] * 2
-    found = minimize(deviance, np.full(2, np.log(_USUAL_SHARE)), method="L-BFGS-B", bounds=bounds)
+    found = minimize(deviance, np.full(2, np.log(USUAL_SHARE)), method="L-BFGS-B", bounds=bounds)
     return np.asarray(np.exp(found.x)[cause.astype(np.int64)])
 
 

@@ -1,6 +1,6 @@
 """The linear model of overlapping surfaces: views freed by their overlaps, read through the visible directions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,8 @@ from stitch.observations.surfaces.surface_trial import SurfaceTrial
 from stitch.observations.surfaces.view_responses import view_columns, view_responses
 from stitch.statistics.folds import JointEnd, grouped_folds
 from stitch.statistics.identifiability import independent
-from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
 _UNSEEN = 0.25
@@ -75,12 +76,20 @@ class Surfaces:
         return np.asarray(out - out.mean(axis=0))
 
 
-def surface_model(measurement: Measurement, model: Model, capture: Capture, freed: FreePoses) -> LinearModel:
+def surface_model(
+    measurement: Measurement,
+    model: Model,
+    capture: Capture,
+    freed: FreePoses,
+    variances: Callable[[Sequence[str]], Array] | None = None,
+) -> LinearModel:
     """Reduce freed views to a linear model.
 
     Args:
         capture: without the effects of the model.
         freed: its views moved by the overlaps alone, from the model's poses.
+        variances: of scatter, noise and further errors of these names, of views that nobody has taken; None: as the
+            views tell.
     """
     g, frames_of_mount = freed.overlaps.gram, capture.hand_eye_frames(model.T_mount)
     channel = pose_channel(g, freed.twists, frames_of_mount, capture.T_reference_flange)
@@ -88,7 +97,7 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
     sizes = np.array([p.typical for p in stacked(model.terms)])
     field = channel.reduction @ field_scatter(measurement, freed)
     alone = replace(mixed_model(channel), fixed=(field @ field.T)[None])
-    half = np.linalg.cholesky(alone.covariance(fit_variances(alone, both_starts=True).variances)[0])
+    half = np.linalg.cholesky(alone.covariance(_null(alone, (), variances).variances)[0])
     white = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.reduction @ extra))
     own, further = white
     seen = independent(own, further, sizes, _UNSEEN)
@@ -98,7 +107,7 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
     if measurement.views.count < _MOST_VIEWS:
         errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
         mixed = with_errors(mixed, errors)
-    null = fit_variances(mixed, both_starts=True)
+    null = _null(mixed, () if errors is None else errors.names, variances)
     values = np.array([p.value for p in stacked(model.terms)])
     return LinearModel(
         measurement,
@@ -111,3 +120,7 @@ def surface_model(measurement: Measurement, model: Model, capture: Capture, free
         null=null,
         pose_errors=errors,
     )
+
+
+def _null(mixed: MixedModel, names: Sequence[str], variances: Callable[[Sequence[str]], Array] | None) -> VarianceFit:
+    return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))
