@@ -26,6 +26,7 @@ _OWN = {
     "drop": "stitch.cli.change:drop",
     "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
+    "plan": "stitch.cli.plan:plan_views",
     "explain": "stitch.cli.explain:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",

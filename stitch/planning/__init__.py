@@ -1,0 +1,1 @@
+"""Before measuring: what planned views would tell, and which further ones bring most."""

@@ -1,0 +1,106 @@
+"""What some views would tell: the hand-eye's U, what could be detected and named, what could not be told apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.candidates import Candidate, candidates_of
+from stitch.diagnosis.sensitivity.detectable import smallest_detectable
+from stitch.frames import Array
+from stitch.measurement.session import Session
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import usual_sizes
+from stitch.planning.chances import Chance, Court, usual_shifts
+from stitch.planning.expected_hand_eye import ExpectedHandEye, expected_hand_eye
+from stitch.planning.expected_model import Cell, expected_model, seen
+from stitch.planning.rivals import Pair, pairs_of
+from stitch.planning.scatter import Scatter, Told
+from stitch.planning.told_sizes import told_sizes, under
+
+
+@dataclass(frozen=True)
+class EffectOutlook:
+    """One effect that could be missing."""
+
+    name: str
+    observable: bool
+    detectable: dict[str, float]  # smallest size of every parameter that is detected in 80 % of cases
+    usual: dict[str, float]  # plausible sizes
+    units: dict[str, str]
+    chance: Chance | None  # at usual size; None where the views cannot show it, or where it was not asked for
+
+    @property
+    def multiple(self) -> float:
+        """Of its usual size from which the parameter that shows best is detected; infinite where none does."""
+        return min((self.detectable[name] / self.usual[name] for name in self.detectable), default=float("inf"))
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What V views would tell."""
+
+    views: int
+    hand_eye: ExpectedHandEye
+    ordinary: ExpectedHandEye  # with an arm that is a little wrong in every joint and link
+    effects: tuple[EffectOutlook, ...]  # likeliest to be detected first
+    pairs: tuple[Pair, ...]  # of the effects that the views show, hardest first
+    not_asked: dict[str, tuple[str, ...]]  # effect: what it needs and the session has not
+    told: Told  # errors that the views leave open
+
+
+def outlook(
+    session: Session, cell: Cell, told: Told | None = None, feature: Array | None = None, chances: bool = True
+) -> Outlook:
+    """What the views of a session would tell.
+
+    Args:
+        told: errors of the arm; None: as large as these views leave them open where it errs by its scatter alone.
+        feature: (3,) reference frame: the place whose displacement U counts; None: the middle of the field.
+        chances: draw what a diagnosis would say of every effect.
+
+    Raises:
+        NoResultError: a view that would not see the part, or views that do not overlap.
+    """
+    found = seen(session, cell)
+    linear = expected_model(found, cell)
+    told = told_sizes(linear, cell.scatter.noise) if told is None else told
+    diagnosed = under(linear, told.fitted)
+    candidates, missing = candidates_of(linear, empirical=False)
+    court = Court(diagnosed, candidates)
+    at = None if feature is None else in_scanner(found.freed.poses, feature)
+    ordinary = _ordinary(told.believed, session.length_unit)
+    return Outlook(
+        views=len(session.views),
+        hand_eye=expected_hand_eye(under(linear, told.believed), found, at),
+        ordinary=expected_hand_eye(under(linear, ordinary), found, at),
+        effects=_effects(diagnosed, candidates, court, chances),
+        pairs=tuple(pairs_of(diagnosed, court.candidates)),
+        not_asked={name: needs for name, needs in missing.items() if name not in linear.model.effects},
+        told=told,
+    )
+
+
+def _ordinary(scatter: Scatter, length_unit: str) -> Scatter:
+    """With errors as large as those of a usual arm, where they are not larger anyway."""
+    usual = usual_sizes(length_unit)
+    return replace(scatter, errors=scatter.errors | {k: max(v, scatter.errors.get(k, 0.0)) for k, v in usual.items()})
+
+
+def in_scanner(poses: Array, feature: Array) -> Array:
+    """(3,) mean place of a point of the reference frame in the scanner's frame."""
+    return np.asarray(np.einsum("vji,vj->vi", poses[:, :3, :3], feature - poses[:, :3, 3]).mean(axis=0))
+
+
+def _effects(
+    linear: LinearModel, candidates: Sequence[Candidate], court: Court, chances: bool
+) -> tuple[EffectOutlook, ...]:
+    shown, rng, out = {c.name for c in court.candidates}, np.random.default_rng(0), []
+    for c in candidates:
+        sizes = smallest_detectable(linear, c, court.tests)
+        believable = {p.name: sizes[p.name] for p in c.parameters if p.name in sizes and sizes[p.name] < p.limit}
+        chance = court.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None
+        own = [p for p in c.parameters if not p.grid]
+        usual, units = {p.name: p.typical for p in own}, {p.name: p.unit for p in own}
+        out.append(EffectOutlook(c.name, c.name in shown, believable, usual=usual, units=units, chance=chance))
+    return tuple(sorted(out, key=lambda e: (not e.observable, e.multiple)))
