@@ -4,6 +4,7 @@ Both by the page's name without `.md`.
 """
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,6 +32,13 @@ def raw_scans(folder: Path) -> None:
 def small_session(folder: Path) -> None:
     """A session of three views, in `folder`/blade-17."""
     synth("blade", folder / "blade-17", views=3, seed=1)
+
+
+def planned_views(folder: Path) -> None:
+    """Eight poses of a scanner on an arm that nobody has scanned from yet, in `folder`/planned."""
+    planned = folder / "planned"
+    synth("blade-table", planned, views=8, seed=3)
+    shutil.rmtree(planned / "clouds")
 
 
 def own_effect(folder: Path) -> None:
@@ -72,6 +80,7 @@ PREPARE: dict[str, Callable[[Path], None]] = {
     "effects": own_effect,
     "own-data": raw_scans,
     "panel": examples_folder,
+    "plan": planned_views,
     "points": tracked_arm,
     "session": small_session,
     "window": examples_folder,
