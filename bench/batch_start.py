@@ -8,16 +8,17 @@ from batch_sessions import ROOT
 
 _TIMES = 5
 _MAIN = "from stitch.cli.main import main\ntry:\n    main({})\nexcept SystemExit:\n    pass\n"
-_ALL = "import stitch.cli.run_sessions, stitch.cli.changed_run, stitch.cli.watched_cells, viz.review.served_review\n"
+_ACTIONS = "stitch.cli.actions"
+_ALL = f"import {_ACTIONS}.run_sessions, {_ACTIONS}.changed_run, {_ACTIONS}.watched_cells, viz.review.served_review\n"
 # What is loaded now, and what would be if it were not put off.
 _COMMANDS = {
     "stitch --version": ("--version", ""),
     "stitch --help": ("--help", _ALL),
-    "stitch run --help": ("run --help", "import stitch.cli.run_sessions\n"),
-    "stitch batch --help": ("batch --help", "import stitch.cli.batch_sessions\n"),
+    "stitch run --help": ("run --help", "import stitch.cli.actions.run_sessions\n"),
+    "stitch batch --help": ("batch --help", "import stitch.cli.actions.batch_sessions\n"),
 }
 _STEPS = {
-    "before the first stage": "import stitch.cli.run_sessions\n",
+    "before the first stage": "import stitch.cli.actions.run_sessions\n",
     "and for the recording": "import viz.recording\n",
     "and for the page": "import viz.run_page\n",
 }

@@ -7,7 +7,7 @@ import typer
 from typer.cli import get_docs_for_click
 
 import stitch
-from stitch.cli.listed_effects import signature
+from stitch.cli.actions.listed_effects import signature
 from stitch.cli.main import build
 from stitch.effects import EFFECTS
 from stitch.effects.contract import PLACES

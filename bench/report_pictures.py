@@ -20,7 +20,7 @@ import rerun.experimental as viewer
 from PIL import Image
 
 from stitch.cli.main import main as stitch
-from stitch.cli.printing import print_page, printing_browser
+from stitch.cli.terminal.printing import print_page, printing_browser
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 COLOURS = 256  # enough for shades, letters and the colour bar

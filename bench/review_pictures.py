@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from bench.report_pictures import call
 from bench.review_clicks import LONG, Camera, after, story
 from bench.review_server import choices, memory, served
-from stitch.cli.printing import printing_browser
+from stitch.cli.terminal.printing import printing_browser
 
 DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 WIDE, PHONE = {"width": 1360, "height": 900}, {"width": 412, "height": 900}

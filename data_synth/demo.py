@@ -31,10 +31,10 @@ def demo(
     from data_synth.commands import reveal
     from data_synth.made_session import make, truth_path
     from data_synth.write import write_session, write_truth
+    from stitch.cli.actions.run_sessions import run_sessions
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run_options import RunOptions
-    from stitch.cli.run_sessions import run_sessions
 
     session = folder / "blade"
     if folder.exists() and not truth_path(session).is_file():

@@ -32,6 +32,6 @@ def batch(
     if scheduler and workers > 1:
         raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.batch_sessions import run_batch
+    from stitch.cli.actions.batch_sessions import run_batch
 
     run_batch(sessions, output, workers, scheduler, force=force, recording=recording, as_json=as_json)

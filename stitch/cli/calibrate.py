@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import Force, Json
-from stitch.cli.streams import results_alone
+from stitch.cli.terminal.streams import results_alone
 from stitch.errors import InputError
 
 calibrate = typer.Typer(
@@ -36,7 +36,7 @@ def sphere(
     if output is not None and output.exists() and output.suffix != ".json":
         raise InputError(f"{output}: exists and is no JSON file; name another, or remove it")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.calibrated_cell import calibrated_by_sphere
+    from stitch.cli.actions.calibrated_cell import calibrated_by_sphere
 
     calibrated_by_sphere(session, radius_free, output, as_json)
 
@@ -51,7 +51,7 @@ def tracker(session: _SESSION, as_json: Json = False) -> None:
       stitch calibrate tracker probe-session --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.calibrated_cell import calibrated_by_tracker
+    from stitch.cli.actions.calibrated_cell import calibrated_by_tracker
 
     calibrated_by_tracker(session, as_json)
 
@@ -74,6 +74,6 @@ def robot(
       stitch calibrate robot reflector-session -o runs/arm
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.calibrated_cell import calibrated_arm
+    from stitch.cli.actions.calibrated_cell import calibrated_arm
 
     calibrated_arm(session, output, force=force, at_most=at_most, as_json=as_json)

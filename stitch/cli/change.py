@@ -33,7 +33,7 @@ def add(
     if bool(effects) + suggested + group != 1:
         raise InputError("add what? to fix: name the effects, or let --suggested or --group choose; one of the three")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.changed_run import add_chosen, add_named
+    from stitch.cli.actions.changed_run import add_chosen, add_named
 
     if effects:
         add_named(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
@@ -56,6 +56,6 @@ def drop(
     Examples:
       stitch drop runs/blade-17 backlash
     """
-    from stitch.cli.changed_run import drop_named
+    from stitch.cli.actions.changed_run import drop_named
 
     drop_named(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)

@@ -23,7 +23,7 @@ def check(
       stitch check --deep blade-17 --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.checked_sessions import checked, deeply_checked
+    from stitch.cli.actions.checked_sessions import checked, deeply_checked
 
     if deep:
         deeply_checked(sessions, as_json)

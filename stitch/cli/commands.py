@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from stitch.cli.command_help import help_of
-from stitch.cli.streams import results_alone
+from stitch.cli.terminal.streams import results_alone
 
 GROUP = "stitch.commands"
 _OWN = {

@@ -17,7 +17,7 @@ def diagnose_run(
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.diagnosed_run import diagnosed_run
+    from stitch.cli.actions.diagnosed_run import diagnosed_run
 
     diagnosed_run(run, effects_file, trust=trust, as_json=as_json)
 
@@ -34,6 +34,6 @@ def next_measurement(
     Examples:
       stitch next runs/blade-17
     """
-    from stitch.cli.diagnosed_run import next_for_run
+    from stitch.cli.actions.diagnosed_run import next_for_run
 
     next_for_run(run, effects_file, trust=trust, as_json=as_json)

@@ -31,6 +31,6 @@ def explain_run(
     if output is not None and output.exists():
         raise InputError(f"{output}: there is such a file; to fix: name another, or move it away")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.explained_run import explained_run
+    from stitch.cli.actions.explained_run import explained_run
 
     explained_run(run, output, effects_file, trust=trust, as_json=as_json)

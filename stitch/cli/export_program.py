@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.controllers.program import Program, read_program
 from stitch.controllers.taught import program_bytes
 from stitch.errors import InputError

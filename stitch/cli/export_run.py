@@ -63,8 +63,8 @@ def export_run(
     if program is None and to not in (*HAND_EYE, *ARM, *CLOUD):
         raise InputError(f"--to {to}: to fix: one of {_KINDS}")
     # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.actions.exported_run import exported_run
     from stitch.cli.export_program import export_program
-    from stitch.cli.exported_run import exported_run
     from stitch.export.arm_model import arm_of
 
     if program is not None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.streams import results
+from stitch.cli.terminal.streams import results
 from stitch.errors import InputError
 from stitch.system.whole_file import whole
 

@@ -51,8 +51,8 @@ def init(
       stitch init drive.mcap --topic /points
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.first_folder import of_bag, of_scans
-    from stitch.cli.looked_for import looked_for
+    from stitch.cli.actions.first_folder import of_bag, of_scans
+    from stitch.cli.actions.looked_for import looked_for
     from stitch.intake.bag_messages import is_bag
     from stitch.intake.stated import Stated
 

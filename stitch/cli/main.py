@@ -12,8 +12,8 @@ from typing import Annotated
 import typer
 
 from stitch.cli.commands import CommandGroup
-from stitch.cli.live_line import TimeLeft, live_line
-from stitch.cli.streams import speak_any_terminal
+from stitch.cli.terminal.live_line import TimeLeft, live_line
+from stitch.cli.terminal.streams import speak_any_terminal
 from stitch.errors import StitchError
 from stitch.reading.text_file import shortened
 from stitch.system import time_limit

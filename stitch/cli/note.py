@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import Json, RunFolder
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.system.console import console
 

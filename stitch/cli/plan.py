@@ -56,7 +56,7 @@ def plan_views(
     """
     _require(views, size, field, output)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.planned_views import Asked, StatedCell, planned_views
+    from stitch.cli.actions.planned_views import Asked, StatedCell, planned_views
 
     stated = StatedCell(part, size, field, start)
     planned_views(folder, Asked(views, split, halve, feature), stated, output, trust=trust, as_json=as_json)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import EffectsFile, RunFolder, Tolerance, Trust, require_tolerance
-from stitch.cli.printing import printing_browser
+from stitch.cli.terminal.printing import printing_browser
 from stitch.errors import InputError
 
 
@@ -46,7 +46,7 @@ def report(
         flag = "--diagnosis" if with_diagnosis else "--no-diagnosis"
         raise InputError(f"{flag}: of two runs nothing is diagnosed; to fix: leave {flag} away")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.written_pages import page_of_one, page_of_two
+    from stitch.cli.actions.written_pages import page_of_one, page_of_two
 
     if other is None:
         page_of_one(run, with_diagnosis is not False, tolerance, printer, effects_file, trust)

@@ -47,7 +47,7 @@ def run(
     """
     require_tolerance(tolerance)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.run_sessions import run_sessions
+    from stitch.cli.actions.run_sessions import run_sessions
 
     options = RunOptions(
         output=output,

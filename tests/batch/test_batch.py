@@ -71,10 +71,10 @@ def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys,
         yield run_session(jobs[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stitch.cli.batch_sessions.results", stopped)
+    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", stopped)
     batch(*sessions, code=1)
     assert "stitch: stopped with 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
-    monkeypatch.setattr("stitch.cli.batch_sessions.results", results)
+    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", results)
     batch(*sessions)
     assert ran == ["monday", "tuesday"]
 

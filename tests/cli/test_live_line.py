@@ -8,8 +8,8 @@ from itertools import count
 
 import pytest
 
-from stitch.cli import live_line
-from stitch.cli.live_line import TimeLeft, told
+from stitch.cli.terminal import live_line
+from stitch.cli.terminal.live_line import TimeLeft, told
 from stitch.system.steps import steps, watched
 from stitch.system.threads import parallel
 
@@ -58,7 +58,7 @@ def test_nobody_watches_nobody_counts(said):
 
 CODE = """
 import time
-from stitch.cli.live_line import TimeLeft
+from stitch.cli.terminal.live_line import TimeLeft
 from stitch.system.steps import steps, watched
 with watched(TimeLeft()):
     for _ in steps("scans", range(4)): time.sleep(0.4)

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from stitch.cli.streams import emit, results_alone
+from stitch.cli.terminal.streams import emit, results_alone
 
 PRINTS = """
 import os, sys

@@ -6,7 +6,8 @@ import pytest
 
 from data_synth import demo as told
 from data_synth import made_session, write
-from stitch.cli import change, diagnose, run_sessions
+from stitch.cli import change, diagnose
+from stitch.cli.actions import run_sessions
 from stitch.errors import InputError
 
 

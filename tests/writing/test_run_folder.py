@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
-from stitch.cli import changed_run
+from stitch.cli.actions import changed_run
 from stitch.cli.main import main
 from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model

@@ -3,7 +3,7 @@
 import time
 from math import isfinite
 
-from stitch.cli.live_line import live_line
+from stitch.cli.terminal.live_line import live_line
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult

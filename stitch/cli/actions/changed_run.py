@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-from stitch.cli.diagnosed_run import write_diagnosis
-from stitch.cli.ledger_summary import show_ledger
-from stitch.cli.recorders import recorder_for
-from stitch.cli.streams import emit
+from stitch.cli.actions.diagnosed_run import write_diagnosis
+from stitch.cli.terminal.ledger_summary import show_ledger
+from stitch.cli.terminal.recorders import recorder_for
+from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.effects.in_session import known, require
 from stitch.errors import InputError

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from stitch.cli.compared_run import write_comparison
-from stitch.cli.diagnosed_run import write_diagnosis
-from stitch.cli.printing import print_page
+from stitch.cli.actions.compared_run import write_comparison
+from stitch.cli.actions.diagnosed_run import write_diagnosis
+from stitch.cli.terminal.printing import print_page
 from stitch.comparison.two_runs import TwoRuns, sentence, two_runs
 from stitch.errors import InputError
 from stitch.pipeline import diagnose

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.integrity.deep_check import deep_check
 from stitch.measurement.session import Session

@@ -8,8 +8,8 @@ from stitch.batch.job import Job
 from stitch.batch.results import results
 from stitch.batch.session_row import SessionRow
 from stitch.batch.summary import DOCUMENT, PAGE, document, sentence, write_summary
-from stitch.cli.batch_table import show_files, show_row, show_table
-from stitch.cli.streams import emit
+from stitch.cli.terminal.batch_table import show_files, show_row, show_table
+from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError, NoResultError
 from stitch.reading.session_toml import document as session_document
 from stitch.reading.session_toml import name_of

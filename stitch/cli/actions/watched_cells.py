@@ -5,8 +5,8 @@ from pathlib import Path
 
 import typer
 
-from stitch.cli.streams import emit
-from stitch.cli.watch_summary import show
+from stitch.cli.terminal.streams import emit
+from stitch.cli.terminal.watch_summary import show
 from stitch.system.steps import steps
 from stitch.system.whole_file import whole
 from stitch.watch.append import append_runs

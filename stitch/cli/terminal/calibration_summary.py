@@ -8,7 +8,7 @@ from rich.table import Table
 
 from stitch.calibrate.robot_calibration import calibrated
 from stitch.calibrate.robot_files import beyond_sentence
-from stitch.cli.ledger_summary import show_ledger
+from stitch.cli.terminal.ledger_summary import show_ledger
 from stitch.runs.run import Run
 from stitch.system.console import console
 

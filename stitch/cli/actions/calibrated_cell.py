@@ -12,9 +12,9 @@ from stitch.calibrate.sphere_calibration import calibrate_sphere
 from stitch.calibrate.sphere_report import document_of
 from stitch.calibrate.tracker_calibration import calibrate_tracker
 from stitch.calibrate.tracker_calibration import document_of as tracker_document
-from stitch.cli.calibration_summary import length_row, show_hand_eye, show_robot
-from stitch.cli.diagnosed_run import write_diagnosis
-from stitch.cli.streams import emit
+from stitch.cli.actions.diagnosed_run import write_diagnosis
+from stitch.cli.terminal.calibration_summary import length_row, show_hand_eye, show_robot
+from stitch.cli.terminal.streams import emit
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.state import state_of

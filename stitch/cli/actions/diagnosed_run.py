@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of, curve_text
 from stitch.pipeline import diagnose

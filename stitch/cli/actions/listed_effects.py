@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.streams import emit, results
+from stitch.cli.terminal.streams import emit, results
 from stitch.effects.contract import EFFECTS, PLACES, Effect
 from stitch.effects.in_session import known
 from stitch.effects.user_file import load

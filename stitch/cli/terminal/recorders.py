@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from stitch.cli.progress import Progress
-from stitch.cli.progress_lines import ProgressLines, wanted
+from stitch.cli.terminal.progress import Progress
+from stitch.cli.terminal.progress_lines import ProgressLines, wanted
 from stitch.runs.recorder import Recorder
 from stitch.runs.tee import Tee
 from stitch.writing.recordings import recordings

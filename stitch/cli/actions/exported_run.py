@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from stitch.cli.streams import results
+from stitch.cli.terminal.streams import results
 from stitch.errors import InputError
 from stitch.export.arm_formats import ARM_FORMATS
 from stitch.export.arm_model import arm_of

@@ -6,7 +6,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.run_summary import hand_eye_lines
+from stitch.cli.terminal.run_summary import hand_eye_lines
 from stitch.planning.expected_hand_eye import ExpectedHandEye
 from stitch.planning.expected_model import Cell
 from stitch.planning.outlook import EffectOutlook, Outlook

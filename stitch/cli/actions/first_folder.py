@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.intake.bag_session import write_bag_session
 from stitch.intake.first_session import FirstSession, first_session

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cli.plan_summary import show
-from stitch.cli.streams import emit
+from stitch.cli.terminal.plan_summary import show
+from stitch.cli.terminal.streams import emit
 from stitch.effects.in_session import known
 from stitch.errors import InputError
 from stitch.frames import Array

@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-from stitch.cli.recorders import recorder_for
 from stitch.cli.run_options import RunOptions
-from stitch.cli.run_summary import show
-from stitch.cli.streams import emit
+from stitch.cli.terminal.recorders import recorder_for
+from stitch.cli.terminal.run_summary import show
+from stitch.cli.terminal.streams import emit
 from stitch.effects.in_session import known
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cli.looked_for import looked_for
-from stitch.cli.streams import emit, results
+from stitch.cli.actions.looked_for import looked_for
+from stitch.cli.terminal.streams import emit, results
 from stitch.errors import InputError
 from stitch.intake.targets_in_scans import points_columns, scans_of, targets_in, views_of_targets
 from stitch.measurement.labelled_points import Sighting

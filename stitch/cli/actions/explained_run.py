@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError, NoResultError
 from stitch.explanation.explain import NAME, Explanation, explain

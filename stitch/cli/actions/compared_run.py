@@ -6,7 +6,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table as Printed
 
-from stitch.cli.streams import emit
+from stitch.cli.terminal.streams import emit
 from stitch.comparison.compare_surfaces import compare
 from stitch.comparison.compare_targets import compare_targets
 from stitch.comparison.tables import Comparison, Table, comparison_document
