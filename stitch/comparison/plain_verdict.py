@@ -1,5 +1,6 @@
 """What a run found in one sentence that everybody on the shop floor understands, and how it stands to a tolerance."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,13 +27,25 @@ def plain_verdict(history: ModelHistory, length_unit: str) -> str:
     told = (length_text(s.field.mean_abs, length_unit) for s in (models[0], models[-1], history.steps[-1]))
     before, now, left = told
     rest = f"with each view moved by its own correction, {left} remain in the stitched cloud."
-    changes = [s.name.removeprefix("+ ") for s in models[1:] if s.name.startswith("+ ")]
+    changes = _brought([step.name for step in models[1:]])
     if not changes:
         return f"On average over the part, the views disagree by {now}; {rest}"
     return (
         f"Adding {' and '.join(changes)} brought the views from {before} to {now} of each other, on average over the "
         f"part; {rest}"
     )
+
+
+def _brought(changes: Sequence[str]) -> list[str]:
+    """Effects that the steps of a history brought and none of them took away again: + a, then − a, + b brought b."""
+    left: list[str] = []
+    for change in ", ".join(changes).split(", "):
+        name = change[2:]
+        if change.startswith("+ "):
+            left.append(name)
+        elif change.startswith("− ") and name in left:
+            left.remove(name)
+    return left
 
 
 def judged(history: ModelHistory, tolerance: float, length_unit: str) -> Judged:
