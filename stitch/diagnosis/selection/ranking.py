@@ -1,7 +1,7 @@
 """Candidates in the order of their log Bayes factor, and which of them are enough for a name."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -66,6 +66,13 @@ def ranked_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tu
     """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
     scores = [score(linear, c) for c in steps("candidate effects", candidates)]
     return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
+
+
+def beside(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
+    """The same where something else has this log posterior in the model of `best`: all shares make room for it."""
+    here = next(r for r in ranked if r.name == best.name).posterior
+    room = 1 + here * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
+    return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
 
 
 def ranked_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:

@@ -9,7 +9,7 @@ from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
 from stitch.diagnosis.selection.forward_selection import forward_selection
 from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
-from stitch.diagnosis.selection.ranking import Ranked, certain, contends, ranked_all, ranked_one
+from stitch.diagnosis.selection.ranking import Ranked, beside, certain, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     LOG_BAYES_FACTOR,
@@ -52,7 +52,9 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if not contenders:
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
-    stray = stray and rescored(base, stray)
+    stray, law = stray and rescored(base, stray), joint_laws.log_posterior(base)
+    ranked = beside(ranked, best, law)
+    adequate, unknown = replace(adequate, ranked=ranked), replace(unknown, ranked=ranked)
     if linear.measurement.views.count >= MANY_VIEWS:
         found = forward_selection(linear, candidates, best)
         refused = found.refused
@@ -61,10 +63,10 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return replace(unknown, notes=tuple(refused.values()))
         best = found.effects[0] if found.effects else best
         second = found.effects[1] if len(found.effects) > 1 else None
-    elif _outdone(base, best, stray):
+    elif _outdone(best, stray, law):
         # Two known effects at once may look like none of them: try the best with a second one.
         second = _second(linear, candidates, best)
-        if second is None or _outdone(base, best, stray, second, len(ranked)):
+        if second is None or _outdone(best, stray, law, second, len(ranked)):
             return unknown
     if _order_open(base, best, empirical):
         return unknown
@@ -87,21 +89,20 @@ def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
     return None
 
 
-def _outdone(
-    base: LinearModel, best: Ranked, stray: Ranked | None, second: Ranked | None = None, tests: int = 1
-) -> bool:
+def _outdone(best: Ranked, stray: Ranked | None, law: float, second: Ranked | None = None, tests: int = 1) -> bool:
     """True where something without a name does what an effect of the library does, with a second one or alone.
 
     A shape without a cause must be 20 to 1 likelier; a joint that follows the joint angles by no law must be 20 to 1
     less likely, as all others that might have the name.
 
     Args:
+        law: log posterior of such a joint.
         tests: effects among which the second was chosen.
     """
-    more = 0.0 if second is None else second.score.log_bayes_factor + float(np.log(PRIOR_PHYSICAL / tests))
-    if stray is not None and stray.log_posterior > best.log_posterior + more + ODDS:
-        return True
-    return joint_laws.contends(base, best.log_posterior + more)
+    known = best.log_posterior
+    if second is not None:
+        known += second.score.log_bayes_factor + float(np.log(PRIOR_PHYSICAL / tests))
+    return (stray is not None and stray.log_posterior > known + ODDS) or law > known - ODDS
 
 
 def _order_open(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) -> bool:

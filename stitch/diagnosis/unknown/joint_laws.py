@@ -35,7 +35,7 @@ class JointLaw:
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
     """What such a law of each joint explains beside a model, likeliest first; () without joints or prior of errors.
 
-    Its size is fitted with all others; `contends` charges it for the width of its prior.
+    Its size is fitted with all others; `log_posterior` charges it for the width of its prior.
     """
     errors = base.pose_errors
     if errors is None or errors.of_joints is None:
@@ -52,13 +52,10 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
     return tuple(sorted(found, key=lambda law: -law.log_bayes_factor))
 
 
-def contends(base: LinearModel, log_posterior: float) -> bool:
-    """Whether what has this log posterior in the same model is less than 20 to 1 likelier than a law of one joint."""
+def log_posterior(base: LinearModel) -> float:
+    """Of the likeliest law of a joint, as those of effects in the same model (`Ranked`); −∞ where there is none."""
     laws = joint_laws(base)
-    if not laws:
-        return False
-    own = laws[0].log_bayes_factor - WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws)))
-    return own > log_posterior - ODDS
+    return laws[0].log_bayes_factor - WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws))) if laws else -np.inf
 
 
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
