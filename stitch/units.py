@@ -30,8 +30,13 @@ def known_text(value: float, U: float) -> str:
     """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
     if not np.isfinite(U) or U <= 0:
         return f"{_plain(value, 6)} ± –"
-    told = _plain(U, 2, zeros=True)
+    told = uncertainty_text(U)
     return f"{value:.{len(told.partition('.')[2])}f} ± {told}"
+
+
+def uncertainty_text(U: float) -> str:
+    """An expanded uncertainty above zero with the two digits that it is worth: 0.087."""
+    return _plain(U, 2, zeros=True)
 
 
 def _plain(value: float, digits: int, zeros: bool = False) -> str:

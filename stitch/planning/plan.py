@@ -73,6 +73,8 @@ def plan(session: Session, planned: PlannedCell, wanted: Wanted) -> Plan:
         if session.robot is None or session.joints is None or not (wanted.halve or wanted.split or wanted.split_any):
             return empty
         possible = candidate_joints(session, cell, _TRIED)
+        if not len(possible):
+            return empty
         told = planned.told if now is None else now.told
         bed = bed_of(with_views(session, list(possible), in_turn=False), cell, told.believed if told else cell.scatter)
         goals = _goals(bed, now, wanted)

@@ -6,14 +6,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.terminal.run_summary import hand_eye_lines
+from stitch.model.hand_eye_uncertainty import expanded
 from stitch.planning.expected_hand_eye import ExpectedHandEye
 from stitch.planning.expected_model import Cell
 from stitch.planning.outlook import EffectOutlook, Outlook
 from stitch.planning.plan import Plan
 from stitch.planning.rivals import Pair
 from stitch.system.console import console
-from stitch.units import length_text, rounded
+from stitch.units import METRES, length_text, rounded, uncertainty_text
 
 # Pairs that are shown, and the share of wrong names from which they are told.
 _PAIRS, _MISTAKEN = 3, 0.05
@@ -39,10 +39,13 @@ def show(plan: Plan, cell: Cell, output: Path | None) -> None:
 
 
 def _show_outlook(terminal: Console, plan: Plan, o: Outlook, cell: Cell) -> None:
-    unit, mount = plan.session.length_unit, plan.session.mount
+    unit, frame = plan.session.length_unit, "base" if plan.session.mount == "eye_to_hand" else "flange"
     terminal.print(f"What {o.views} views would tell:", style="bold", soft_wrap=True)
-    for line in hand_eye_lines(cell.model.T_mount, o.hand_eye.covariance, mount, unit):
-        terminal.print(line, soft_wrap=True)
+    terminal.print(f"U (k = 2) of the hand-eye T_{frame}_scanner, in the frame of the {frame}:", soft_wrap=True)
+    U = expanded(cell.model.T_mount, o.hand_eye.covariance) * np.repeat([1e3, METRES[unit] * 1e3], 3)
+    position, turn = (", ".join(map(_of_axis, "xyz", sizes)) for sizes in (U[3:], U[:3]))
+    terminal.print(f"  position {position} mm", soft_wrap=True)
+    terminal.print(f"  rotation vector {turn} mrad", soft_wrap=True)
     terminal.print(
         f"  at the part {length_text(o.hand_eye.U, unit, 2)}, mostly {_sources(o.hand_eye)}; "
         f"{length_text(o.ordinary.U, unit, 2)} with an arm that is a little wrong in every joint and link",
@@ -68,6 +71,10 @@ def _show_outlook(terminal: Console, plan: Plan, o: Outlook, cell: Cell) -> None
     _show_pairs(terminal, o)
 
 
+def _of_axis(axis: str, U: float) -> str:
+    return f"{axis} {uncertainty_text(U)}"
+
+
 def _sources(hand_eye: ExpectedHandEye) -> str:
     shares = sorted(hand_eye.shares.items(), key=lambda item: -item[1])[:2]
     return " and ".join(f"{name} ({share:.0%})" for name, share in shares)
@@ -87,8 +94,7 @@ def _show_pairs(terminal: Console, o: Outlook) -> None:
     hard = [pair for pair in o.pairs if pair.size > 1][:_PAIRS] or list(o.pairs[:1])
     for pair in hard:
         own, rival, size = (pair.a, pair.b, pair.size_a) if pair.size_a > pair.size_b else (pair.b, pair.a, pair.size_b)
-        told = f"from {size:.2g} times its usual size" if np.isfinite(size) else "at no size"
-        terminal.print(f"{own} is told from {rival} {told}.", soft_wrap=True)
+        terminal.print(f"{own} is told from {rival} {_from(size)}.", soft_wrap=True)
 
 
 def _show_proposed(terminal: Console, plan: Plan) -> None:
@@ -128,11 +134,12 @@ def _show_after(terminal: Console, plan: Plan, now: Outlook, after: Outlook) -> 
     if plan.split is not None:
         before, then = (_pair(o, plan.split) for o in (now, after))
         if before is not None and then is not None:
-            terminal.print(
-                f"{plan.split[0]} and {plan.split[1]} are told apart from {then.size:.2g} times their usual size "
-                f"(now {before.size:.2g}).",
-                soft_wrap=True,
-            )
+            names = " and ".join(plan.split)
+            terminal.print(f"{names} are told apart {_from(then.size)}; now {_from(before.size)}.", soft_wrap=True)
+
+
+def _from(size: float) -> str:
+    return f"from {size:.2g} times its usual size" if np.isfinite(size) else "at no size"
 
 
 def _pair(o: Outlook, names: tuple[str, str]) -> Pair | None:
