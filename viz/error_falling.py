@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import change_of, model_history
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES
+from stitch.units import MICROMETRES, length_text
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
 from viz.part_camera import camera_for
 from viz.part_picture import painted, visible
@@ -38,7 +38,7 @@ def error_falling(run: Run) -> Figure:
         colours = unsigned_colours(surface.coloured(step.field.overall * um), limit)
         axes.imshow(painted(surface, camera, seen, colours))
         axes.axis("off")
-        axes.set_title(f"{step.name}\n{step.field.mean_abs * um:.3g} µm on average", fontsize=10)
+        axes.set_title(f"{step.name}\n{length_text(step.field.mean_abs * um / 1e3, 'mm')} on average", fontsize=10)
     scale = ScalarMappable(Normalize(0, limit), colormaps[FIELD])
     parts.colorbar(scale, ax=panels, label="views disagree by (µm)", extend="max", shrink=0.75, aspect=30)
     _bars(right.subplots(), run, um)

@@ -13,7 +13,7 @@ from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory, ModelStep
 from stitch.frames import Array
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES
+from stitch.units import MICROMETRES, length_text
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
 from viz.run_figures import shown_points
@@ -47,7 +47,7 @@ class ModelScene:
 
     def title(self, step: ModelStep) -> str:
         """Name of a step and how far the views disagree there."""
-        return f"{step.name}: views disagree by {step.field.mean_abs * self.um:.3g} µm on average"
+        return f"{step.name}: views disagree by {length_text(step.field.mean_abs * self.um / 1e3, 'mm')} on average"
 
 
 def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stitch.comparison.model_history import ModelHistory, change_of
 from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, rounded
+from stitch.units import MICROMETRES, known_text, rounded
 from viz.run_figures import shown_points, view_shifts
 
 # Of more views than this the page lists those to look at first.
@@ -81,19 +81,26 @@ def note_rows(run: Run) -> list[dict[str, str]]:
     ]
 
 
-def hand_eye_rows(run: Run) -> list[dict[str, object]]:
+def hand_eye_rows(run: Run) -> list[dict[str, str]]:
     """Name, coarse, corrected, U (k = 2) and unit of every number of the hand-eye; all in the mount frame."""
     mm = MICROMETRES[run.session.length_unit] / 1e3
     values = []
     for T in (run.T_mount_coarse, run.T_mount):
-        values.append([*(T[:3, 3] * mm), *np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec())])
+        values.append([*(T[:3, 3] * mm), *(Rotation.from_matrix(T[:3, :3]).as_rotvec() * 1e3)])
     U = expanded(run.T_mount, run.mount_covariance)
-    expanded_units = [*(U[3:] * mm), *np.degrees(U[:3])]
-    names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "°") for axis in "xyz"]
+    units = [*(U[3:] * mm), *(U[:3] * 1e3)]
+    names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "mrad") for axis in "xyz"]
     return [
-        {"name": name, "unit": unit, "coarse": coarse, "corrected": corrected, "U": u}
-        for (name, unit), coarse, corrected, u in zip(names, values[0], values[1], expanded_units, strict=True)
+        {"name": name, "unit": unit} | _told(coarse, corrected, u)
+        for (name, unit), coarse, corrected, u in zip(names, values[0], values[1], units, strict=True)
     ]
+
+
+def _told(coarse: float, corrected: float, U: float) -> dict[str, str]:
+    """Three numbers with the digits that U knows, as the terminal has them."""
+    value, _, U_text = known_text(corrected, U).partition(" ± ")
+    begun = f"{coarse:.{len(value.partition('.')[2])}f}"
+    return {name: text.replace("-", "−") for name, text in (("coarse", begun), ("corrected", value), ("U", U_text))}
 
 
 def matrix(run: Run) -> str:

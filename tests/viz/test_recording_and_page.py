@@ -15,6 +15,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
 from stitch.comparison.model_history import model_history
 from stitch.runs.run import Note
+from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
 from viz.run_page import write_report
@@ -54,7 +55,7 @@ def eyes(path):
 
 def titles(rows):
     """Names of the views of a step, as result.json has its numbers."""
-    return [f"{row['step']}: views disagree by {row['mean'] * 1e3:.3g} µm on average" for row in rows]
+    return [f"{row['step']}: views disagree by {length_text(row['mean'], 'mm')} on average" for row in rows]
 
 
 def test_the_recording_is_whole_and_small_and_shows_everything(recorded):
