@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from stitch.comparison.model_history import ModelStep
 from stitch.frames import Array, Indices
+from stitch.units import length_text
 from viz.colours import FIELD, unsigned_colours
 from viz.part_camera import Camera
 from viz.part_surface import PartSurface
@@ -32,7 +33,7 @@ class Seen(NamedTuple):
 
 def step_shown(step: ModelStep, um: float) -> tuple[str, Array]:
     """Title and values of a still picture; µm."""
-    return f"{step.name}\n{step.field.mean_abs * um:.3g} µm on average", step.field.overall * um
+    return f"{step.name}\n{length_text(step.field.mean_abs * um / 1e3, 'mm')} on average", step.field.overall * um
 
 
 def part_picture(
