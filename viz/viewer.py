@@ -28,6 +28,8 @@ def open_recording(run: Path) -> None:
         InputError: the run has no recording.
         NoResultError: the viewer could not open a window.
     """
+    if not run.exists():
+        raise InputError(f"{run}: no such run folder; `stitch run` writes one")
     path = run / "recording.rrd" if run.is_dir() else run
     if not path.is_file():
         raise InputError(f"{path}: no recording; run `stitch run` without --no-recording")

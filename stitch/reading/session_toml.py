@@ -1,5 +1,6 @@
 """session.toml: every key checked, tables turned to what they describe."""
 
+import shlex
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -39,7 +40,11 @@ def document(file: Path) -> dict[str, Any]:
     Raises:
         InputError: missing, not TOML, of another format, or with a key that nobody knows.
     """
-    document = read_toml(file, "a session is a folder with session.toml and views.csv")
+    hint = "a session is a folder with session.toml and views.csv"
+    if file.parent.is_dir():
+        # Whoever names the folder of the raw scans comes here first.
+        hint += f"; to fix: `stitch init {shlex.quote(str(file.parent))}` makes one of scans and poses as they are"
+    document = read_toml(file, hint)
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{FORMAT}"')
     for table, known in _KEYS.items():

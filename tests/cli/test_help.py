@@ -120,3 +120,12 @@ def test_run_without_a_session_says_so(tmp_path, monkeypatch, capsys):
     assert (
         ended.value.code == 2 and "this folder has no session.toml; to fix: name a session" in capsys.readouterr().err
     )
+
+
+def test_the_folder_of_raw_scans_is_no_session_and_becomes_one_by_init(tmp_path, capsys):
+    (tmp_path / "my scans").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(tmp_path / "my scans")])
+    assert ended.value.code == 2
+    assert "session.toml: not found; a session is a folder" in (told := capsys.readouterr().err)
+    assert f"`stitch init '{tmp_path}/my scans'`" in told

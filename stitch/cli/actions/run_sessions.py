@@ -79,7 +79,10 @@ def _given(asked: RunOptions) -> tuple[ModelFile | None, ModelFile | None, str |
 def _here() -> Path:
     """The folder one stands in, if it is a session."""
     if not Path("session.toml").is_file():
-        raise InputError("run what? this folder has no session.toml; to fix: name a session folder, or go into one")
+        raise InputError(
+            "run what? this folder has no session.toml; to fix: name a session folder, go into one, or make one with "
+            "`stitch init FOLDER`"
+        )
     return Path.cwd()
 
 
