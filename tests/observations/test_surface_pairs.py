@@ -1,5 +1,7 @@
 """Matching, normal equations and repeatability, each against something independent."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -33,6 +35,18 @@ def test_partners_are_the_nearest_points_by_another_tree(blade_capture):
     to_w, to_v = cKDTree(q).query(p[found.index_v])[1], cKDTree(p).query(q[found.index_w])[1]
     assert np.all((to_w == found.index_w) | (to_v == found.index_v))
     assert np.allclose(found.residual, np.einsum("ij,ij->i", p[found.index_v] - q[found.index_w], found.normal))
+
+
+@pytest.mark.parametrize(("views", "turns"), [(21, 1), (26, 2)])
+def test_points_take_turns_where_many_views_overlap(blade_capture, views, turns):
+    """One scan so often: every point is its own partner, in 20 views or all the 25 others shared by two halves."""
+    scan = blade_capture[1].scans[0]
+    picked, pairs = sample(scan, 300), list(combinations(range(views), 2))
+    found = list(match([scan] * views, np.tile(np.eye(4), (views, 1, 1)), pairs, 0.5, [picked] * views))
+    of_first = [m.index_v for m in found if m.v == 0]
+    assert len(of_first) == views - 1 and set(np.concatenate(of_first)) == set(picked)
+    # Both search directions.
+    assert sum(map(len, of_first)) == pytest.approx(2 * (views - 1) * len(picked) / turns, rel=0.02)
 
 
 def test_views_that_face_away_do_not_overlap(blade_capture):

@@ -16,6 +16,8 @@ from stitch.system.threads import parallel
 _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Queries that decide whether two views overlap, and the share that must find a partner.
 _PROBES = 250
+# Views in which one point of another view is asked for.
+_MOST_PARTNERS = 20
 _MINIMUM_OVERLAP = 0.04
 
 
@@ -73,16 +75,21 @@ def match(
 ) -> Iterator[Match]:
     """Stream the correspondences of `pairs`: each sampled point with its nearest point of the other.
 
+    Where a view overlaps with more than 20 others, its points take turns: each is asked for in 20 of them. What a point
+    says of its own view it says to the first few already, so that many views cost what they are and not their square.
+
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         gate: largest distance between partners, length_unit.
         samples: per view the indices that search (see `sample`).
     """
 
+    turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
+
     def of_pair(pair: tuple[int, int]) -> Match | None:
         v, w = pair
-        from_v = _partners(scans, poses, samples[v], v, w, gate)
-        from_w = _partners(scans, poses, samples[w], w, v, gate)
+        from_v = _partners(scans, poses, samples[v][w % turns[v] :: turns[v]], v, w, gate)
+        from_w = _partners(scans, poses, samples[w][v % turns[w] :: turns[w]], w, v, gate)
         index_v = np.concatenate([from_v[0], from_w[1]])
         index_w = np.concatenate([from_v[1], from_w[0]])
         return _measure(scans, poses, v, w, index_v, index_w) if len(index_v) else None
