@@ -13,6 +13,8 @@ from stitch.planning.view_search import Channel, separations
 
 # Keeps what too few views leave open finite: a radian, and many times any part.
 _OPEN = 1e-8
+# Whatever the unit, no logarithm of a length comes near.
+_NEVER = -50.0
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,9 @@ class HalvedHandEye:
         return np.array([displacement(C, self.middle) for C in flat]).reshape(covariance.shape[:-2])
 
     def progress(self, normal: Array) -> Array:
-        """(...) 1 where U has come down to that share; without a present U its logarithm, never enough."""
+        """(...) 1 where U has come down to that share; without a present U what its logarithm falls by, never 1."""
         if not np.isfinite(self.now):
-            return np.asarray(-np.log(self.U(normal)))
+            return np.asarray(_NEVER - np.log(self.U(normal)))
         return np.asarray(np.clip(np.log(self.U(normal) / self.now) / np.log(self.share), 0.0, 1.0))
 
 

@@ -58,3 +58,10 @@ def test_no_view_is_chosen_that_is_not_needed(channel):
     reached = float(np.min(HalvedHandEye(channel, np.zeros(3), 1.0).U(channel.with_each([0, 1, 2], range(3, 10)))))
     goal = HalvedHandEye(channel, np.zeros(3), now=reached / 0.5 * 1.001)
     assert len(choose_views([goal], joints, present=3, most=6)) == 1
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_where_there_is_no_hand_eye_yet_as_many_views_are_chosen_as_are_asked_for(channel, unit):
+    """In any unit of length."""
+    goal = HalvedHandEye(channel, np.array([0.0, 0.0, unit]), now=float("nan"))
+    assert len(choose_views([goal], np.zeros((10, 6)), present=1, most=4)) == 4
