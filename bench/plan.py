@@ -59,7 +59,7 @@ LAWS = (
 )
 _VIEWS, _PIXELS = 12, 60
 _SIZES = (0.2, 2.0)  # of nature's own, log-uniform
-_FIRST_SEED = 700
+_FIRST_SEED, _ENOUGH = 700, 20
 _BINS = (0.0, 0.25, 0.75, 1.0)
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "plan.md"
 _MARKS = ("<!-- chances: begin -->", "<!-- chances: end -->")
@@ -146,6 +146,8 @@ def table(rows: Sequence[Row]) -> str:
     squares = [row["chi_square"] for row in empty]
     nothing = f"Nothing hidden: {_share(alarms, len(empty))} of {len(empty)} alarm"
     lines += ["", f"{nothing}; χ²/6 of the hand-eye under the stated covariance {np.mean(squares) / 6:.2f} on average."]
+    if len(rows) < _ENOUGH:
+        lines += ["", f"Only {len(rows)} cells so far: too few to say that the chances are calibrated."]
     return "\n".join(lines)
 
 
