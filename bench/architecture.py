@@ -57,7 +57,7 @@ def purpose(room: str) -> str:
 def draw() -> None:
     """Rooms by floor; an arrow points from who imports to what is imported."""
     *rows, ground = floors()
-    figure, ax = plt.subplots(figsize=(12, 15), dpi=90)
+    figure, ax = plt.subplots(figsize=(13.2, 15), dpi=90)
     places = {}
     for level, row in enumerate([*rows, ground]):
         step = (WIDTH if row is not ground else 3.1) + 0.35
@@ -68,7 +68,7 @@ def draw() -> None:
         arrow(ax, places[a], places[b])
     for room, (x, y) in places.items():
         box(ax, x, y, 3.1 if room in ground else WIDTH, room)
-    ax.set_xlim(-6.9, 6.9)
+    ax.set_xlim(-7.6, 7.6)
     ax.set_ylim(-len(rows) * (HEIGHT + GAP) - 0.7, 0.7)
     ax.axis("off")
     figure.tight_layout()
