@@ -58,6 +58,14 @@ def test_no_answer_is_one_line(sessions, monkeypatch, capsys, batch):
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", "--workers", "2", code=2)
 
 
+def test_where_nothing_can_be_read_nothing_is_left(tmp_path, batch):
+    batch(tmp_path / "nowhere", "-o", tmp_path / "runs", code=2)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "own").mkdir()
+    batch(tmp_path / "nowhere", "-o", tmp_path / "own", code=2)
+    assert list(tmp_path.iterdir()) == [tmp_path / "own"]
+
+
 @pytest.mark.usefixtures("ran")
 def test_without_the_package_one_process_works(sessions, monkeypatch, capsys, batch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)

@@ -26,7 +26,7 @@ def run_batch(
     Raises:
         InputError, NoResultError: as `stitch batch` ends.
     """
-    jobs = _jobs(sessions, output, force, recording)
+    jobs, stood = _jobs(sessions, output, force, recording), output.exists()
     rows: dict[str, SessionRow] = {}
     try:
         # Whatever ends the loop ends the workers.
@@ -39,6 +39,9 @@ def run_batch(
             f"stopped with {len(rows)} of {len(jobs)} sessions told; what is finished is kept, and the same command "
             "goes on from there"
         ) from None
+    if not stood and output.is_dir() and not any(output.iterdir()):
+        # Workers claim their places before they read: where nothing came of it, nothing is left.
+        output.rmdir()
     _finish([rows[job.run.name] for job in jobs], output, as_json)
 
 
