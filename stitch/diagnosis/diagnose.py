@@ -18,7 +18,6 @@ from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, 
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import clear_laws
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
@@ -47,7 +46,7 @@ def diagnose_state(state: State) -> Diagnosis:
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
         unnamed = unnamed_errors(linear) if selection.verdict == "unknown_effect" else ()
-        curves = joint_curves(clear_laws(linear)) if selection.verdict == "unknown_effect" else ()
+        curves = joint_curves([law for kind in unnamed for law in kind.laws])
         beyond = implausible(linear, limit)
         # Where it is said what repeats, scatter is the rest; else all of it.
         rest = linear if unnamed and (curves or not beyond) else linear.scatter_only

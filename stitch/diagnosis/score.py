@@ -18,7 +18,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
-_SEEN = 0.5
+SEEN = 0.5
 # Forms that do not gain under the null's variances do not gain under their own either.
 _HOPELESS = -4.0
 # Under several variances, of which one is nearly that of the maximum, they gain half a nat at the most.
@@ -71,7 +71,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     full = candidate.forms[0]
     starts = (base, *base.elsewhere)
     whites = [residuals(at, candidate) for at in starts]
-    seen = any(bool((np.linalg.norm(own[0] * full.sizes, axis=0) > _SEEN).any()) for own in whites if own[0].size)
+    seen = any(bool((np.linalg.norm(own[0] * full.sizes, axis=0) > SEEN).any()) for own in whites if own[0].size)
     found = list(zip(starts, whites, strict=True))
     quick = np.array([[_quick(base, at, f, own[i]) for at, own in found] for i, f in enumerate(candidate.forms)])
     likely = quick.max(axis=1)

@@ -104,7 +104,7 @@ def _lack(d: Diagnosis) -> str:
 
 
 def curve_text(curve: JointCurve) -> str:
-    """Where in the range a joint errs: Joint 3 turns by -0.24 ± 0.04 mrad too far at j4 = -20°, …"""
+    """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
     low, high = (
         f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad at j{curve.along} = "
         f"{np.degrees(curve.angle[i]):.0f}°"

@@ -18,7 +18,7 @@ _QUADRIC_NEIGHBOURS = 16
 _NOISE_SAMPLES = 1500
 # Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
 # radius, the centroid has left the point: the surface ends here.
-_GRAZING_COSINE = np.cos(np.radians(75.0))
+GRAZING_COSINE = np.cos(np.radians(75.0))
 _EDGE_OFFSET = 0.35
 # Surface variation λ₀/(λ₀+λ₁+λ₂) of a crease (Pauly et al. 2002); a plane has 0.
 _CREASE_VARIATION = 0.05
@@ -65,7 +65,7 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
     normals *= -np.sign(cosine)[:, None]
     confidence = np.abs(cosine)
     offset = np.linalg.norm(centroid - own, axis=1)
-    usable = (confidence > _GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
+    usable = (confidence > GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
     usable &= variation < _CREASE_VARIATION
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
-from stitch.diagnosis.score import form_weights
+from stitch.diagnosis.score import SEEN, form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL, PRIOR_UNKNOWN
 from stitch.diagnosis.unknown.joint_laws import TIMES, WIDTH
 from stitch.frames import Array, Mask
@@ -176,7 +176,7 @@ def _factor(covariance: Array) -> Array:
 def _visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
     white = linear.without([candidate.name]).residual(candidate.forms[0].columns) * candidate.forms[0].sizes
-    return bool((np.linalg.norm(white, axis=0) > 0.5).any())
+    return bool((np.linalg.norm(white, axis=0) > SEEN).any())
 
 
 def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DRAWS) -> Array:

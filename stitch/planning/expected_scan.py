@@ -6,10 +6,9 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
+from stitch.measurement.scan import GRAZING_COSINE
 from stitch.planning.part_surface import PartSurface
 
-# Beyond 75° of incidence no scanner is believed (`measurement/scan.py`).
-_GRAZING = np.cos(np.radians(75.0))
 # A ray is as wide as so many distances between the points; what lies so many rays' widths behind another is hidden.
 _RAY, _BEHIND = 2.0, 4.0
 # Cosine to the optical axis beyond which no scanner sees.
@@ -44,7 +43,7 @@ def expected_scan(part: PartSurface, T_reference_scanner: Array, field: Field) -
     slopes, reach = points[:, :2] / (points @ field.axis)[:, None], np.linalg.norm(points, axis=1)
     cosine = -np.einsum("ij,ij->i", points, normals) / reach
     inside = (np.abs(slopes) <= field.half).all(axis=1) & (reach > field.near) & (reach < field.far)
-    return np.asarray(ahead[inside & (cosine > _GRAZING) & ~_hidden(slopes, reach)])
+    return np.asarray(ahead[inside & (cosine > GRAZING_COSINE) & ~_hidden(slopes, reach)])
 
 
 def _hidden(slopes: Array, reach: Array) -> Mask:

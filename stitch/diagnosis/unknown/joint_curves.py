@@ -44,11 +44,18 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
     The law is a random function; what the views say of it is its mean and covariance given their numbers, with the
     hand-eye free and at the fitted sizes of all errors (kriging; Rasmussen & Williams 2006, eq. 2.41).
     """
-    found = [_course(law, j) for law in laws for j in range(law.model.measurement.views.joints.shape[1])]
+    found = []
+    for law in laws:
+        joints, errors = law.model.measurement.views.joints, law.model.pose_errors
+        assert errors is not None and errors.of_joints is not None
+        alike = errors.of_joints.alike
+        whole = float(_given_views(law, alike, alike)[0].var())
+        found += [_course(law, j, whole) for j in range(joints.shape[1])]
     return tuple(sorted((c for c in found if c.share > _WORTH), key=lambda c: -c.share))
 
 
-def _course(law: JointLaw, j: int) -> JointCurve:
+def _course(law: JointLaw, j: int, whole: float) -> JointCurve:
+    """Along joint j, counted from 0; `whole` is the variance over the views of all that the law does, rad²."""
     joints = law.model.measurement.views.joints
     angle, views = np.linspace(joints[:, j].min(), joints[:, j].max(), _PLACES), len(joints)
     factors = alike_joint_by_joint(joints, joints)
@@ -59,11 +66,10 @@ def _course(law: JointLaw, j: int) -> JointCurve:
     with_places = others.mean() * alike_joint_by_joint(places[:, None], places[:, None])[:, :, 0]
     centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_PLACES, views])
     mean, covariance = _given_views(law, centred @ with_views, centred @ with_places @ centred.T)
-    every, _ = _given_views(law, np.prod(factors, axis=2), np.prod(factors, axis=2))
     return JointCurve(
         joint=law.joint,
         along=j + 1,
-        share=min(float(mean[_PLACES:].var() / max(every.var(), 1e-300)), 1.0),
+        share=min(float(mean[_PLACES:].var() / max(whole, 1e-300)), 1.0),
         angle=angle,
         error=mean[:_PLACES],
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.joint_laws import clear_laws
+from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
@@ -22,6 +22,7 @@ class Unnamed:
     words: str  # "they …"
     log_bayes_factor: float  # over the same errors without it
     joints: bool  # follows the pose rather than time
+    laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
 
 
 def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
@@ -58,7 +59,7 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
     """That of one joint beside all that the prior holds."""
     laws = clear_laws(linear)
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
-    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True) if laws else None
+    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, True, laws) if laws else None
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:
