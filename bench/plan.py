@@ -37,7 +37,7 @@ from stitch.planning.chances import DRAWS, Court
 from stitch.planning.expected_hand_eye import expected_hand_eye
 from stitch.planning.expected_model import Cell, expected_model, seen
 from stitch.planning.expected_scan import Field
-from stitch.planning.part_surface import of_mesh
+from stitch.planning.planned_part import of_mesh
 from stitch.planning.scatter import stated_scatter
 from stitch.planning.told_sizes import told_sizes, under
 from stitch.system.threads import library_threads_off

@@ -14,7 +14,7 @@ from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.planning.expected_model import FEWEST, Cell, expected_scans
 from stitch.planning.expected_scan import Field
-from stitch.planning.part_surface import PartSurface, block, surface_of_file, thinned_surface
+from stitch.planning.planned_part import PlannedPart, block, surface_of_file, thinned_surface
 from stitch.planning.scatter import Told, found_scatter, stated_scatter
 from stitch.reading.clouds import read_cloud
 from stitch.runs.state import State
@@ -103,7 +103,7 @@ def cell_of_run(state: State, folder: Path) -> PlannedCell:
     return PlannedCell(Cell(state.model, thinned_surface(cloud.points, cloud.normals), field, told.believed), (), told)
 
 
-def _part(session: Session, part: Path | None, size_mm: float | None) -> tuple[PartSurface, list[str]]:
+def _part(session: Session, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
     """The part's surface, and what is assumed of it."""
     unit = METRES[session.length_unit]
     if part is not None:

@@ -19,7 +19,7 @@ from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.planning.expected_scan import Field, expected_scan
-from stitch.planning.part_surface import PartSurface
+from stitch.planning.planned_part import PlannedPart
 from stitch.planning.scatter import Scatter
 from stitch.statistics.variance_components import at_variances
 from stitch.statistics.variance_prior import NOISE
@@ -36,7 +36,7 @@ class Cell:
     """Everything about a cell but its views."""
 
     model: Model
-    part: PartSurface  # reference frame
+    part: PlannedPart  # reference frame
     field: Field
     scatter: Scatter
 

@@ -7,7 +7,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.scan import GRAZING_COSINE
-from stitch.planning.part_surface import PartSurface
+from stitch.planning.planned_part import PlannedPart
 
 # A ray is as wide as so many distances between the points; what lies so many rays' widths behind another is hidden.
 _RAY, _BEHIND = 2.0, 4.0
@@ -26,7 +26,7 @@ class Field:
     axis: Array
 
 
-def expected_scan(part: PartSurface, T_reference_scanner: Array, field: Field) -> Indices:
+def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: Field) -> Indices:
     """Indices of the part's points that the scanner sees.
 
     Args:

@@ -17,7 +17,7 @@ from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.view_responses import view_columns, view_responses
 from stitch.planning.expected_model import Cell, Seen, seen
-from stitch.planning.part_surface import thinned_surface
+from stitch.planning.planned_part import thinned_surface
 from stitch.planning.scatter import Scatter
 from stitch.planning.view_search import Channel, noise_of
 

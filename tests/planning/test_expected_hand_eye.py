@@ -17,7 +17,7 @@ from stitch.planning.chances import Court
 from stitch.planning.expected_hand_eye import expected_hand_eye
 from stitch.planning.expected_model import Cell, expected_model, seen
 from stitch.planning.expected_scan import Field
-from stitch.planning.part_surface import of_mesh
+from stitch.planning.planned_part import of_mesh
 from stitch.planning.scatter import Scatter
 
 ROTATION, TRANSLATION = 5e-5, 0.03

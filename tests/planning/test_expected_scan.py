@@ -7,7 +7,7 @@ import trimesh
 from data_synth.fixtures.ideal_scanner import facing
 from stitch.errors import InputError
 from stitch.planning.expected_scan import Field, expected_scan
-from stitch.planning.part_surface import block, of_mesh, surface_of_file
+from stitch.planning.planned_part import block, of_mesh, surface_of_file
 
 WIDE = Field(np.array([2.0, 2.0]), 1.0, 1e4, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
 

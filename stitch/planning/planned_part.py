@@ -19,7 +19,7 @@ _SIDES = np.array([1.0, 0.7, 0.5])
 
 
 @dataclass(frozen=True)
-class PartSurface:
+class PlannedPart:
     """Points (N, 3) on a surface and their outward normals (N, 3); length_unit."""
 
     points: Array
@@ -35,12 +35,12 @@ class PartSurface:
         """Diagonal of its box."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
-    def moved(self, T: Array) -> "PartSurface":
+    def moved(self, T: Array) -> "PlannedPart":
         """The surface in another frame."""
-        return PartSurface(frames.transform(T, self.points), frames.rotate(T, self.normals))
+        return PlannedPart(frames.transform(T, self.points), frames.rotate(T, self.normals))
 
 
-def surface_of_file(file: Path, scale: float) -> PartSurface:
+def surface_of_file(file: Path, scale: float) -> PlannedPart:
     """A mesh (STL, PLY, OBJ …), or a cloud with normals, as that of a run; `scale` turns its unit into the session's.
 
     Raises:
@@ -59,13 +59,13 @@ def surface_of_file(file: Path, scale: float) -> PartSurface:
     return thinned_surface(cloud.points, cloud.normals)
 
 
-def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> PartSurface:
+def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> PlannedPart:
     """At most so many points of a cloud, evenly over their order."""
     picked = np.linspace(0, len(points) - 1, min(at_most, len(points))).astype(int)
-    return PartSurface(points[picked], normals[picked])
+    return PlannedPart(points[picked], normals[picked])
 
 
-def block(size: float) -> PartSurface:
+def block(size: float) -> PlannedPart:
     """What stands for a part of which only the largest side is known: a block of 1 : 0.7 : 0.5 about the origin."""
     return of_mesh(trimesh.creation.box(extents=size * _SIDES))
 
@@ -82,7 +82,7 @@ def _mesh(file: Path) -> trimesh.Trimesh | None:
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
 
 
-def of_mesh(mesh: trimesh.Trimesh) -> PartSurface:
+def of_mesh(mesh: trimesh.Trimesh) -> PlannedPart:
     """Points spread over a mesh at random, the same every time."""
     points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
-    return PartSurface(np.asarray(points), np.asarray(mesh.face_normals[faces]))
+    return PlannedPart(np.asarray(points), np.asarray(mesh.face_normals[faces]))
