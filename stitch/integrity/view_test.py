@@ -8,6 +8,7 @@ non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, T
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
-from stitch.statistics.least_squares import column_space
+from stitch.statistics.least_squares import column_space, summed_squares
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import VarianceFit, fit_variances
@@ -53,11 +54,14 @@ class ViewModel:
     def mixed(self, further: Array | None = None) -> MixedModel:
         """The model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
         mean = self.hand_eye if further is None else np.column_stack([self.hand_eye, further])
-        blocks = self.views @ self.carried
-        rotation, translation = (np.einsum("vni,vmi->nm", b, b) for b in (blocks[:, :, :3], blocks[:, :, 3:]))
-        components = np.array([rotation, translation, self.noise])[:, None]
         usual = None if self.usual is None else self.usual[None]
-        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], components, usual)
+        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], self._components, usual)
+
+    @cached_property
+    def _components(self) -> Array:
+        """(3, 1, n, n) covariances of unit scatter of the flange, rotation and translation, and of the noise."""
+        blocks = self.views @ self.carried
+        return np.array([*(summed_squares(b) for b in (blocks[:, :, :3], blocks[:, :, 3:])), self.noise])[:, None]
 
     def fit(self, further: Array | None = None) -> VarianceFit:
         """Scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""

@@ -49,3 +49,12 @@ def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Arra
     keep = values > relative * values[-1]
     projected = vectors[:, keep].T @ (-vector * scale) / values[keep]
     return np.asarray(scale * (vectors[:, keep] @ projected))
+
+
+def summed_squares(blocks: Array) -> Array:
+    """(n, n) Σ_v B_v B_vᵀ of blocks (V, n, k): covariance of n numbers that V independent unit errors move.
+
+    One matrix product: with hundreds of views a sum over three indices takes a hundred times as long.
+    """
+    wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
+    return np.asarray(wide @ wide.T)

@@ -16,7 +16,7 @@ from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
 from stitch.observations.surfaces.gram import Gram
-from stitch.statistics.least_squares import column_space
+from stitch.statistics.least_squares import column_space, summed_squares
 from stitch.statistics.parameter_selection import Whitened
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import fit_variances
@@ -68,7 +68,7 @@ def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
 def _scatter(left: Array, carried: Array) -> Array:
     """Covariance of the visible directions for independent unit twists of every view."""
     blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
-    return np.asarray(np.einsum("vni,vmi->nm", blocks, blocks))
+    return summed_squares(blocks)
 
 
 def mixed_model(channel: PoseChannel, further: Array | None = None) -> MixedModel:
