@@ -42,7 +42,7 @@ def versions() -> Row:
 
 
 def _points(session: Session) -> str:
-    clouds = sum(len(view.cloud.points) for view in session.views if view.cloud is not None)
+    clouds = sum(view.cloud.count for view in session.views if view.cloud is not None)
     labelled = sum(len(view.sighting.targets) for view in session.views if view.sighting is not None)
     told = [f"{n:,} {word}" for n, word in ((clouds, "points"), (labelled, "labelled points")) if n]
     return " and ".join(told) or "no points"

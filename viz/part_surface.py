@@ -15,6 +15,8 @@ from stitch.writing.mesh import TriangleMesh, mesh_of
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
 _FINENESS = 150
+# Many for each of the cells; more would not be seen.
+_POINTS = 1_000_000
 # Share of the triangles up to which a piece of surface for itself is not shown.
 _CRUMB = 0.005
 # Share of places seen once up to which they are not shown.
@@ -76,11 +78,12 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
 
 def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     """(N, 3) mean points and unit normals of cells, both sides of a sheet apart."""
-    once = fused.count < 2
+    some = np.linspace(0, len(fused.points) - 1, min(len(fused.points), _POINTS)).astype(np.int64)
+    once = fused.count[some] < 2
     # Where views meet almost everywhere, what one view alone saw are its flying points.
     keep = ~once | (once.mean() > _FLYING)
     # As stitched.ply holds them: a page that is made anew is the same.
-    points, normals = (x[keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
+    points, normals = (x[some][keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
     size = float(np.ptp(points, axis=0).max()) / _FINENESS
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))

@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,9 @@ Tolerance = Annotated[
     float | None,
     typer.Option("--tolerance", help="On the page: within which the views have to agree on the part, length_unit."),
 ]
+Memory = Annotated[
+    str | None, typer.Option("--memory", metavar="SIZE", help="Stay below so much, such as 2GB; default: no limit.")
+]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `stitch run` wrote.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone on standard output.")]
 
@@ -28,3 +32,18 @@ def require_tolerance(tolerance: float | None) -> None:
     """
     if tolerance is not None and not 0 < tolerance < float("inf"):
         raise InputError(f"--tolerance {tolerance:g}: to fix: give a length above zero, in the session's length_unit")
+
+
+def bytes_of(size: str | None) -> float | None:
+    """Bytes of a size as people write it, None for none.
+
+    Raises:
+        InputError: not a size.
+    """
+    if size is None:
+        return None
+    told = re.fullmatch(r"([0-9.]+) *([KMGT])i?B?", size.strip(), re.IGNORECASE)
+    try:
+        return float(told[1]) * 1e3 ** (1 + "KMGT".index(told[2].upper())) if told else float(size)
+    except ValueError:
+        raise InputError(f"--memory {size}: to fix: give a size such as 2GB or 800MB") from None

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import EffectsFile, Force, Json, Tolerance, Trust, require_tolerance
+from stitch.cli.options import EffectsFile, Force, Json, Memory, Tolerance, Trust, bytes_of, require_tolerance
 from stitch.cli.run_options import RunOptions
 
 
@@ -32,6 +32,7 @@ def run(
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
     mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
     tolerance: Tolerance = None,
+    memory: Memory = None,
     as_json: Json = False,
 ) -> None:
     """Find and correct the hand-eye, register the views, fuse them.
@@ -44,6 +45,7 @@ def run(
       stitch run monday tuesday -o both
       stitch run blade-18 --hand-eye found --mesh
       stitch run other-scanner --arm found
+      stitch run fuselage --memory 4GB
     """
     require_tolerance(tolerance)
     # Loaded by who runs something: whoever asks for help has it at once.
@@ -61,6 +63,7 @@ def run(
         recording=recording,
         mesh=mesh,
         tolerance=tolerance,
+        memory=bytes_of(memory),
         as_json=as_json,
     )
     run_sessions(sessions or [], options)

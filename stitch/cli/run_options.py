@@ -19,5 +19,6 @@ class RunOptions:
     recording: bool = True
     mesh: bool = False
     tolerance: float | None = None
+    memory: float | None = None  # bytes
     as_json: bool = False
     says_next: bool = True  # the last line names the next command; a command that calls this on its way names its own

@@ -34,7 +34,7 @@ from stitch.measurement.capture import Capture
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.session import Scanner, Session, View
-from stitch.observations.surfaces.thinning import thinned
+from stitch.measurement.thinning import thinned
 from stitch.reading.clouds import read_cloud
 
 # Enough points a view to tell conventions.

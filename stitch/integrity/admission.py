@@ -27,7 +27,7 @@ from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
-from stitch.measurement.session import Session
+from stitch.measurement.session import Session, View
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
@@ -131,8 +131,8 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
 
 
 def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
-    name, scan = session.views[found.view].name, own.scans[found.view]
-    return LeftOut(name, stands_off(session, found), own.poses(T_mount)[found.view], len(scan.points))
+    view = session.views[found.view]
+    return LeftOut(view.name, stands_off(session, found), own.poses(T_mount)[found.view], _scanned(view))
 
 
 def _beyond_any_slip(session: Session, found: Snooping) -> bool:
@@ -151,8 +151,12 @@ def _not_belonging(
     for v in found.left_out:
         name = session.views[v].name
         why = next((p.line() for p in problems if name in p.views), "it shares no surface with the others")
-        out.append(LeftOut(name, why, poses[v], len(own.scans[v].points)))
+        out.append(LeftOut(name, why, poses[v], _scanned(session.views[v])))
     return tuple(out)
+
+
+def _scanned(view: View) -> int:
+    return 0 if view.cloud is None else view.cloud.count
 
 
 def _links(session: Session, found: Snooping) -> ViewLinks:

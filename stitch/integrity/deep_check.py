@@ -22,9 +22,9 @@ from stitch.integrity.usual_effects import usual_twists
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
+from stitch.measurement.thinning import thinned
 from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
-from stitch.observations.surfaces.thinning import thinned
 from stitch.stages.coarse import coarse
 from stitch.stages.correct import close_in
 

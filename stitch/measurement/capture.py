@@ -7,9 +7,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, prepare
-from stitch.measurement.session import Session
+from stitch.measurement.scan import Scan, prepare_view
+from stitch.measurement.session import Session, View
 from stitch.measurement.sightings import Sightings, sightings_of
+from stitch.system.threads import parallel
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,13 @@ def capture(session: Session) -> Capture:
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    scans = prepare(session) if session.has_clouds else ()
-    return place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
+    scans = parallel(_prepared, session.views, "preparing scans") if session.has_clouds else ()
+    return place(session.name, tuple(scans), T_base_flange, session.mount, sightings_of(session))
+
+
+def _prepared(view: View) -> Scan:
+    assert view.cloud is not None
+    return prepare_view(view.name, view.cloud.points) if view.cloud.whole is None else view.cloud.whole.scan
 
 
 def place(

@@ -1,8 +1,14 @@
 """One scan as arrays."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.measurement.bounding_box import box_of
+from stitch.measurement.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -12,3 +18,30 @@ class Cloud:
     points: Array  # (N, 3)
     normals: Array | None = None  # (N, 3) if the file has them
     scalars: dict[str, Array] = field(default_factory=dict)  # name -> (N,), e.g. intensity, time
+    whole: "WholeCloud | None" = None  # None: these are all points that were scanned
+
+    @property
+    def count(self) -> int:
+        """How many points were scanned."""
+        return len(self.points) if self.whole is None else self.whole.count
+
+
+@dataclass(frozen=True)
+class WholeCloud:
+    """All points of a scan of which a cloud holds some; they stay where they are, mostly in a file."""
+
+    again: Callable[[], Cloud]  # reads them
+    count: int
+    box: Array  # (2, 3) its lowest and highest corner, scanner frame
+    scan: Scan  # the points that the cloud holds, with the surface of all of them
+
+    def read(self) -> Cloud:
+        """Every point, in the order in which they were scanned.
+
+        Raises:
+            InputError: the file is not what it was.
+        """
+        cloud = self.again()
+        if len(cloud.points) != self.count or not np.array_equal(box_of(cloud.points), self.box):
+            raise InputError(f"the scan of view {self.scan.name} changed on disk during the run; to fix: run again")
+        return cloud

@@ -19,7 +19,7 @@ from stitch.measurement.session import Mount, SensorKind, Session
 from stitch.measurement.views import ScanView, Views, views_of
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
-_SMALLEST_COSINE = 0.1
+SMALLEST_COSINE = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     like = [ScanView(v, views, np.zeros(0), intensity[v], gravity=down[v], size=size) for v in range(views.count)]
     scan_views = [
-        replace(like[v], cosine=np.maximum(scan.confidence, _SMALLEST_COSINE)) for v, scan in enumerate(capture.scans)
+        replace(like[v], cosine=np.maximum(scan.confidence, SMALLEST_COSINE)) for v, scan in enumerate(capture.scans)
     ]
     target_views: list[ScanView] = []
     if capture.sightings is not None:
@@ -133,14 +133,20 @@ def about_part(measurement: Measurement, T_mount: Array) -> Measurement:
     return replace(measurement, scan_views=scan_views, target_views=target_views)
 
 
-def _intensities(session: Session) -> list[Array | None]:
-    """Standardised over the session: (I − Ī)/σ_I."""
+def intensity_scale(session: Session) -> tuple[float, float] | None:
+    """Mean and standard deviation over all points in memory; None where some have none, or all the same."""
     raw = [None if v.cloud is None else v.cloud.scalars.get("intensity") for v in session.views]
     if any(values is None for values in raw):
-        return [None] * len(raw)
+        return None
     everything = np.concatenate([values for values in raw if values is not None])
     # One value that is not finite would spoil the mean of all: intensity then counts as absent, in every view.
     if not np.isfinite(everything).all() or everything.std() <= 0:
-        return [None] * len(raw)
-    spread = float(everything.std())
-    return [None if values is None else (values - everything.mean()) / spread for values in raw]
+        return None
+    return float(everything.mean()), float(everything.std())
+
+
+def _intensities(session: Session) -> list[Array | None]:
+    """Standardised over the session: (I − Ī)/σ_I."""
+    scale = intensity_scale(session)
+    clouds = [None if scale is None else view.cloud for view in session.views]
+    return [None if c is None or scale is None else (c.scalars["intensity"] - scale[0]) / scale[1] for c in clouds]

@@ -7,8 +7,6 @@ import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch.frames import Array, Indices
-from stitch.measurement.session import Session
-from stitch.system.threads import parallel
 
 # Neighbours of the local plane: enough to average the noise, few enough to follow a fillet.
 _PLANE_NEIGHBOURS = 16
@@ -36,13 +34,8 @@ class Scan:
     confidence: Array  # (N,) cosine of incidence
     tree: Any  # pykdtree KDTree over `points`
     spacing: float  # median distance between neighbours
+    scanned_spacing: float  # the same between all points that were scanned, of which these may be some
     noise: float  # 1-sigma across the surface, from the scan itself
-
-
-def prepare(session: Session) -> tuple[Scan, ...]:
-    """Scans of all views of a cloud session, in the order of views.csv."""
-    clouds = [(view.name, view.cloud.points) for view in session.views if view.cloud]
-    return tuple(parallel(lambda item: prepare_view(*item), clouds, "preparing scans"))
 
 
 def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Scan:
@@ -70,9 +63,10 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)
     noise = _noise(points, own[smooth], normals[smooth], tree)
+    spacing = scanned_spacing = float(np.median(distance[:, 1]))
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
-        distance, _ = tree.query(own, k=2)
+        spacing = _spacing(own, tree)
     area = np.pi * radius**2 / neighbours * (len(points) / len(own))
     return Scan(
         name=name,
@@ -82,7 +76,8 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
         area=area,
         confidence=confidence,
         tree=tree,
-        spacing=float(np.median(distance[:, 1])),
+        spacing=spacing,
+        scanned_spacing=scanned_spacing,
         noise=noise,
     )
 
@@ -94,7 +89,6 @@ def sparse(scan: Scan, at_most: int) -> Scan:
     picked = np.linspace(0, len(scan.points) - 1, at_most).astype(int)
     points = np.ascontiguousarray(scan.points[picked])
     tree = KDTree(points, leafsize=16)
-    distance, _ = tree.query(points, k=2)
     return replace(
         scan,
         points=points,
@@ -103,8 +97,13 @@ def sparse(scan: Scan, at_most: int) -> Scan:
         area=scan.area[picked] * (len(scan.points) / at_most),
         confidence=scan.confidence[picked],
         tree=tree,
-        spacing=float(np.median(distance[:, 1])),
+        spacing=_spacing(points, tree),
     )
+
+
+def _spacing(points: Array, tree: Any) -> float:
+    distance, _ = tree.query(points, k=2)
+    return float(np.median(distance[:, 1]))
 
 
 def _planes(centred: Array) -> tuple[Array, Array]:

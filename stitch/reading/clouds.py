@@ -66,11 +66,12 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
     points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64)
     if not len(points):
         raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
-    bad = int((~np.isfinite(points).all(axis=1)).sum())
-    if bad:
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points).all(axis=1)).sum())
         raise InputError(f"{path}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
     # Structured exports write 0 0 0 for a pixel that measured nothing; the scanner's own place has no ray.
-    seen = points.any(axis=1)
+    x, y, z = points.T
+    seen = (x != 0) | (y != 0) | (z != 0)
     if not seen.any():
         raise InputError(
             f"{path}: all {len(points)} points are 0 0 0, nothing was measured; leave this view out of views.csv or "
@@ -81,7 +82,7 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
         if all(name in columns for name in names):
             normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)[seen]
     scalars = {name: np.asarray(column, np.float64)[seen] for name, column in columns.items() if column.ndim == 1}
-    return Cloud(points[seen] * scale, normals, scalars)
+    return Cloud((points if seen.all() else points[seen]) * scale, normals, scalars)
 
 
 def read_ply(path: Path) -> dict[str, Array]:

@@ -38,7 +38,6 @@ def check_scale(session: Session, cloud_unit: str) -> None:
     for view in session.views:
         if view.cloud is not None:
             points = view.cloud.points * metres
-            _require_near(f"view {view.name}", points)
             what = f"{toml}: the points of view {view.name}"
             _refuse(_median_distance(points), (0.0, _RANGE_M), f"{what} lie", "away", "cloud_unit", cloud_unit)
             _refuse(_size(points), _SIZE_M, f"{what} extend over", "", "cloud_unit", cloud_unit)
@@ -63,10 +62,10 @@ def _size(points: Array) -> float:
     return float((high - low).max())
 
 
-def _require_near(what: str, points: Array) -> None:
+def require_near(what: str, points: Array) -> None:
     """Refuse single points that no sensor measures: one of them would stretch every grid over the cloud."""
-    far = np.abs(points).max(axis=1) > _FARTHEST_M
-    if far.any():
+    if np.abs(points).max() > _FARTHEST_M:
+        far = np.abs(points).max(axis=1) > _FARTHEST_M
         raise InputError(
             f"{what}: {far.sum()} of {len(points)} points lie more than {_FARTHEST_M:g} m from the scanner, the first "
             f"is point {int(far.argmax()) + 1}; to fix: remove them from the cloud, or check cloud_unit"

@@ -1,5 +1,7 @@
 """A session folder on disk -> `Session`; every check of input is made here or in the readers it calls."""
 
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -10,26 +12,35 @@ from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.session import Mount, Session, View
+from stitch.measurement.thinning import ENOUGH, points_within, thinned_cloud
 from stitch.reading import session_toml
 from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
-from stitch.reading.plausible import check_scale
+from stitch.reading.plausible import check_scale, require_near
 from stitch.reading.points_csv import read_points, read_targets
 from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
 from stitch.reading.views_csv import Row, read_views, row_at
-from stitch.system.steps import steps
+from stitch.system.threads import parallel
 from stitch.units import METRES
 
 # Fewer points span no surface.
 _FEWEST = 3
 
 
-def load_session(path: Path | str, scans: bool = True, start: Array | None = None) -> Session:
+def load_session(
+    path: Path | str,
+    scans: bool = True,
+    start: Array | None = None,
+    at_most: int | None = ENOUGH,
+    memory: float | None = None,
+) -> Session:
     """Read and check a session folder.
 
     Args:
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
+        at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
+        memory: bytes within which a run of the session has to stay; may be less than `at_most` asks for.
         start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
 
     Raises:
@@ -44,7 +55,11 @@ def load_session(path: Path | str, scans: bool = True, start: Array | None = Non
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
     sightings = _sightings(path, [row.name for row in rows]) if scans else {}
-    views = _views(path, rows, METRES[cloud_unit] / METRES[unit] if scans else None, sightings)
+    if memory is not None:
+        at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
+    read = partial(_cloud, path, scale=METRES[cloud_unit] / METRES[unit], metres=METRES[unit], at_most=at_most)
+    clouds = parallel(read, rows, "reading scans") if scans else [None] * len(rows)
+    views = _views(path, rows, clouds, sightings, scans)
     cad, cad_unit = session_toml.cad(file, document.get("part", {}))
     session = Session(
         path=path,
@@ -96,16 +111,13 @@ def _nominal(path: Path, sightings: dict[str, Sighting]) -> Nominal | None:
     return read_targets(file, sorted({name for s in sightings.values() for name in s.targets}))
 
 
-def _views(path: Path, rows: list[Row], scale: float | None, sightings: dict[str, Sighting]) -> tuple[View, ...]:
-    """The rows with what was seen; without a scale for the clouds, nothing is."""
+def _views(
+    path: Path, rows: list[Row], clouds: Iterable[Cloud | None], sightings: dict[str, Sighting], scans: bool
+) -> tuple[View, ...]:
+    """The rows with what was seen."""
     views = []
-    for row in steps("reading scans", rows):
-        cloud = None
-        if scale is None:
-            pass
-        elif row.cloud:
-            cloud = _cloud(path, row, scale)
-        elif not sightings:
+    for row, cloud in zip(rows, clouds, strict=True):
+        if scans and cloud is None and not sightings:
             raise InputError(
                 f"{path / 'views.csv'} line {row.line}: view {row.name} names no cloud; fill the column "
                 "cloud, or put points.csv or frames.csv beside it"
@@ -125,7 +137,9 @@ def _views(path: Path, rows: list[Row], scale: float | None, sightings: dict[str
     return tuple(views)
 
 
-def _cloud(path: Path, row: Row, scale: float) -> Cloud:
+def _cloud(path: Path, row: Row, scale: float, metres: float, at_most: int | None) -> Cloud | None:
+    if not row.cloud:
+        return None
     file = path / row.cloud
     try:
         cloud = read_cloud(file, scale)
@@ -134,6 +148,8 @@ def _cloud(path: Path, row: Row, scale: float) -> Cloud:
                 f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
                 "it again"
             )
+        # Looked at before some are taken: each of them will be fused.
+        require_near(str(file), cloud.points * metres)
     except InputError as error:
         raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-    return cloud
+    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read_cloud, file, scale))

@@ -7,6 +7,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.observations.surfaces.noise_floor import noise_floor
@@ -16,7 +17,8 @@ from stitch.observations.targets.target_fit import TargetFit, rms_of
 from stitch.runs.recorder import Recorder, Silent
 from stitch.runs.run import FusedCloud, StageResult
 from stitch.stages.correction import Correction
-from stitch.stages.fuse import fuse, view_residuals
+from stitch.stages.fuse import view_residuals
+from stitch.stages.fuse_whole import Registered, fuse_every_point
 from stitch.stages.register import register
 from stitch.stages.register_targets import register_targets
 from stitch.stages.sentences import correct_note, surface_sentence, target_sentence
@@ -50,9 +52,20 @@ class Finished:
 
 
 def finish_surfaces(
-    session: Session, correction: Correction, index: int, before: StageResult, recorder: Recorder, seconds: float
+    session: Session,
+    measurement: Measurement,
+    correction: Correction,
+    *,
+    index: int,
+    before: StageResult,
+    recorder: Recorder,
+    seconds: float,
 ) -> Finished:
-    """Register and fuse session `index` of a rig under the common model, and show it to the recorder."""
+    """Register and fuse session `index` of a rig under the common model, and show it to the recorder.
+
+    Raises:
+        InputError: a scan changed on disk since it was read.
+    """
     clock = Clock()
     own, overlaps = correction.captures[index], correction.overlaps[index]
     scatter = correction.hand_eye.repeatability[index]
@@ -64,7 +77,7 @@ def finish_surfaces(
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index].poses)
     final, iterations = registration.overlaps.gram, len(registration.history)
     registered = StageResult("register", final.rms, int(final.count.sum()), iterations, clock.lap())
-    fused = fuse(own, registration.poses)
+    fused = fuse_every_point(Registered(session, measurement, correction.model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
     show(recorder, registered, own, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)

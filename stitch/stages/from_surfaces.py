@@ -122,7 +122,15 @@ def finish(
 ) -> Finished:
     """Register and fuse session `index` under the common model."""
     assert fitted.correction is not None
-    return finish_surfaces(session, fitted.correction, index, before, recorder, seconds)
+    return finish_surfaces(
+        session,
+        fitted.sessions[index].measurement,
+        fitted.correction,
+        index=index,
+        before=before,
+        recorder=recorder,
+        seconds=seconds,
+    )
 
 
 def notes(session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[str, ...]:

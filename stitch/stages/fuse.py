@@ -1,6 +1,7 @@
 """Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +15,16 @@ from stitch.runs.run import FusedCloud
 _EDGE_WEIGHT = 0.05
 
 
+@dataclass(frozen=True)
+class PlacedPoints:
+    """Points of registered views in the reference frame."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3)
+    weight: Array  # (N,)
+    view: Indices  # (N,)
+
+
 def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
     """Average all views in cells of `cell` (default: the scans' spacing), in the reference frame.
 
@@ -21,7 +32,12 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    cells = _Cells(capture.scans, poses, cell or capture.spacing)
+    return fused(_placed(capture.scans, poses), cell or capture.spacing)
+
+
+def fused(placed: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
+    """The same of placed points, in the order of cells along `axis`; the grid is the reference frame's own."""
+    cells = _Cells(placed, cell, axis)
     points, normals, _weight = cells.mean()
     view_cell, offset, view_weight = cells.view_means(points, normals)
     count = np.bincount(view_cell, minlength=len(points))
@@ -37,55 +53,68 @@ def view_residuals(capture: Capture, poses: Array, cell: float) -> list[Array]:
     Args:
         cell: grid size; wide enough to hold the step between the views.
     """
-    cells = _Cells(capture.scans, poses, cell)
+    cells = _Cells(_placed(capture.scans, poses), cell)
     points, normals, weight = cells.mean()
     own_points, own_weight = cells.own()
     rest = weight[cells.cell] - own_weight
     with np.errstate(invalid="ignore", divide="ignore"):
         others = (points[cells.cell] * weight[cells.cell][:, None] - own_points) / rest[:, None]
-        signed = np.einsum("ij,ij->i", cells.points - others, normals[cells.cell])
+        signed = np.einsum("ij,ij->i", cells.placed.points - others, normals[cells.cell])
     signed[rest <= 1e-9 * weight[cells.cell]] = np.nan
     return np.split(signed, np.cumsum([len(scan.points) for scan in capture.scans])[:-1])
 
 
-class _Cells:
-    """All points in the reference frame with the grid cell of each."""
+def weights(confidence: Array, usable: Array) -> Array:
+    """(N,) what points count by their cosine of incidence, and by whether they lie on a smooth surface."""
+    return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
 
-    def __init__(self, scans: Sequence[Scan], poses: Array, size: float) -> None:
-        pairs = list(zip(scans, poses, strict=True))
-        self.points = np.concatenate([frames.transform(T, s.points) for s, T in pairs])
-        self.normals = np.concatenate([frames.rotate(T, s.normals) for s, T in pairs])
-        self.weight = np.concatenate([s.confidence**2 * np.where(s.usable, 1.0, _EDGE_WEIGHT) for s in scans])
-        self.view = np.repeat(np.arange(len(scans)), [len(s.points) for s in scans])
-        self.views = len(scans)
-        index = np.floor((self.points - self.points.min(axis=0)) / size).astype(np.int64)
+
+def _placed(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
+    pairs = list(zip(scans, poses, strict=True))
+    return PlacedPoints(
+        np.concatenate([frames.transform(T, s.points) for s, T in pairs]),
+        np.concatenate([frames.rotate(T, s.normals) for s, T in pairs]),
+        np.concatenate([weights(s.confidence, s.usable) for s in scans]),
+        np.repeat(np.arange(len(scans)), [len(s.points) for s in scans]),
+    )
+
+
+class _Cells:
+    """Placed points with the grid cell of each."""
+
+    def __init__(self, placed: PlacedPoints, size: float, axis: int = 0) -> None:
+        self.placed = placed
+        self.views = int(placed.view.max()) + 1
+        index = np.floor(placed.points / size).astype(np.int64)
+        index -= index.min(axis=0)
+        order = [axis, *(i for i in range(3) if i != axis)]
         shape = index.max(axis=0) + 1
-        key = np.ravel_multi_index(tuple(index.T), tuple(shape))
+        key = np.ravel_multi_index(tuple(index.T[order]), tuple(shape[order]))
         _, self.cell = np.unique(key, return_inverse=True)
         self.cells = int(self.cell.max()) + 1
 
     def mean(self) -> tuple[Array, Array, Array]:
         """Weighted mean points and unit normals (C, 3), and total weight (C,)."""
-        weight = np.bincount(self.cell, self.weight, self.cells)
-        points = self._sum(self.cell, self.points, self.cells) / weight[:, None]
-        normals = self._sum(self.cell, self.normals, self.cells)
+        weight = np.bincount(self.cell, self.placed.weight, self.cells)
+        points = self._sum(self.cell, self.placed.points, self.cells) / weight[:, None]
+        normals = self._sum(self.cell, self.placed.normals, self.cells)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return points, normals / np.maximum(length, 1e-12), np.asarray(weight, float)
 
     def own(self) -> tuple[Array, Array]:
         """Per point: weighted sum of points (N, 3) and weight (N,) of its own view in its cell."""
-        _, group = np.unique(self.cell * self.views + self.view, return_inverse=True)
+        _, group = np.unique(self.cell * self.views + self.placed.view, return_inverse=True)
         size = int(group.max()) + 1
-        weight: Array = np.asarray(np.bincount(group, self.weight, size), float)
-        return self._sum(group, self.points, size)[group], weight[group]
+        weight: Array = np.asarray(np.bincount(group, self.placed.weight, size), float)
+        return self._sum(group, self.placed.points, size)[group], weight[group]
 
     def view_means(self, points: Array, normals: Array) -> tuple[Indices, Array, Array]:
         """Per (cell, view): its cell, the mean offset along the cell's normal, and its weight."""
-        offset = np.einsum("ij,ij->i", self.points - points[self.cell], normals[self.cell])
-        key, group = np.unique(self.cell * self.views + self.view, return_inverse=True)
-        weight: Array = np.asarray(np.bincount(group, self.weight, len(key)), float)
-        mean: Array = np.bincount(group, self.weight * offset, len(key)) / weight
+        offset = np.einsum("ij,ij->i", self.placed.points - points[self.cell], normals[self.cell])
+        key, group = np.unique(self.cell * self.views + self.placed.view, return_inverse=True)
+        weight: Array = np.asarray(np.bincount(group, self.placed.weight, len(key)), float)
+        mean: Array = np.bincount(group, self.placed.weight * offset, len(key)) / weight
         return np.asarray(key // self.views, np.int64), mean, weight
 
     def _sum(self, group: Indices, values: Array, size: int) -> Array:
-        return np.stack([np.bincount(group, self.weight * values[:, i], size) for i in range(3)], axis=1)
+        return np.stack([np.bincount(group, self.placed.weight * values[:, i], size) for i in range(3)], axis=1)

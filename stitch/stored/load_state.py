@@ -10,7 +10,6 @@ from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import about_part, measurement_of
 from stitch.model.bound import bound
 from stitch.model.forward import corrected
-from stitch.observations.surfaces.thinning import thinned
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.runs.state import State
@@ -21,8 +20,8 @@ from stitch.system.threads import library_threads_off
 from stitch.writing.target_rows import as_counted
 
 
-def load_state(folder: Path, effects_file: Path | None = None, thin: bool = False, trust: bool = False) -> State:
-    """The state of a run folder; its session is read again, for questions about poses with thinned scans.
+def load_state(folder: Path, effects_file: Path | None = None, trust: bool = False) -> State:
+    """The state of a run folder; its session is read again.
 
     Args:
         trust: run the Python file of effects that the model names.
@@ -38,8 +37,7 @@ def load_state(folder: Path, effects_file: Path | None = None, thin: bool = Fals
         raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
     session = load_session(path)
     with library_threads_off():
-        session, scans = thinned(session) if thin and session.has_clouds else (session, capture(session))
-        measurement = about_part(measurement_of(session, scans), file.T_mount_coarse)
+        measurement = about_part(measurement_of(session, capture(session)), file.T_mount_coarse)
         left_out, links = left_out_of(document)
         gone = [v for v, view in enumerate(session.views) if view.name in {item.view for item in left_out}]
         session, measurement = session.without([item.view for item in left_out]), measurement.without(gone)

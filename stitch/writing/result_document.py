@@ -83,7 +83,7 @@ def result_document(run: Run) -> dict[str, Any]:
 def points_of(view: View) -> int:
     """Number of points that a view shows, of its cloud and by name."""
     labelled = 0 if view.sighting is None else len(view.sighting.targets)
-    return labelled + (0 if view.cloud is None else len(view.cloud.points))
+    return labelled + (0 if view.cloud is None else view.cloud.count)
 
 
 def ledger(run: Run) -> list[dict[str, Any]]:

@@ -18,19 +18,27 @@ from stitch.writing.target_rows import residual_columns
 
 _Value = TypeVar("_Value")
 
+# Rows that are in memory at a time.
+_ROWS = 1_000_000
 _PLACE = ("x", "y", "z", "nx", "ny", "nz")
 _OWN = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
-    """Binary PLY with normals, `residual` and `count`."""
+    """Binary PLY with normals, `residual` and `count`; of a cloud in a file never more than a part is in memory."""
     names = ("x", "y", "z", "nx", "ny", "nz", "residual")
-    columns = np.column_stack([cloud.points, cloud.normals, cloud.residual])
-    vertex = np.empty(len(cloud.points), [(name, "<f4") for name in names] + [("count", "<u2")])
-    for name, column in zip(names, columns.T, strict=True):
-        vertex[name] = column
-    vertex["count"] = cloud.count
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    layout = np.dtype([(name, "<f4") for name in names] + [("count", "<u2")])
+    header = PlyData([PlyElement.describe(np.empty(0, layout), "vertex")], byte_order="<").header
+    with path.open("wb") as out:
+        out.write(header.replace("vertex 0", f"vertex {len(cloud.points)}").encode() + b"\n")
+        for start in range(0, len(cloud.points), _ROWS):
+            part = slice(start, start + _ROWS)
+            columns = np.column_stack([cloud.points[part], cloud.normals[part], cloud.residual[part]])
+            vertex = np.empty(len(columns), layout)
+            for name, column in zip(names, columns.T, strict=True):
+                vertex[name] = column
+            vertex["count"] = cloud.count[part]
+            vertex.tofile(out)
 
 
 def write_residuals(run: Run, path: Path) -> None:

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_synth.fixtures.edits import edit
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.errors import InputError
+from stitch.reading.clouds import read_cloud
 from stitch.reading.plausible import check_scale
 from stitch.reading.session_folder import load_session
 
@@ -49,7 +51,10 @@ def test_another_unit_is_refused(right, factor):
 
 
 def test_one_stray_point_is_named(session):
-    loaded = load_session(session)
-    loaded.views[1].cloud.points[7, 2] = 1e30
-    with pytest.raises(InputError, match=r"view v001: 1 of \d+ points lie more than 1000 m .* point 8; to fix"):
-        check_scale(loaded, "mm")
+    file = sorted((session / "clouds").iterdir())[1]
+    points = read_cloud(file).points
+    points[7, 2] = 1e30
+    np.savetxt(file.with_suffix(".xyz"), points)
+    edit(session / "views.csv", file.name, file.with_suffix(".xyz").name)
+    with pytest.raises(InputError, match=r"view v001 .* 1 of \d+ points lie more than 1000 m .* point 8; to fix"):
+        load_session(session)

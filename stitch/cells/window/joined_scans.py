@@ -100,7 +100,7 @@ def read_session(folder: Path, hand_eye: Path) -> Placed:
     Raises:
         InputError: session or hand-eye is missing or malformed, or they do not belong together.
     """
-    session = load_session(folder)
+    session = load_session(folder, at_most=None)
     if session.mount != "eye_in_hand":
         raise InputError(f"{folder / 'session.toml'}: mount is {session.mount!r}; the scanner must ride on the flange")
     clouds = []

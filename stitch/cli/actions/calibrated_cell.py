@@ -29,7 +29,7 @@ def calibrated_by_sphere(session: Path, radius_free: bool, output: Path | None, 
     Raises:
         InputError, NoResultError: as `stitch calibrate sphere` ends.
     """
-    loaded = load_session(session)
+    loaded = load_session(session, at_most=None)
     document = document_of(calibrate_sphere(loaded, radius_free), loaded)
     if output is not None:
         write_json(document, output)

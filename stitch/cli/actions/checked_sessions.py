@@ -70,7 +70,7 @@ def summary(session: Session) -> dict[str, object]:
         "mount": session.mount,
         "length_unit": session.length_unit,
         "views": len(session.views),
-        "points": int(sum(len(points) for points in clouds)),
+        "points": sum(view.cloud.count for view in session.views if view.cloud is not None),
         "targets": len({name for view in session.views if view.sighting for name in view.sighting.targets}),
         "sightings": sum(len(view.sighting.targets) for view in session.views if view.sighting),
         "median_range": round(float(np.median(ranges)), 3) if ranges else None,

@@ -28,7 +28,7 @@ def compared_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: 
         InputError, NoResultError: as `stitch compare` ends.
     """
     with held(run):
-        state = load_state(run, effects_file, thin=True, trust=trust)
+        state = load_state(run, effects_file, trust=trust)
         found = write_comparison(state, run)
     if as_json:
         emit(to_json(comparison_document(found)))

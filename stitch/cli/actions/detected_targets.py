@@ -29,7 +29,7 @@ def detected_targets(
         raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
     if output is not None and (output.exists() or output.is_symlink()):
         raise InputError(f"{output}: exists already; to fix: remove it, or name another file")
-    loaded = load_session(session)
+    loaded = load_session(session, at_most=None)
     found, notes = targets_in(scans_of(loaded), wanted)
     views = [view.name for view in loaded.views]
     columns = points_columns(views, found)

@@ -67,7 +67,7 @@ def _nothing_next(found: Diagnosis) -> str:
 
 def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
     with held(run):
-        state = load_state(run, effects_file, thin=True, trust=trust)
+        state = load_state(run, effects_file, trust=trust)
         found = diagnose(state)
         return found, write_diagnosis(found, state, run), state.session.length_unit
 

@@ -19,7 +19,7 @@ def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, 
     Raises:
         InputError, NoResultError: as `stitch explain` ends.
     """
-    state = load_state(run, effects_file, thin=True, trust=trust)
+    state = load_state(run, effects_file, trust=trust)
     if NAME in state.model.effects:
         raise InputError(
             f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"

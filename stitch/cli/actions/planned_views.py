@@ -81,7 +81,7 @@ def _cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, Pl
         odd = next((f"--{name}" for name, value in vars(stated).items() if value is not None), None)
         if odd is not None:
             raise InputError(f"{odd}: {folder} is a run, which knows that; to fix: leave {odd} out")
-        state = load_state(folder, thin=True, trust=trust)
+        state = load_state(folder, trust=trust)
         return state.session, cell_of_run(state, folder)
     start = None
     if stated.start is not None:

@@ -35,7 +35,8 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
         known(name)
     here = not sessions
     sessions = sessions or [_here()]
-    loaded = [load_session(path) for path in sessions]
+    memory = None if asked.memory is None else asked.memory / len(sessions)
+    loaded = [load_session(path, memory=memory) for path in sessions]
     names = _names(loaded)
     target = asked.output or Path("../runs" if here else "runs") / "+".join(names)
     model, kept, own_effects = _given(asked)

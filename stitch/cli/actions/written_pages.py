@@ -32,9 +32,8 @@ def page_of_one(
         state = load_state(run, effects_file, trust=trust)
         run_folder.extend("stitch.reports", stored_run(run, state), page, tolerance)
         if with_diagnosis:
-            thin = load_state(run, effects_file, thin=True, trust=trust)
-            write_comparison(thin, run)
-            write_diagnosis(diagnose(thin), thin, run)
+            write_comparison(state, run)
+            write_diagnosis(diagnose(state), state, run)
         _told(_printed(page, printer))
 
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.frames import Array, Indices
+from stitch.measurement.bounding_box import box_of, corners
 from stitch.measurement.scan import Scan
 from stitch.system.threads import parallel
 
@@ -62,8 +62,17 @@ def overlapping_pairs(
                     return True
         return False
 
-    pairs = list(combinations(range(len(scans)), 2))
+    pairs = _near(scans, poses, gate)
     return [pair for pair, meets in zip(pairs, parallel(overlap, pairs), strict=True) if meets]
+
+
+def _near(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
+    """Pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
+    placed = [frames.transform(T, corners(box_of(scan.points))) for scan, T in zip(scans, poses, strict=True)]
+    low, high = np.min(placed, axis=1), np.max(placed, axis=1)
+    apart = (low[:, None] - high[None] > gate).any(axis=2)
+    v, w = np.nonzero(np.triu(~(apart | apart.T), 1))
+    return list(zip(v.tolist(), w.tolist(), strict=True))
 
 
 def match(

@@ -1,0 +1,147 @@
+"""Fuse scans of which memory holds only some points: every point read once more, slab by slab of the part.
+
+The slabs end where cells of the grid end, so that what comes out does not depend on how many there are. A point takes
+normal and edge from the nearest one in memory, whose surface was that of all points.
+"""
+
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array, Indices
+from stitch.measurement.bounding_box import corners
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import SMALLEST_COSINE, Measurement, intensity_scale
+from stitch.measurement.session import Session
+from stitch.model.forward import moves_points, undone
+from stitch.model.model import Model
+from stitch.runs.run import FusedCloud
+from stitch.stages.fuse import PlacedPoints, fuse, fused, weights
+from stitch.system.threads import parallel
+
+# Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
+_SLAB = 2_500_000
+# Effects of scanner and part move a point by less than this share of the view's size.
+_MOVED = 0.02
+_ROW = np.dtype([("points", "f8", 3), ("normals", "f8", 3), ("residual", "f8"), ("count", "i4")])
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A session under its model, with single views registered."""
+
+    session: Session
+    measurement: Measurement  # with the effects in use
+    model: Model
+    own: Capture  # without them
+    poses: Array  # (V, 4, 4) T_reference_scanner
+
+
+def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
+    """Fuse all points that were scanned, those in memory and those in files.
+
+    Args:
+        slab: points that are fused at a time; with more of them the result is held in a file without a name.
+
+    Raises:
+        InputError: a scan is not what it was when it was read.
+    """
+    session, own, poses = registered.session, registered.own, registered.poses
+    cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
+    if all(view.cloud is None or view.cloud.whole is None for view in session.views):
+        return fuse(own, poses, cell)
+    ends, axis = _slabs(registered, cell, slab)
+
+    def of_slab(bounds: tuple[float, float]) -> FusedCloud | None:
+        low, high = (cell * number for number in bounds)
+        parts = [_within(registered, v, axis, low, high) for v in range(len(own.scans))]
+        placed = PlacedPoints(*(np.concatenate([getattr(p, name) for p in parts]) for name in _PLACED))
+        return fused(placed, cell, axis) if len(placed.points) else None
+
+    clouds = parallel(of_slab, pairwise(ends), "fusing slabs")
+    return _held((cloud for cloud in clouds if cloud is not None), len(ends) > 2)
+
+
+_PLACED = ("points", "normals", "weight", "view")
+
+
+def _slabs(registered: Registered, cell: float, slab: int) -> tuple[list[float], int]:
+    """Numbers of cells at which slabs end along the part's longest axis, and that axis."""
+    own, poses = registered.own, registered.poses
+    placed = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
+    low, high = (f([f(p, axis=0) for p in placed], axis=0) for f in (np.min, np.max))
+    axis = int(np.argmax(high - low))
+    first = np.floor(low[axis] / cell)
+    share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
+    length = int(np.floor(high[axis] / cell) - first) + 1
+    along = np.zeros(length)
+    for points, per_point in zip(placed, share, strict=True):
+        along += per_point * np.bincount((np.floor(points[:, axis] / cell) - first).astype(np.int64), minlength=length)
+    number = np.floor((np.cumsum(along) - along / 2) / slab)
+    ends = first + np.flatnonzero(np.diff(number) > 0) + 1
+    return [-np.inf, *ends.tolist(), np.inf], axis
+
+
+def _within(registered: Registered, v: int, axis: int, low: float, high: float) -> PlacedPoints:
+    """Points of view v between two planes of the reference frame, with the view's number."""
+    T, cloud, scan = registered.poses[v], registered.session.views[v].cloud, registered.own.scans[v]
+    whole = None if cloud is None else cloud.whole
+    if whole is None:
+        points, normals, weight = scan.points, scan.normals, weights(scan.confidence, scan.usable)
+    else:
+        ends = frames.transform(T, corners(whole.box))[:, axis]
+        margin = _MOVED * float(np.ptp(whole.box, axis=0).max())
+        if ends.max() + margin < low or ends.min() - margin > high:
+            return _nothing()
+        every = whole.read()
+        height = frames.transform(T, every.points)[:, axis]
+        near = np.flatnonzero((height >= low - margin) & (height < high + margin))
+        points, normals, weight = _surface(registered, v, every.points[near], every.scalars, near)
+    placed = frames.transform(T, points)
+    keep = (placed[:, axis] >= low) & (placed[:, axis] < high)
+    return PlacedPoints(placed[keep], frames.rotate(T, normals[keep]), weight[keep], np.full(keep.sum(), v))
+
+
+def _surface(
+    registered: Registered, v: int, points: Array, scalars: dict[str, Array], index: Indices
+) -> tuple[Array, Array, Array]:
+    """Points (N, 3) of view v, scanner frame, without the effects in use; their normals (N, 3) and weights (N,)."""
+    scan = registered.measurement.capture.scans[v]
+    _, nearest = scan.tree.query(points, k=1)
+    normals = scan.normals[nearest]
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    confidence = np.abs(np.einsum("ij,ij->i", normals, ray))
+    terms = registered.model.terms
+    if moves_points(terms):
+        scale = intensity_scale(registered.session)
+        view = replace(
+            registered.measurement.scan_views[v],
+            cosine=np.maximum(confidence, SMALLEST_COSINE),
+            intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
+        )
+        points = points + undone(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
+    return points, normals, weights(confidence, scan.usable[nearest])
+
+
+def _nothing() -> PlacedPoints:
+    return PlacedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+
+
+def _held(clouds: Iterable[FusedCloud], in_file: bool) -> FusedCloud:
+    """The slabs one after the other, in memory or in a file that goes with the process."""
+    if not in_file:
+        return next(iter(clouds))
+    file = tempfile.TemporaryFile()  # noqa: SIM115  # the map holds it
+    count = 0
+    for cloud in clouds:
+        rows = np.empty(len(cloud.points), _ROW)
+        for name in _ROW.names or ():
+            rows[name] = getattr(cloud, name)
+        rows.tofile(file)
+        count += len(rows)
+    held = np.memmap(file, _ROW, "r", shape=(count,))
+    return FusedCloud(held["points"], held["normals"], held["residual"], held["count"])
