@@ -23,10 +23,10 @@ def main() -> None:
     for name in parser.parse_args().parts:
         lines = PARTS[name]()
         print("\n".join(lines), flush=True)
-        _into_page(name, lines)
+        into_page(name, lines)
 
 
-def _into_page(name: str, lines: list[str]) -> None:
+def into_page(name: str, lines: list[str]) -> None:
     """Put a table between its marks."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)

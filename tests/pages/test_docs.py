@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import stitch
+from stitch.system import threads
 from stitch.writing.run_folder import write_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,6 +102,7 @@ def test_a_cloud_walks_as_the_page_says(session, tmp_path):
         if event == "call" and (place := (frame.f_code.co_name, frame.f_code.co_filename)) in places:
             seen.append(place)
 
+    threads._pool.cache_clear()  # only threads that begin now are watched
     threading.setprofile(watch)
     sys.setprofile(watch)
     try:
