@@ -26,12 +26,12 @@ def main() -> None:
         into_page(name, lines)
 
 
-def into_page(name: str, lines: list[str]) -> None:
+def into_page(name: str, lines: list[str], page: Path = PAGE) -> None:
     """Put a table between its marks."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+    head, _, rest = page.read_text(encoding="utf-8").partition(begin)
     tail = rest.partition(end)[2]
-    PAGE.write_text("\n".join([head + begin, "", *lines, "", end]) + tail, encoding="utf-8")
+    page.write_text("\n".join([head + begin, "", *lines, "", end]) + tail, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Run: python bench/large.py FOLDER [--most 2e8]; panels of `large_panel.py` are written into FOLDER (30 MB
 for a view of a million points) and kept; a row for each run is appended to FOLDER/large.jsonl, and the tables go into
-docs/scale.md. A run that stands there is not repeated.
+docs/large-sessions.md. A run that stands there is not repeated.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from large_panel import distance, write_panel
 from plyfile import PlyData
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "large-sessions.md"
 _VIEWS, _POINTS = (10, 30, 100, 300), (10_000, 100_000, 1_000_000, 10_000_000)
 # Views at which points grow, and points at which views grow; the largest of both.
 _AT_VIEWS, _AT_POINTS = 18, 20_000
@@ -114,7 +115,7 @@ def main() -> None:
     if _LARGEST in known:
         lines += ["**More of both**", "", *table([known[_LARGEST]])]
     print("\n".join(lines))
-    into_page("large", lines)
+    into_page("large", lines, PAGE)
 
 
 if __name__ == "__main__":
