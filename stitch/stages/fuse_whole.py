@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from stitch import frames
+from stitch.errors import InputError
 from stitch.frames import Array, Indices
 from stitch.measurement.bounding_box import corners
 from stitch.measurement.capture import Capture
@@ -48,7 +49,7 @@ def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
         slab: points that are fused at a time; with more of them the result is held in a file without a name.
 
     Raises:
-        InputError: a scan is not what it was when it was read.
+        InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
     """
     session, own, poses = registered.session, registered.own, registered.poses
     cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
@@ -141,7 +142,13 @@ def _held(clouds: Iterable[FusedCloud], in_file: bool) -> FusedCloud:
         rows = np.empty(len(cloud.points), _ROW)
         for name in _ROW.names or ():
             rows[name] = getattr(cloud, name)
-        rows.tofile(file)
+        try:
+            rows.tofile(file)
+        except OSError:
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for the fused cloud, {_ROW.itemsize} bytes a point; to fix: make "
+                "room, or name another folder in the environment variable TMPDIR"
+            ) from None
         count += len(rows)
     held = np.memmap(file, _ROW, "r", shape=(count,))
     return FusedCloud(held["points"], held["normals"], held["residual"], held["count"])

@@ -1,6 +1,7 @@
 """check, run and batch: exit codes, and folders that stay as they are."""
 
 import json
+import re
 
 import pytest
 
@@ -50,3 +51,19 @@ def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path, capsys):
         main(["batch", str(tmp_path / "nowhere"), "-o", str(tmp_path / "runs")])
     assert ended.value.code == 2
     assert "nowhere" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        ("much", "--memory much: to fix: give a size such as 2GB"),
+        ("1GB", r"memory: 1 GB are too little for a run of 3 views; to fix: give 1\.3 GB"),
+        ("900 MiB", "memory: 0.9 GB are too little"),
+    ],
+)
+def test_memory_that_is_no_size_or_too_little_is_refused(session, tmp_path, capsys, size, said):
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(tmp_path / "r"), "--memory", size])
+    assert ended.value.code == 2
+    assert re.search(said, capsys.readouterr().err)
+    assert not (tmp_path / "r").exists()
