@@ -11,6 +11,7 @@ from stitch.comparison.patches import Patches
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.runs.run import FusedCloud
+from stitch.system.mapped_file import release
 from stitch.writing.mesh import TriangleMesh, mesh_of
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
@@ -79,11 +80,11 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
 def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     """(N, 3) mean points and unit normals of cells, both sides of a sheet apart."""
     some = np.linspace(0, len(fused.points) - 1, min(len(fused.points), _POINTS)).astype(np.int64)
-    once = fused.count[some] < 2
+    once = _of(some, fused.count) < 2
     # Where views meet almost everywhere, what one view alone saw are its flying points.
     keep = ~once | (once.mean() > _FLYING)
     # As stitched.ply holds them: a page that is made anew is the same.
-    points, normals = (x[some][keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
+    points, normals = (_of(some, x)[keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
     size = float(np.ptp(points, axis=0).max()) / _FINENESS
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))
@@ -91,6 +92,13 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     count = np.bincount(group)[:, None]
     point, normal = (np.stack([np.bincount(group, x) for x in v.T], axis=1) / count for v in (points, normals))
     return point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+
+
+def _of(some: Indices, values: Array) -> Array:
+    """Some rows; what was read for them of a cloud that is held in a file is given back."""
+    out = values[some]
+    release(values)
+    return np.asarray(out)
 
 
 def vertex_normals(vertices: Array, triangles: Indices) -> Array:

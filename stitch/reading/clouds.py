@@ -82,7 +82,8 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
         if all(name in columns for name in names):
             normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)[seen]
     scalars = {name: np.asarray(column, np.float64)[seen] for name, column in columns.items() if column.ndim == 1}
-    return Cloud((points if seen.all() else points[seen]) * scale, normals, scalars)
+    points = points if seen.all() else points[seen]
+    return Cloud(points if scale == 1.0 else points * scale, normals, scalars)
 
 
 def read_ply(path: Path) -> dict[str, Array]:

@@ -4,15 +4,12 @@ The slabs end where cells of the grid end, so that what comes out does not depen
 normal and edge from the nearest one in memory, whose surface was that of all points.
 """
 
-import tempfile
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
 
 from stitch import frames
-from stitch.errors import InputError
 from stitch.frames import Array, Indices
 from stitch.measurement.bounding_box import corners
 from stitch.measurement.capture import Capture
@@ -22,13 +19,13 @@ from stitch.model.forward import moves_points, undone
 from stitch.model.model import Model
 from stitch.runs.run import FusedCloud
 from stitch.stages.fuse import PlacedPoints, fuse, fused, weights
+from stitch.system.mapped_file import mapped
 from stitch.system.threads import parallel
 
 # Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
 _SLAB = 2_500_000
 # Effects of scanner and part move a point by less than this share of the view's size.
 _MOVED = 0.02
-_ROW = np.dtype([("points", "f8", 3), ("normals", "f8", 3), ("residual", "f8"), ("count", "i4")])
 
 
 @dataclass(frozen=True)
@@ -60,14 +57,14 @@ def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
     def of_slab(bounds: tuple[float, float]) -> FusedCloud | None:
         low, high = (cell * number for number in bounds)
         parts = [_within(registered, v, axis, low, high) for v in range(len(own.scans))]
-        placed = PlacedPoints(*(np.concatenate([getattr(p, name) for p in parts]) for name in _PLACED))
+        placed = PlacedPoints(
+            **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PlacedPoints)}
+        )
         return fused(placed, cell, axis) if len(placed.points) else None
 
     clouds = parallel(of_slab, pairwise(ends), "fusing slabs")
-    return _held((cloud for cloud in clouds if cloud is not None), len(ends) > 2)
-
-
-_PLACED = ("points", "normals", "weight", "view")
+    found = (cloud for cloud in clouds if cloud is not None)
+    return next(found) if len(ends) == 2 else FusedCloud(**mapped(vars(cloud) for cloud in found))
 
 
 def _slabs(registered: Registered, cell: float, slab: int) -> tuple[list[float], int]:
@@ -130,25 +127,3 @@ def _surface(
 
 def _nothing() -> PlacedPoints:
     return PlacedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
-
-
-def _held(clouds: Iterable[FusedCloud], in_file: bool) -> FusedCloud:
-    """The slabs one after the other, in memory or in a file that goes with the process."""
-    if not in_file:
-        return next(iter(clouds))
-    file = tempfile.TemporaryFile()  # noqa: SIM115  # the map holds it
-    count = 0
-    for cloud in clouds:
-        rows = np.empty(len(cloud.points), _ROW)
-        for name in _ROW.names or ():
-            rows[name] = getattr(cloud, name)
-        try:
-            rows.tofile(file)
-        except OSError:
-            raise InputError(
-                f"{tempfile.gettempdir()}: no room for the fused cloud, {_ROW.itemsize} bytes a point; to fix: make "
-                "room, or name another folder in the environment variable TMPDIR"
-            ) from None
-        count += len(rows)
-    held = np.memmap(file, _ROW, "r", shape=(count,))
-    return FusedCloud(held["points"], held["normals"], held["residual"], held["count"])

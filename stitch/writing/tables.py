@@ -14,6 +14,7 @@ from stitch.frames import Array
 from stitch.measurement.session import Session, View
 from stitch.observations.surfaces.match import Match
 from stitch.runs.run import FusedCloud, Run
+from stitch.system.mapped_file import release
 from stitch.writing.target_rows import residual_columns
 
 _Value = TypeVar("_Value")
@@ -39,6 +40,8 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
                 vertex[name] = column
             vertex["count"] = cloud.count[part]
             vertex.tofile(out)
+            for values in vars(cloud).values():
+                release(values)
 
 
 def write_residuals(run: Run, path: Path) -> None:

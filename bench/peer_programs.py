@@ -1,0 +1,96 @@
+"""What other libraries make of the same scans and start poses: pairs aligned one by one, then a graph of poses.
+
+Run by `peers.py`, in an environment that has numpy, plyfile, open3d and small_gicp:
+python peer_programs.py open3d|small_gicp CLOUDS START.npy OUT.npy
+"""
+
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData
+
+# Settings of both: distances between partners, coarse to fine (mm), and how much of a view must meet another.
+DISTANCES, OVERLAP = (6.0, 2.0, 0.8), 0.1
+# Of the alignments: neighbours of a normal or covariance, robust scale of point-to-plane (mm).
+NEIGHBOURS, ROBUST = 20, 0.1
+
+
+def main() -> None:
+    which, folder, start, out = sys.argv[1:]
+    files = sorted(Path(folder).iterdir())
+    clouds = [np.column_stack([PlyData.read(str(f))["vertex"][a] for a in "xyz"]).astype(float) for f in files]
+    edges = {"open3d": open3d_edges, "small_gicp": small_gicp_edges}[which]
+    poses = np.load(start)
+    poses = optimised(poses, edges(clouds, poses))
+    np.save(out, poses)
+    merged = np.concatenate([c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)])
+    merged.astype("<f4").tofile(Path(out).with_suffix(".xyz"))
+
+
+def open3d_edges(clouds, poses):
+    """(i, j, T_i_j, information) of all pairs that meet: robust point-to-plane ICP."""
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    shown = []
+    for points in clouds:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+        shown.append(cloud)
+    plane = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=ROBUST))
+    wide = registration.TransformationEstimationPointToPlane()
+    for i, j in combinations(range(len(clouds)), 2):
+        T = np.linalg.inv(poses[i]) @ poses[j]
+        if registration.evaluate_registration(shown[j], shown[i], DISTANCES[0], T).fitness < OVERLAP:
+            continue
+        for distance in DISTANCES:
+            method = plane if distance == DISTANCES[-1] else wide
+            T = registration.registration_icp(shown[j], shown[i], distance, T, method).transformation
+        information = registration.get_information_matrix_from_point_clouds(shown[j], shown[i], DISTANCES[-1], T)
+        yield i, j, T, information
+
+
+def small_gicp_edges(clouds, poses):
+    """The same by generalised ICP."""
+    import small_gicp
+
+    made = [small_gicp.preprocess_points(p, downsampling_resolution=1e-3, num_neighbors=NEIGHBOURS) for p in clouds]
+    for i, j in combinations(range(len(clouds)), 2):
+        T = np.linalg.inv(poses[i]) @ poses[j]
+        (target, tree), (source, _) = made[i], made[j]
+        for distance in DISTANCES:
+            found = small_gicp.align(
+                target, source, tree, T, max_correspondence_distance=distance, max_iterations=50, num_threads=2
+            )
+            if found.num_inliers < OVERLAP * source.size():
+                break
+            T = found.T_target_source
+        else:
+            yield i, j, T, found.H
+
+
+def optimised(poses, edges):
+    """T_reference_scanner (V, 4, 4) by Open3D's graph of poses, every pair an edge that may be wrong."""
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    graph = registration.PoseGraph()
+    graph.nodes.extend([registration.PoseGraphNode(T) for T in poses])
+    for i, j, T, information in edges:
+        # An edge of Open3D leads from its source to its target.
+        graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=True))
+    registration.global_optimization(
+        graph,
+        registration.GlobalOptimizationLevenbergMarquardt(),
+        registration.GlobalOptimizationConvergenceCriteria(),
+        registration.GlobalOptimizationOption(
+            max_correspondence_distance=DISTANCES[-1], edge_prune_threshold=0.25, reference_node=0
+        ),
+    )
+    return np.array([node.pose for node in graph.nodes])
+
+
+if __name__ == "__main__":
+    main()
