@@ -1,4 +1,4 @@
-"""Pictures of pages and recording of the demo's cell, as people see them: python bench/report_pictures.py.
+"""Pictures of pages and recording of the demo's cell, as people see them: python -m bench.report_pictures.
 
 Writes docs/pictures/report-*.png (light, dark, phone, paper), two-runs.png (the run before and after an effect was
 added) and recording-*.png (tabs, five moments of `model`).
@@ -19,11 +19,11 @@ from pathlib import Path
 import rerun.experimental as viewer
 from PIL import Image
 
+from bench.few_colours import few_colours
 from stitch.cli.main import main as stitch
 from stitch.cli.terminal.printing import print_page, printing_browser
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
-COLOURS = 256  # enough for shades, letters and the colour bar
 _DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 _PAGES = {
     "report-light": (1100, 1500),
@@ -135,7 +135,7 @@ def _loaded() -> viewer.ViewerClient:
 def keep(picture: Image.Image, name: str) -> None:
     """Write a picture in few colours."""
     path = FOLDER / f"{name}.png"
-    picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    few_colours(picture).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 

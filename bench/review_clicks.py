@@ -7,8 +7,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
+from bench.few_colours import few_colours
+
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
-COLOURS = 256
 LONG = 900_000  # ms that a command may take
 OWN = '''from stitch.effects import effect, number
 
@@ -39,8 +40,7 @@ class Camera:
             self.page.wait_for_timeout(1500)
             raw = FOLDER / f".{name}.new.png"
             self.page.screenshot(path=raw)
-            picture = Image.open(raw).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-            picture.save(FOLDER / f"review-{name}.png", optimize=True)
+            few_colours(Image.open(raw)).save(FOLDER / f"review-{name}.png", optimize=True)
             raw.unlink()
         self.begun = time.monotonic()
 

@@ -43,5 +43,5 @@ def test_what_has_a_name_is_no_group(first):
     result, lines, found = stepwise.suggest_group(state_of(first))
     assert found.verdict == "missing_effect" and result is None and "no group" in lines[-1]
     # For everybody first, then the evidence.
-    assert lines[0].startswith("Missing in the model: joint_offset. Adding it should bring the error from")
+    assert lines[0].startswith("Missing in the model: joint_offset (a joint counts its angle from a wrong zero). Add")
     assert lines[1] == found.sentence

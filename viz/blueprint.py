@@ -14,8 +14,8 @@ from viz.part_camera import Camera
 
 # Of the longest side of the part, from its middle: all of it is in the picture.
 _AWAY = 1.2
-# What is seen at distance 1, about.
-_HIGH, _WIDE = 0.95, 1.4
+# Tangents of half the viewer's field (55 degrees high) with a margin, in a window half as wide again as high.
+_HIGH, _WIDE = 0.47, 0.7
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
@@ -29,8 +29,9 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         _part("part/after", scene.title(after) + unit, scene, camera),
         rrb.Vertical(
             rrb.TextDocumentView(origin="verdict", name="What was found"),
+            _missing(),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[5, 1],
+            row_shares=[10, 3, 2],
         ),
         column_shares=[3, 3, 2],
         name="Before | after",
@@ -47,10 +48,9 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
-            _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
-            _bars("bars/moved", "Each view moved by register (µm)"),
+            _bars("bars", "Each view, from 0 on, off the others (µm)", "bars/first", "bars/views"),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[7, 6, 6, 4],
+            row_shares=[5, 10, 3],
         ),
         column_shares=[3, 3, 2],
         name="The model, step by step",
@@ -68,9 +68,10 @@ def target_blueprint(cell: Array, run: Run) -> rrb.Blueprint:
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="verdict", name="What was found"),
+            _missing(),
             rrb.TextDocumentView(origin="now", name="Sticks"),
-            _bars("bars/moved", "Each view moved by register (µm)"),
-            row_shares=[4, 1, 2],
+            _moved(),
+            row_shares=[8, 3, 2, 4],
         ),
         column_shares=[3, 2],
         name="Targets",
@@ -110,11 +111,12 @@ def _cell(points: Array) -> rrb.Vertical:
     # Turned a little: the shortest way through a cell is often along the scanner's rays.
     across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
-    # So far off that height and width are in the picture.
-    wide, deep = (float(np.ptp(points @ axis)) for axis in (np.cross(level, [0.0, 0.0, 1.0]), level))
-    away = deep / 4 + max(float(np.ptp(points[:, 2])) / _HIGH, wide / _WIDE)
-    position = middle + away * np.array([level[0], level[1], 0.3])
-    eye = rrb.EyeControls3D(position=position, look_target=middle, eye_up=[0, 0, 1])
+    towards = np.array([level[0], level[1], 0.3]) / np.hypot(1.0, 0.3)
+    aside = np.cross([0.0, 0.0, 1.0], level)
+    x, y, z = np.array([aside, np.cross(towards, aside), towards]) @ (points - middle).T
+    # The nearest place from which every point is in the picture.
+    away = float(np.max(z + np.maximum(np.abs(x) / _WIDE, np.abs(y) / _HIGH)))
+    eye = rrb.EyeControls3D(position=middle + away * towards, look_target=middle, eye_up=[0, 0, 1])
     view = rrb.Spatial3DView(
         origin="robot",
         name="Arm at every view (grey lines), field of the scanner (pyramids), part (points); base frame",
@@ -125,19 +127,29 @@ def _cell(points: Array) -> rrb.Vertical:
 
 
 def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
-    """Every model that was fitted, in the fit and on views left out; below, how the last fit closed in."""
+    """Every model that was fitted, in the fit and on views left out; below, the last fit closing in, and register."""
     models = ", ".join(f"{i} {change_of(run.ledger, i)}" for i in range(len(run.ledger)))
     fell = [
         _bars("steps/residual_rms", f"Rms of each model in the fit (µm): {models}"),
         _bars("steps/heldout_rms", "The same on views left out (µm)"),
     ]
     closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
-    return rrb.Vertical(rrb.Horizontal(*fell), *closed, row_shares=[2, *[1 for _ in closed]], name="How the error fell")
+    return rrb.Vertical(
+        rrb.Horizontal(*fell), rrb.Horizontal(*closed, _moved()), row_shares=[2, 1], name="How the error fell"
+    )
+
+
+def _moved() -> rrb.BarChartView:
+    return _bars("bars/moved", "Each view, from 0 on, moved by register (µm)")
+
+
+def _missing() -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(origin="diagnosis/plain", name="What is missing")
 
 
 def _diagnosis() -> rrb.Horizontal:
     """Verdict with candidate effects | their evidence, and where the overlaps put the views."""
     verdict = rrb.TextDocumentView(origin="diagnosis/verdict", name="Verdict and candidate effects, best first")
-    evidence = _bars("diagnosis/evidence", "Log Bayes factor of each candidate effect, numbered as in the table")
-    moved = _bars("diagnosis/displaced", "Every view off where the model puts it (µm)")
+    evidence = _bars("diagnosis/evidence", "Log Bayes factor of each row of the table: above 0 speaks for the effect")
+    moved = _bars("diagnosis/displaced", "Each view, from 0 on, off where the model puts it (µm)")
     return rrb.Horizontal(verdict, rrb.Vertical(evidence, moved), column_shares=[3, 2], name="What is missing")

@@ -10,7 +10,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import amounts_of
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
-from stitch.writing.plain_finding import plain_finding
+from stitch.writing.plain_finding import next_step, plain_finding
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
 from viz.rerun_program import rerun_program
@@ -54,7 +54,9 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     um = MICROMETRES[length_unit]
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
     on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
-    lines = [f"**{plain_finding(found, length_unit)}**", "", found.sentence, ""]
+    plain = plain_finding(found, length_unit)
+    rec.log("diagnosis/plain", rr.TextDocument(plain), static=True)
+    lines = [f"**{plain}**", "", found.sentence, "", f"{next_step(found, 'RUN')}", ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
         "|---:|---|---:|---:|---:|---|",

@@ -95,8 +95,8 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene) -> Non
             points = at_rest[np.linspace(0, len(at_rest) - 1, min(len(at_rest), _POINTS)).astype(int)] - scene.centre
             colour = COLOURS_OF_FEW[scene.farthest.index(v)]
             recording.log(f"scans/{view.name}", rr.Points3D(points.astype(np.float32), colors=[colour]), static=True)
-    means = _means(scene.history.models[0].field.values) * scene.um
-    recording.log("bars/first", rr.BarChart(means, color=GREY), static=True)
+    first = _means(scene.history.models[0].field.values) * scene.um
+    recording.log("bars/first", rr.BarChart(first, color=GREY), static=True)
     for frame in range(0, FRAMES * (len(scene.history.steps) - 1) + 1, _BETWEEN):
         recording.set_time("model", sequence=frame)
         _log_frame(recording, scene, frame / FRAMES, np.array(places))
@@ -120,28 +120,32 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
     for v in scene.farthest:
         placed = rr.Transform3D(translation=T[v, :3, 3] + scene.centre, mat3x3=T[v, :3, :3])
         recording.log(f"scans/{scene.names[v]}", placed)
-    from_centre = places - scene.centre
+    few, from_centre = list(scene.farthest), places - scene.centre
     ends = np.einsum("vij,vj->vi", T[:, :3, :3], from_centre) + T[:, :3, 3]
-    few = list(scene.farthest)
-    recording.log(
-        "displacements",
-        rr.Arrows3D(
-            origins=places[few],
-            vectors=(ends - from_centre)[few],
-            labels=[scene.names[v] for v in few],
-            colors=list(COLOURS_OF_FEW[: len(few)]),
-            radii=_THICK,
-            show_labels=True,
-        ),
+    arrows = rr.Arrows3D(
+        origins=places[few],
+        vectors=(ends - from_centre)[few],
+        labels=[scene.names[v] for v in few],
+        colors=list(COLOURS_OF_FEW[: len(few)]),
+        radii=_THICK,
+        show_labels=True,
     )
+    recording.log("displacements", arrows)
     means = _means((1 - share) * one.values + share * other.values) * scene.um
     recording.log("bars/views", rr.BarChart(means, color=_BAR))
-    if share in (0.0, 1.0):
-        now, first = k + round(share), scene.history.models[0].name
-        factor = f"Displacements: {scene.magnified[now]:g} times larger than they are. Grey bars: {first}."
-        text = f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; noise alone would leave "
-        text += f"{steps[now].field.noise * scene.um:.2g} µm.\n\n{factor}"
-        recording.log("now", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    recording.log("now", rr.TextDocument(_words(scene, k, share), media_type=rr.MediaType.MARKDOWN))
+
+
+def _words(scene: ModelScene, k: int, share: float) -> str:
+    """What is seen at a step, or on the way from step k to the next."""
+    steps = scene.history.steps
+    if 0 < share < 1:
+        return f"## {steps[k].name} → {steps[k + 1].name}\n{share:.0%} of the way: colours, places and bars run evenly."
+    now = k + round(share)
+    noise = f"noise alone would leave {steps[now].field.noise * scene.um:.2g} µm"
+    shown = f"Displacements: {scene.magnified[now]:g} times larger than they are. Grey bars: "
+    shown += f"{scene.history.models[0].name}."
+    return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; {noise}.\n\n{shown}"
 
 
 def _log_part(recording: rr.RecordingStream, path: str, scene: ModelScene) -> None:

@@ -26,6 +26,9 @@ from viz.target_figures import residual_vectors
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
 
+# A stage whose rms did not fall to this share of its first has no course that is worth a picture.
+_FELL = 0.95
+
 
 class RerunRecorder:
     """A `stitch.runs.recorder.Recorder` that writes one .rrd file when the run has ended."""
@@ -52,7 +55,8 @@ class RerunRecorder:
         history = model_history(run)
         words = run_markdown(run, history)
         rec.log("verdict", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
-        rec.log("diagnosis/verdict", rr.TextDocument(NOT_YET, media_type=rr.MediaType.MARKDOWN), static=True)
+        for place in ("diagnosis/plain", "diagnosis/verdict"):
+            rec.log(place, rr.TextDocument(NOT_YET, media_type=rr.MediaType.MARKDOWN), static=True)
         for stage, rms in self.rms.items():
             rec.log(f"iterations/{stage}", rr.BarChart(np.array(rms) * um, color=GREY), static=True)
         for which, colour in (("residual_rms", COLOURS_OF_FEW[0]), ("heldout_rms", COLOURS_OF_FEW[1])):
@@ -70,9 +74,9 @@ class RerunRecorder:
             scene = model_scene(run, history, surface, cell)
             log_model(rec, run, scene)
             full = scene.limit * um
-            several = tuple(stage for stage, rms in self.rms.items() if len(rms) > 1)
+            fell = tuple(stage for stage, rms in self.rms.items() if rms[-1] < _FELL * rms[0])
             log_colour_bar(rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"])
-            rec.send_blueprint(model_blueprint(scene, camera, run, several))
+            rec.send_blueprint(model_blueprint(scene, camera, run, fell))
         file.write()
 
 

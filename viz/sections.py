@@ -13,7 +13,7 @@ from stitch.diagnosis.sentences import amounts_of
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
-from stitch.writing.plain_finding import plain_finding
+from stitch.writing.plain_finding import next_step, plain_finding
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
@@ -44,7 +44,9 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
     )
     _insert(folder / "report.html", "diagnosis", html)
-    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(plain)}</p>')
+    why, command = next_step(found, "RUN").rsplit(": ", 1)
+    then = f'<p class="evidence">{escape(why)}: <code>{escape(command)}</code>, RUN the folder of this page.</p>'
+    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(plain)}</p>{then}')
     add_diagnosis(found, fields, unit, folder / "recording.rrd")
 
 

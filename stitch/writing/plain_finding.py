@@ -5,11 +5,12 @@ Terminal, page, recording and review all say it so; the diagnosis' own sentence 
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.units import length_text
+from stitch.writing.plain_effects import in_words
 
 
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
     """What is missing, and how far the error should fall with it."""
-    named = " or ".join(found.effects)
+    named = " or ".join(in_words(name) for name in found.effects)
     match found.verdict:
         case "adequate":
             return "No effect is found missing: noise and the arm's scatter explain what is left."
@@ -25,3 +26,17 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     then = found.residual_rms * validation.inside**0.5
     before, after = (length_text(rms, length_unit) for rms in (found.residual_rms, then))
     return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
+
+
+def next_step(found: Diagnosis, run: str) -> str:
+    """The command that most would type now, with what it is for; `run` as it has to be typed."""
+    match found.verdict:
+        case "missing_effect":
+            return f"Next: stitch add {run} --suggested"
+        case "cannot_tell":
+            return f"Fitted as one, if that helps: stitch add {run} --group"
+        case "unknown_effect" if found.curves:
+            return f"A formula for it, if there is one: stitch explain {run} -o mine.py"
+        case "unknown_effect":
+            return f"Next, to see where it fails: stitch review {run}"
+    return f"Next: stitch export {run} --to ros"

@@ -34,7 +34,8 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     shutil.copytree(run, before)
     diagnosed = told(capsys, "diagnose", run)
     finding = json.loads((run / "diagnosis.json").read_text())
-    assert finding["plain"].startswith("Missing in the model: joint_offset. Adding it should bring the error from ")
+    named = "Missing in the model: joint_offset (a joint counts its angle from a wrong zero). "
+    assert finding["plain"].startswith(f"{named}Adding it should bring the error from ")
     state = RunReview(run).state()
     assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
     assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])

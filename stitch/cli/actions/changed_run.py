@@ -1,5 +1,6 @@
 """What `stitch add` and `stitch drop` do: another model for a run, everything fitted anew, the ledger for people."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from stitch.stored.load_state import load_state
 from stitch.system.console import console
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
+from stitch.writing.plain_finding import next_step
 from stitch.writing.result_document import result_document
 
 
@@ -74,6 +76,8 @@ def _suggested(
     else:
         console().print("Nothing was added: the model is as it was.", soft_wrap=True)
     write_diagnosis(found, state if result is None else state_of(result), run)
+    if not as_json:
+        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
 
 
 def drop_named(
@@ -100,6 +104,8 @@ def _change(run: Path, state: State, effects: list[str], recording: bool, as_jso
         result = change(state, effects, recorder_for(scratch, recording))
         run_folder.write_with_page(result, scratch)
     _show(result, as_json)
+    if not as_json:
+        console().print(f"Next: stitch diagnose {shlex.quote(str(run))}", soft_wrap=True)
 
 
 def _show(result: Run, as_json: bool) -> None:

@@ -16,7 +16,7 @@ from stitch.system.console import console
 from stitch.units import length_text
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
-from stitch.writing.plain_finding import plain_finding
+from stitch.writing.plain_finding import next_step, plain_finding
 from stitch.writing.run_folder import extend, held
 
 _SHOWN = 6
@@ -33,11 +33,7 @@ def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json:
         emit(to_json(document))
     else:
         show(found, unit)
-        if found.verdict == "cannot_tell":
-            console().print(f"Fitted as one, if that helps: stitch add {shlex.quote(str(run))} --group", soft_wrap=True)
-        elif found.curves:
-            told = f"A formula for it, if there is one: stitch explain {shlex.quote(str(run))} -o mine.py"
-            console().print(told, soft_wrap=True)
+        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
 
 
 def next_for_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:

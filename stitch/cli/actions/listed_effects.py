@@ -32,7 +32,7 @@ def listed_effects(name: str | None, effects_file: Path | None, as_json: bool) -
         return
     table = Table()
     for heading in ("effect", "place", "what nature does", "parameters"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading, overflow="fold", no_wrap=heading == "effect")
     for effect in EFFECTS.values():
         table.add_row(effect.name, effect.place, effect.formula, signature(effect))
     terminal.print(table)

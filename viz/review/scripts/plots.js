@@ -49,7 +49,7 @@ function views() {
   const shown = table.label.filter(name => worst.has(name)), most = Math.max(...shown.map(name => rms[name]), 1e-9);
   const what = state.labelled ? "rms of the labelled points of each" : "rms of each against the others";
   const few = shown.length < table.label.length ? `: the ${shown.length} farthest off of ${table.label.length}` : "";
-  return card("Views", `${what} (µm)${few}`, "wide", shown.map((name, i) => bar({
+  return card("Views", `${what}, up to ${um(most)}${few}`, "wide", shown.map((name, i) => bar({
     key: `view ${name}`, height: rms[name] / most, from: 0, pressed: choice.views.includes(name),
     label: `view ${name}: rms ${um(rms[name])}`,
     toggle: range => {
