@@ -83,6 +83,7 @@ def _read(run: Path, codes: dict[str, int], seconds: dict[str, float]) -> Made:
         sentence=result.get("plain") or result.get("verdict", ""),
         verdict=found.get("verdict", ""),
         effects=found.get("effects", []),
+        plain=found.get("plain", ""),
         diagnosis=found.get("sentence", ""),
         views=len(result.get("views", [])),
         points=sum(view["points"] for view in result.get("views", [])),

@@ -36,7 +36,8 @@ class Made:
     sentence: str
     verdict: str
     effects: list[str]
-    diagnosis: str
+    plain: str  # what is missing, for everybody
+    diagnosis: str  # its evidence
     views: int
     points: int
     recording: int  # bytes
@@ -91,10 +92,11 @@ def _sections(made: dict[Case, Made]) -> list[str]:
 def _section(case: Case, own: Made) -> str:
     size = f"{own.recording / 1e6:.1f} MB" if own.recording else "none"
     pictured = f"![{case.name}](pictures/gallery-{case.name}.webp)\n\n" if own.sentence and own.recording else ""
-    told = " ".join(text for text in (own.sentence, f"**{own.diagnosis}**" if own.diagnosis else "") if text)
+    told = " ".join(text for text in (own.sentence, f"**{own.plain}**" if own.plain else "") if text)
+    evidence = f"\n\nEvidence: {own.diagnosis}" if own.diagnosis else ""
     return (
         f"### {case.name}\n\n{case.told} {own.views} views, {own.points:,} points. Recording: "
-        f"`{case.name}/run/recording.rrd`, {size}.\n\n{pictured}{told}\n"
+        f"`{case.name}/run/recording.rrd`, {size}.\n\n{pictured}{told}{evidence}\n"
     )
 
 

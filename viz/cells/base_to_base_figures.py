@@ -13,6 +13,7 @@ from stitch.cells.base_to_base.stand import Stand, rod_points
 from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult
 from stitch.frames import Array
 from viz.colours import BLUE, GREEN, ORANGE
+from viz.drawing import above
 
 _ONE, _TWO, _ROD = BLUE, GREEN, ORANGE
 
@@ -95,7 +96,7 @@ def contradictions(comparisons: Sequence[Comparison]) -> Figure:
     ax.barh(["–".join(c.pair) for c in shown], sizes, color=[_ROD if s > LIMIT else _ONE for s in sizes], height=0.6)
     ax.axvline(LIMIT, color=_ROD, ls="--", lw=1, label="refused beyond")
     ax.set(xlabel="difference of stand and robot (sigmas)", xlim=(0, max(1.2 * LIMIT, 1.1 * max(sizes, default=0.0))))
-    ax.legend(frameon=False, loc="lower right")
+    above(ax)
     ax.spines[["top", "right"]].set_visible(False)
     return figure
 

@@ -7,6 +7,7 @@ import numpy as np
 from stitch.cells.drilling.drill_job import Job
 from stitch.cells.drilling.drill_solution import Drive, JobResult
 from stitch.frames import transform
+from stitch.units import known_text
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
 from viz.cells.page import Page, Picture, Table, write
@@ -25,7 +26,7 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
         caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
         pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
     words = (sentence(job, result), job.file, _about(job))
-    write(Page("Drilling", *words, pictures, _tables(job, result), notes=_notes(result)), path)
+    write(Page("Drilling", *words, pictures, _tables(job, result), notes=_notes(result, job.length_unit)), path)
 
 
 def _about(job: Job) -> list[Row]:
@@ -46,13 +47,18 @@ def sentence(job: Job, result: JobResult) -> str:
     return (
         f"{len(result.drives)} holes to drill in {len(result.groups)} groups. By the drawing the drives miss the "
         f"reference holes by {before.min():.2f} to {before.max():.2f} {job.length_unit}; after the correction "
-        f"{after.max():.2f} at most is left."
+        f"{after.max():.2f} {job.length_unit} at most is left."
     )
 
 
-def _notes(result: JobResult) -> list[str]:
+def _notes(result: JobResult, length_unit: str) -> list[str]:
     found = [t for t in (result.effects.trials if result.effects else ()) if t.accepted]
-    out = [f"Found and taken out: {t.effect} = {t.value:.4g} ± {t.sigma:.2g} (p {t.p_value:.1g})." for t in found]
+    units = {"plate_height": f" {length_unit}"}
+    out = [
+        f"Found and taken out: {t.effect} = {known_text(t.value, t.sigma)}{units.get(t.effect, '')} "
+        f"(p {t.p_value:.1g})."
+        for t in found
+    ]
     tool = result.tool_axis
     if tool is not None and tool.accepted:
         tilt, sigma = np.degrees([tool.tilt, tool.sigma])
@@ -102,7 +108,7 @@ def record(job: Job, result: JobResult, path: Path) -> None:
 
 
 def _words(job: Job, result: JobResult) -> str:
-    notes = "\n".join(f"- {note}" for note in _notes(result))
+    notes = "\n".join(f"- {note}" for note in _notes(result, job.length_unit))
     return (
         f"# Drilling\n\n{sentence(job, result)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as measured. Green: "
         f"corrected drives. Red and green arrows: errors before and after, {magnified(job, result):g} times larger."

@@ -26,10 +26,10 @@ def errors_figure(names: Sequence[str], master: int, shift: ErrorsAlong, turn: E
     """Error against distance and angle, one line per slave: the worst of the three axes."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots(2, 2, sharex="row", squeeze=False)
-    rows = ((shift, shift.steps, "distance moved / mm"), (turn, np.degrees(turn.steps), "angle turned / deg"))
+    rows = ((shift, shift.steps, "distance moved (mm)"), (turn, np.degrees(turn.steps), "angle turned (°)"))
     for row, (errors, steps, label) in enumerate(rows):
         microns, millidegrees = errors.position * 1e3, np.degrees(errors.angle) * 1e3
-        columns = ((microns, "position error / µm"), (millidegrees, "angle error / 0.001°"))
+        columns = ((microns, "position error (µm)"), (millidegrees, "angle error (0.001°)"))
         for ax, (sizes, size_label) in zip(axes[row], columns, strict=True):
             _draw_slaves(ax, steps, sizes, names, master=master)
             ax.set(xlabel=label, ylabel=size_label)
@@ -56,9 +56,9 @@ def shape_figure(names: Sequence[str], steps: Sequence[Array], tolerance: float,
     for i, name in enumerate(names):
         deviations.plot(range(len(table)), table[:, i], marker="o", label=name)
     deviations.axhline(tolerance, color="0.4", linestyle="--", label="tolerance")
-    deviations.set(xlabel="corrections", ylabel="largest deviation at the clamp / mm", xticks=range(len(table)))
+    deviations.set(xlabel="corrections", ylabel="largest deviation at the clamp (mm)", xticks=range(len(table)))
     deviations.set_ylim(0, None)
     deviations.legend(fontsize="small", ncols=2)
     bars.bar(range(len(forces)), forces)
-    bars.set(xlabel="corrections", ylabel="largest change of force / N", xticks=range(len(forces)))
+    bars.set(xlabel="corrections", ylabel="largest change of force (N)", xticks=range(len(forces)))
     return figure

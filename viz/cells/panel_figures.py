@@ -9,6 +9,7 @@ from stitch.cells.panel.panel_job import Job
 from stitch.cells.panel.panel_solution import JobResult
 from stitch.frames import Array, Indices
 from viz.colours import BLUE, GREEN, ORANGE, SIGNED
+from viz.drawing import above
 
 
 def expected_after(job: Job, result: JobResult) -> Array:
@@ -104,6 +105,6 @@ def misfit(job: Job, result: JobResult) -> Figure:
     ax.bar(job.robots, sizes, color=GREEN)
     ax.axhline(1.0, color="0.4", ls="--", lw=1, label="tracker's sigma")
     ax.set(ylabel="rms (sigmas)", xlabel="robot")
-    ax.legend(frameon=False)
+    above(ax)
     ax.spines[["top", "right"]].set_visible(False)
     return figure

@@ -30,7 +30,7 @@ def deviation_map(found: Deviations, unit: str = UNIT) -> Figure:
     drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
     bad = found.cells.middle[found.outside]
     ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
-    figure.colorbar(drawn, label=f"outside (+) or inside (−) the CAD ({unit})", extend="both", shrink=0.8)
+    figure.colorbar(drawn, label=f"off the CAD, + outside ({unit})", extend="both", shrink=0.8)
     # White means no deviation, so the ground cannot be white.
     ax.set_facecolor("0.78")
     ax.set(aspect="equal", xlabel=f"{'xyz'[i]} of the part ({unit})", ylabel=f"{'xyz'[j]} of the part ({unit})")
