@@ -19,6 +19,7 @@ _CLOUD_LINES = 400
 PROGRAMS = (".ls", ".src", ".mod", ".script")
 _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
+_PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
 # What this program writes itself.
 _OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
 
@@ -43,16 +44,14 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
     Raises:
         InputError: no clouds, no poses, or several tables of poses.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; to fix: name the folder of the scans")
+    _require_folder(folder)
     if poses is not None and not poses.exists():
         raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
     files = _files(folder, 0)
     named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
     clouds, other_clouds = _clouds([f for f in files if f not in named])
     if not clouds:
-        known = ", ".join(CLOUD_SUFFIXES)
-        raise InputError(f"{folder}: no clouds there; to fix: put the scans there as {known}")
+        raise InputError(_no_clouds(folder, files))
     taken = {*clouds, *other_clouds}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f)]
     chosen, rest = _named(poses, taken) if poses is not None else _poses(folder, candidates, len(clouds))
@@ -64,6 +63,26 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
         urdf=urdfs[0] if len(urdfs) == 1 else None,
         aside=(*other_clouds, *rest),
     )
+
+
+def _require_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    if not folder.is_file():
+        raise InputError(f"{folder}: no such folder; to fix: name the folder of the scans")
+    if folder.suffix.lower() in _PACKED:
+        raise InputError(f"{folder}: is packed; to fix: unpack it and name the folder")
+    raise InputError(f"{folder}: is a file; to fix: name the folder that it lies in, {folder.parent}")
+
+
+def _no_clouds(folder: Path, files: Sequence[Path]) -> str:
+    """Why, and what to do: an archive that nobody has unpacked, or files of other kinds."""
+    packed = next((f for f in files if f.suffix.lower() in _PACKED), None)
+    if packed is not None:
+        return f"{folder}: no clouds there, only packed in {packed.relative_to(folder)}; to fix: unpack it there"
+    kinds = Counter(f.suffix.lower() or f.name for f in files).most_common(3)
+    there = f", only {', '.join(f'{count} {kind}' for kind, count in kinds)}" if kinds else ""
+    return f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}"
 
 
 def _files(folder: Path, depth: int) -> list[Path]:

@@ -49,7 +49,10 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     separator = max(_SEPARATORS, key=lambda s: sum(_value(c) is not None for _, line in body for c in _cells(line, s)))
-    rows = [(i, _cells(line, separator)) for i, line in body]
+    # A spreadsheet writes an empty row as separators.
+    read = [(i, cells) for i, line in body if (cells := _cells(line, separator))]
+    rows = _below_titles(read)
+    above = len(read) - len(rows)
     comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
     text, numeric = _columns(rows)
@@ -59,6 +62,8 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     decimal = any(_DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
     words += ", with a header" if header else ", without a header"
+    if above:
+        words += f", {above} line{'s' * (above > 1)} of words above it passed over"
     return NumberTable(
         file=file,
         header=tuple(header[c] for c in numeric) if header else None,
@@ -98,20 +103,32 @@ def _number(file: Path, line: int, cell: str) -> float:
     return value
 
 
+def _below_titles(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Without what people write above a table: rows of another length with hardly a number among their words."""
+    width = Counter(len(row) for _, row in rows).most_common(1)[0][0] if rows else 0
+    first = 0
+    while first < len(rows) - 1 and len(rows[first][1]) != width:
+        known = [_value(cell) is not None for cell in rows[first][1]]
+        if all(known) or sum(known) > 1:
+            break
+        first += 1
+    return rows[first:]
+
+
 def _split_header(
     file: Path, rows: list[tuple[int, list[str]]], comment: str, separator: str
 ) -> tuple[list[str] | None, list[tuple[int, list[str]]]]:
     """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
     header: list[str] | None = None
-    first = rows[0][1]
+    if not rows:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    top, first = rows[0]
     below = rows[1:] or rows
     width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
     typical = next((row for _, row in below if len(row) == width), first)
     texts = [_value(cell) is None for cell in first]
     if len(rows) > 1 and any(t and _value(c) is not None for t, c in zip(texts, typical, strict=False)):
         header, rows = first, rows[1:]
-    elif len(rows) > 1 and all(texts) and len(first) != width:
-        rows = rows[1:]  # a title
     elif comment:
         names = _cells(comment.lstrip("#%/ "), separator)
         header = names if len(names) == width and all(_value(name) is None for name in names) else None
@@ -121,7 +138,7 @@ def _split_header(
             f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}; to fix: write one number a column"
         )
     if header is not None and len(header) != width:
-        raise InputError(f"{file} line 1: {len(header)} names for {width} columns; to fix: name every column once")
+        raise InputError(f"{file} line {top}: {len(header)} names for {width} columns; to fix: name every column once")
     return header, rows
 
 

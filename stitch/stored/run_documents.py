@@ -1,6 +1,7 @@
 """result.json and ledger.json of a run folder, checked: a person may have edited them, or a disk cut them short."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,10 @@ def _checked(file: Path, schema: dict[str, Any]) -> Any:
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
 
-    told = read_text(file, "name a run folder that `stitch run` wrote")
+    hint = "name a run folder that `stitch run` wrote"
+    if (file.parent / "session.toml").is_file():
+        hint = f"this is a session; to fix: `stitch run {shlex.quote(str(file.parent))} -o RUN` first, then name RUN"
+    told = read_text(file, hint)
     try:
         document = json.loads(told, parse_constant=_refused)
     except (ValueError, RecursionError) as error:

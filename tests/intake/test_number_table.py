@@ -39,12 +39,30 @@ def test_brackets_comments_degree_signs_and_names_of_views(tmp_path):
     assert table.labels == (("view-1", "a.ply"), ("view-2", "b.ply")) and table.lines == (2, 4)
 
 
+def test_what_a_spreadsheet_writes_above_its_table_is_passed_over(tmp_path):
+    lines = [
+        "\ufeffRobot poses, cell 7, 2026;;;;",
+        ";;;;",
+        "Point;X [in];Y;Z;A",
+        "P1;1,5;2;3;4",
+        "P2;2,5;2;3;4",
+        ";;;;",
+    ]
+    (tmp_path / "t.csv").write_text("\r\n".join(lines), encoding="utf-8")
+    table = read_number_table(tmp_path / "t.csv")
+    assert table.numbers.tolist() == [[1.5, 2, 3, 4], [2.5, 2, 3, 4]] and table.lines == (4, 5)
+    assert table.header is not None and [name.split()[0] for name in table.header] == ["X", "Y", "Z", "A"]
+    assert table.labels == (("P1",), ("P2",)) and "1 line of words" in table.words
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         ("", "no rows"),
         ("just words\nand more\n", "no rows"),
         ("1,2,3\n4,5\n6,7,8\n", "line 2: 2 cells"),
+        # A pose that lacks numbers is no title.
+        ("P1,1,2\nP2,4,5,6\nP3,6,7,8\n", "line 1: 3 cells"),
         ("1,2,3\n4,x5,6\n7,8,9\n", "line 2: 'x5'"),
         ("1,2,3\n4,1e99,6\n7,8,9\n", "line 2"),
     ],
