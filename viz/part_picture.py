@@ -44,7 +44,9 @@ def part_picture(
     high, wide = seen.shape
     inches = _INCHES / max(high, wide)
     each = max(wide * inches, 1.9)
-    figure = Figure(figsize=(0.9 + len(states) * each, high * inches + 0.6), layout="constrained")
+    # As high as the words of the colour bar, however flat the part.
+    size = 0.9 + len(states) * each, max(high * inches, 2.0) + 0.6
+    figure = Figure(figsize=size, layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(states)))
     for axes, (title, values) in zip(panels, states, strict=True):
         axes.imshow(painted(surface, camera, seen, unsigned_colours(surface.coloured(values), limit)))
