@@ -7,6 +7,9 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
 
+# What is left follows a covariate: p-value below which everybody is told, as in the diagnosis' own sentence.
+_FOLLOWS = 0.01
+
 
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
     """What is missing, and how far the error should fall with it."""
@@ -17,15 +20,22 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":
-            joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
-            where = f": {joints} errs by a law that has no name" if joints else ""
-            return f"Something is missing in the model that no effect of the library explains{where}."
+            return f"Something is missing in the model that no effect of the library explains{_where(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
     if validation is None:
         return f"Missing in the model: {named}."
     then = found.residual_rms * validation.inside**0.5
     before, after = (length_text(rms, length_unit) for rms in (found.residual_rms, then))
     return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
+
+
+def _where(found: Diagnosis) -> str:
+    """The joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
+    joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
+    if joints:
+        return f": {joints} errs by a law that has no name"
+    follows = [x.covariate for x in found.depends_on if x.p_value < _FOLLOWS]
+    return f": what is left follows {' and '.join(follows[:2])}" if follows else ""
 
 
 def next_step(found: Diagnosis, run: str) -> str:
