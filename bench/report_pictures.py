@@ -107,7 +107,7 @@ def recording(run: Path) -> None:
                 if moment is not None:
                     client.set_time("model", sequence=moment, play_state="paused")
                     time.sleep(2)
-                picture = Image.open(io.BytesIO(client.take_screenshot()))
+                picture = Image.open(io.BytesIO(_taken(client)))
                 # The window's own bar says what machine took the picture.
                 picture = picture.crop((0, _TITLE, *picture.size))
                 keep(picture, f"recording-{name}" + ("" if moment is None else f"-{moment}"))
@@ -115,6 +115,16 @@ def recording(run: Path) -> None:
         # The viewer too, which the launcher leaves behind: the next recording would open in it.
         os.killpg(shown.pid, signal.SIGTERM)
         shown.wait()
+
+
+def _taken(client: viewer.ViewerClient) -> bytes:
+    """A picture of what is shown; a viewer that draws on a busy processor may need several tries."""
+    for _ in range(5):
+        try:
+            return bytes(client.take_screenshot())
+        except TimeoutError:
+            time.sleep(5)
+    raise RuntimeError("the viewer gave no picture: is the machine busy?")
 
 
 def _loaded() -> viewer.ViewerClient:

@@ -31,7 +31,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
             rrb.TextDocumentView(origin="verdict", name="What was found"),
             _missing(),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[10, 3, 2],
+            row_shares=[18, 6, 5],
         ),
         column_shares=[3, 3, 2],
         name="Before | after",
@@ -48,7 +48,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
-            _bars("bars", "Each view, from 0 on, off the others (µm)", "bars/first", "bars/views"),
+            _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
             _bar("colours/field", "Views disagree by (µm)"),
             row_shares=[5, 10, 3],
         ),
@@ -113,9 +113,13 @@ def _cell(points: Array) -> rrb.Vertical:
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
     towards = np.array([level[0], level[1], 0.3]) / np.hypot(1.0, 0.3)
     aside = np.cross([0.0, 0.0, 1.0], level)
-    x, y, z = np.array([aside, np.cross(towards, aside), towards]) @ (points - middle).T
-    # The nearest place from which every point is in the picture.
-    away = float(np.max(z + np.maximum(np.abs(x) / _WIDE, np.abs(y) / _HIGH)))
+    axes = np.array([aside, np.cross(towards, aside), towards])
+    for _ in range(4):
+        x, y, z = axes @ (points - middle).T
+        # The nearest place from which every point is in the picture, and what is seen then comes to its middle.
+        away = float(np.max(z + np.maximum(np.abs(x) / _WIDE, np.abs(y) / _HIGH)))
+        seen = np.array([x, y]) / (away - z)
+        middle = middle + 0.5 * away * (seen.min(axis=1) + seen.max(axis=1)) @ axes[:2]
     eye = rrb.EyeControls3D(position=middle + away * towards, look_target=middle, eye_up=[0, 0, 1])
     view = rrb.Spatial3DView(
         origin="robot",

@@ -20,6 +20,7 @@ PROGRAMS = (".ls", ".src", ".mod", ".script")
 _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
 _PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
+_WORKBOOKS = (".xlsx", ".xls", ".ods", ".numbers")
 # What this program writes itself.
 _OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
 
@@ -54,6 +55,7 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
         raise InputError(_no_clouds(folder, files))
     taken = {*clouds, *other_clouds}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f)]
+    _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
     chosen, rest = _named(poses, taken) if poses is not None else _poses(folder, candidates, len(clouds))
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
     return Found(
@@ -142,6 +144,12 @@ def _named(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
             raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
         return inside, []
     return [poses], []
+
+
+def _require_no_workbook(folder: Path, files: Sequence[Path]) -> None:
+    book = next((f for f in files if f.suffix.lower() in _WORKBOOKS), None)
+    if book is not None:
+        raise InputError(f"{book}: workbooks are not read; to fix: save the sheet of the poses as CSV in {folder}")
 
 
 def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
