@@ -31,7 +31,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
             rrb.TextDocumentView(origin="verdict", name="What was found"),
             _missing(),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[18, 6, 5],
+            row_shares=[20, 5, 5],
         ),
         column_shares=[3, 3, 2],
         name="Before | after",
