@@ -15,7 +15,7 @@ export function showCandidates(state, ask, busy) {
     return;
   }
   const rows = all ? found.candidates : found.candidates.slice(0, FIRST);
-  const most = Math.max(state.residual, ...rows.map(c => c.heldout_if_added ?? 0));
+  const most = Math.max(state.residual, state.heldout ?? 0, ...rows.map(c => c.heldout_if_added ?? 0));
   const table = [legend(), element("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Candidate effects" }, element("table", { class: "candidate" },
       element("thead", {}, element("tr", {}, ...["candidate effect", "rms if added (µm)", "posterior", ""].map(h => element("th", { scope: "col" }, h || element("span", { "aria-label": "add" }))))),
       element("tbody", {}, row("as it is", state.residual, state.heldout, most, state.floor), ...rows.flatMap(c => candidate(c, found, state, most, ask, busy))))),
