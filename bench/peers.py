@@ -94,8 +94,8 @@ def compare(python: str, rounds: int, seed: int, folder: Path) -> list[str]:
             f"{1e3 * np.quantile(off, 0.95):.1f} |"
         )
     return [
-        f"{SCENE}, seed {seed}: {len(clouds)} views, {sum(map(len, clouds)):,} points, {os.cpu_count()} cores, {rounds} "
-        "rounds one after the other; median (least … most)",
+        f"{SCENE}, seed {seed}: {len(clouds)} views, {sum(map(len, clouds)):,} points, {os.cpu_count()} cores, "
+        f"{rounds} rounds one after the other; median (least … most)",
         "",
         "| | s | times the first | median µm off the part | 95 % µm |",
         "|---|---:|---:|---:|---:|",

@@ -94,7 +94,7 @@ def served(run, *options):
 
 def compare_without_picture(run):
     """compare.json as `stitch compare` writes it."""
-    write_json(comparison_document(compare(load_state(run, thin=True))), run / "compare.json")
+    write_json(comparison_document(compare(load_state(run))), run / "compare.json")
 
 
 @pytest.fixture(scope="package")
