@@ -24,7 +24,7 @@ from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (700, 701)
+DEVELOPMENT, HELD_OUT = (0, 1), (710, 711, 712)
 KINDS = (
     *(("clean", 0.0), ("ordinary arm", 0.1), ("ordinary arm", 0.3), ("ordinary arm", 1.0), ("ordinary arm", 2.0)),
     *(("memory", 0.5), ("memory", 0.9), ("stops", 1.0), ("coupling", 1.5e-4), ("coupling", 6e-4)),
@@ -85,7 +85,7 @@ def main() -> None:
     for kind, size in KINDS:
         tally, scans = Tally(), SCANS_A_STOP if kind == "stops" else 1
         for scene in options.scenes.split(","):
-            for seed in seeds if scans == 1 else seeds[:1]:
+            for seed in seeds:
                 key = (scene, seed, scans)
                 cell = built[key] = built.get(key) or cell_of(*key)
                 for xi, covariance in trials(cell, kind, size, options.draws, options.alone):

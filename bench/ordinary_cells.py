@@ -13,22 +13,25 @@ from data_synth.ordinary_arm import coupled, draw_arm, with_memory
 from data_synth.scene import load_scene
 from data_synth.simulate import on_rail, simulate
 from stitch import frames
-from stitch.diagnosis.diagnose import linear_model_of
 from stitch.frames import Array
-from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
-from stitch.observations.surfaces.surface_model import Surfaces
-from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.measurement.capture import capture, part_size
+from stitch.measurement.measurement import Measurement, about_part, measurement_of
+from stitch.observations.surfaces.free_poses import FreePoses, free_poses, visible_directions
+from stitch.observations.surfaces.hand_eye import scatter_of
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlaps import collect, next_gate
+from stitch.stages.correct import COARSE_SAMPLES
 
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm
 # Poses of a session in which every stop is scanned so often.
 SCANS_A_STOP = 3
+# First distance between partners, as a share of the part: poses scatter by far less.
+_GATE = 0.05
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One simulated session under its own clean run."""
+    """One simulated session, its views freed about the true hand-eye."""
 
     scene: str
     seed: int
@@ -51,27 +54,22 @@ class Cell:
 
 
 def cell_of(name: str, seed: int, scans_a_stop: int = 1) -> Cell:
-    """Simulate and run a session with nothing wrong but scatter; of fewer stops where each is scanned several times."""
+    """Simulate a session with nothing wrong but scatter, and free its views about the true hand-eye; of fewer stops
+    where each is scanned several times."""
     plan, rail = plan_for(load_scene(name), seed)
     if scans_a_stop > 1:
         again = np.repeat(np.arange(len(rail) // scans_a_stop + 2), scans_a_stop)
         of_views = {key: getattr(plan, key)[again] for key in ("joints", "torque", "velocity")}
         plan, rail = replace(plan, **of_views), rail[again]
     measured = simulate(scene_of(name), {}, seed, planned=(plan, rail))
-    found = run(session_of(measured))
-    state = state_of(found)
-    seen = linear_model_of(state).observation
-    assert isinstance(seen, Surfaces)
-    return Cell(
-        scene=name,
-        seed=seed,
-        plan=plan,
-        rail=rail,
-        T_mount=measured.T_mount,
-        measurement=state.measurement,
-        freed=seen.freed,
-        noise_factor=found.repeatability.noise_factor,
-    )
+    session, T_mount = session_of(measured), measured.T_mount
+    measurement = about_part(measurement_of(session, capture(session)), T_mount)
+    own = measurement.capture
+    poses = own.poses(T_mount)
+    begun = collect(own, poses, _GATE * part_size([own]), [sample(scan, COARSE_SAMPLES) for scan in own.scans])
+    freed = free_poses(own, poses, next_gate(begun, own))
+    noise_factor = scatter_of(own, freed, T_mount).noise_factor
+    return Cell(name, seed, plan, rail, T_mount, measurement, freed, noise_factor)
 
 
 def erring(cell: Cell, kind: str, size: float, rng: np.random.Generator) -> Array:

@@ -23,8 +23,7 @@ _CALLED = {
     "white rotation": "white repeatability",
     "white translation": "white repeatability",
     "smooth": "smooth, unnamed",
-    "wandering rotation": "wandering in time",
-    "wandering translation": "wandering in time",
+    "wandering": "wandering in time",
     "stop rotation": "shared by the scans of a stop",
     "stop translation": "shared by the scans of a stop",
 }

@@ -20,19 +20,17 @@ import numpy as np
 from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
-from stitch.frames import Array, Mask
+from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
-from stitch.statistics.kernels import SmoothErrors, alike_in_joints, alike_in_time, spread_over
+from stitch.statistics.kernels import SmoothErrors, alike_in_joints, alike_in_time, same_stop, spread_over
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth, or
 # wanders, is usually smaller (rad, mm).
 _ARM, _SMOOTH, _ROTATION, _TRANSLATION = 0.1, 0.03, 2e-5, 0.02
 _PER_MM = {"mm": 1.0, "m": 1e-3}
-# Poses of the flange that differ by less, in rad and as a share of its distance from the base, are the same stop.
-_SAME = 1e-4
 # Dense matrices of more views take minutes; there the scatter alone must do.
 _MOST_VIEWS = 150
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
@@ -41,12 +39,10 @@ _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "
 _CONSTANT = ("joint_offset", "link_geometry")
 
 
-def usual_sizes(length_unit: str) -> dict[str, float]:
+def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
     arm = ("joint_offset", "link_geometry", "joint_compliance", *_FAMILY.values())
-    translation = _TRANSLATION * _PER_MM[length_unit]
-    wandering = {"wandering rotation": _ROTATION**2, "wandering translation": translation**2}
-    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2} | wandering
+    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2, "wandering": 1.0}
 
 
 @dataclass(frozen=True)
@@ -120,10 +116,10 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
     halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
     unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}
-    near = _near_in_time(measurements)
-    for name, half in halves.items():
-        found[f"wandering {name}"] = (spread_over(half, near), unit[name])
-    same = _same_stop(np.concatenate([m.T_base_flange for m in measurements]))
+    # What warms up or settles turns and moves: one size for both, in units of the usual ones.
+    usual = np.concatenate([unit[name] * half.reshape(-1, 6, 3) for name, half in halves.items()], axis=2)
+    found["wandering"] = (spread_over(usual.reshape(-1, 6), _near_in_time(measurements)), 1.0)
+    same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
         for name, half in halves.items():
             found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
@@ -161,14 +157,6 @@ def _columns(measurement: Measurement, model: Model, centre: Array, effects: Seq
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     found = zip(terms, twists(measurement, model, terms, centre), strict=True)
     return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
-
-
-def _same_stop(T_base_flange: Array) -> Mask:
-    """(V, V) views taken from one and the same pose, whatever else they saw."""
-    turned = np.abs(T_base_flange[:, None, :3, :3] - T_base_flange[None, :, :3, :3]).max(axis=(2, 3))
-    away = np.linalg.norm(T_base_flange[:, None, :3, 3] - T_base_flange[None, :, :3, 3], axis=2)
-    reach = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).mean())
-    return np.asarray((turned < _SAME) & (away < _SAME * max(reach, 1e-300)))
 
 
 def _near_in_time(measurements: Sequence[Measurement]) -> Array:

@@ -69,7 +69,7 @@ def outlook(
     candidates, missing = candidates_of(linear, empirical=False)
     court = Court(diagnosed, candidates)
     at = None if feature is None else in_scanner(found.freed.poses, feature)
-    ordinary = _ordinary(told.believed, session.length_unit)
+    ordinary = _ordinary(told.believed)
     return Outlook(
         views=len(session.views),
         hand_eye=expected_hand_eye(under(linear, told.believed), found, at),
@@ -81,9 +81,9 @@ def outlook(
     )
 
 
-def _ordinary(scatter: Scatter, length_unit: str) -> Scatter:
+def _ordinary(scatter: Scatter) -> Scatter:
     """With errors as large as those of a usual arm, where they are not larger anyway."""
-    usual = usual_sizes(length_unit)
+    usual = usual_sizes()
     return replace(scatter, errors=scatter.errors | {k: max(v, scatter.errors.get(k, 0.0)) for k, v in usual.items()})
 
 

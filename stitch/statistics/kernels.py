@@ -4,12 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 
+# Correlation time in steps from view to view: that of a usual session. How much neighbours differ says how large the
+# wandering is, its memory says what of it all views share: of a shorter one too little. What is forgotten sooner is
+# much like white scatter, which is there beside it.
+_MEMORY = 20.0
+# Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
+_SAME = 1e-4
 # How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike.
 _REACH = 1.0
-# Correlation times in steps from view to view: half of the wandering is quick, half slow.
-_QUICK, _SLOW = 2.0, 10.0
 
 
 def alike_in_joints(joints: Array) -> Array:
@@ -28,9 +32,16 @@ def alike_joint_by_joint(some: Array, others: Array) -> Array:
 
 
 def alike_in_time(time: Array) -> Array:
-    """(V, V) of a process that forgets (Ornstein–Uhlenbeck), quick and slow; time (V,) in steps from view to view."""
-    apart = np.abs(time[:, None] - time[None, :])
-    return np.asarray(0.5 * np.exp(-apart / _QUICK) + 0.5 * np.exp(-apart / _SLOW))
+    """(V, V) of a process that forgets (Ornstein–Uhlenbeck); time (V,) in steps from view to view."""
+    return np.asarray(np.exp(-np.abs(time[:, None] - time[None, :]) / _MEMORY))
+
+
+def same_stop(T_base_flange: Array) -> Mask:
+    """(V, V) views taken from one and the same pose (V, 4, 4), whatever else they saw."""
+    turned = np.abs(T_base_flange[:, None, :3, :3] - T_base_flange[None, :, :3, :3]).max(axis=(2, 3))
+    away = np.linalg.norm(T_base_flange[:, None, :3, 3] - T_base_flange[None, :, :3, 3], axis=2)
+    reach = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).mean())
+    return np.asarray((turned < _SAME) & (away < _SAME * max(reach, 1e-300)))
 
 
 @dataclass(frozen=True)

@@ -1,65 +1,108 @@
 """Variances with their uncertainty: averaged over their posterior, not plugged in at its maximum.
 
 With few views a variance may well be zero at its maximum, and every sigma after it a lie. A covariance is linear in its
-variances, so what counts is their posterior mean (REML likelihood times prior), drawn by Hamiltonian Monte Carlo
-(Duane et al. 1987, Phys. Lett. B 195:216; Neal 2011) about the maximum, with the same random numbers every time.
+variances, so what counts is their posterior mean (REML likelihood times prior). The posterior has many modes: of errors
+that look alike any one may be there and the others absent. So each variance is drawn in turn from all that it may be
+while the others stand (Gibbs sampling on a grid; Ritter & Tanner 1992, J. Am. Stat. Assoc. 87:861), absent included,
+and what counts is its mean there (Gelfand & Smith 1990, J. Am. Stat. Assoc. 85:398). Same random numbers every time.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 
 from stitch.frames import Array
-from stitch.statistics.restricted_likelihood import MixedModel, deviance_slope
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.restricted_likelihood import MixedModel, rows_of_blocks
 from stitch.statistics.variance_components import VarianceFit
+from stitch.statistics.variance_prior import NOISE, log_density, usual_variances
 
-# Draws that count and those before them; leapfrog steps of a draw and their length, in standard deviations.
-_DRAWS, _BURNT = 48, 8
-# Among so many numbers the variances are known better, and a draw takes longer: fewer do. Among as many as the second
+# Rounds over all variances that count, and those before them.
+_ROUNDS, _BURNT = 32, 6
+# Among so many numbers the variances are known better, and a round takes longer: fewer do. Among as many as the second
 # number the maximum alone must do.
-_AMONG, _NO_DRAWS = 300, 1_200
-_LEAPS, _LEAP = 5, (0.35, 0.75)
-_STEP = 0.05  # of log variances, for the slope's slope
-# What log variances are believed to spread by, where the curvature at the maximum says otherwise.
-_SHARPEST, _WIDEST = 0.1, 4.0
+_AMONG, _FEWEST, _NO_ROUNDS = 300, 4, 1_200
+# The grid in log variances: below and above a variance that is usual, and its steps as a share of how
+# well n numbers know a log variance, √(2/n), at most so long.
+_BELOW, _ABOVE, _SHARE, _LONGEST = np.log(1e-4), np.log(1e8), 1.5, 0.25
+# Directions of a component with less than this share of its largest variance are rounding.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Numbers without their mean: n of them, and square roots of the components of their covariance."""
+
+    z: Array  # (n,)
+    roots: list[Array]  # per component (n, rank)
+    fixed: Array  # (n, n)
+
+    def half(self, variances: Array) -> Array:
+        """(n, n) lower Cholesky factor of the covariance."""
+        V = self.fixed + np.sum([v * (root @ root.T) for v, root in zip(variances, self.roots, strict=True)], axis=0)
+        return np.asarray(np.linalg.cholesky(V))
 
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """(c,) posterior means of the variances, begun at their maximum.
 
-    Among so many numbers that a draw takes seconds, the maximum itself.
+    Among so many numbers that a round takes seconds, the maximum itself.
     """
-    if mixed.size >= _NO_DRAWS:
+    if mixed.size >= _NO_ROUNDS:
         return fit.variances
-    return np.asarray(np.exp(_drawn(mixed, np.log(np.maximum(fit.variances, 1e-300)))).mean(axis=0))
+    seen, rng = _without_mean(mixed), np.random.default_rng(0)
+    grids = _grids(mixed, fit.variances)
+    densities = [log_density(i, np.log(grid), mixed.scales) for i, grid in enumerate(grids)]
+    here, total = np.array(fit.variances), np.zeros(len(grids))
+    rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
+    burnt = -(-_BURNT * rounds // _ROUNDS)
+    for turn in range(burnt + rounds):
+        for i, grid in enumerate(grids):
+            if seen.roots[i].shape[1]:
+                weights = _weights(seen, here, i, grid, densities[i])
+                here[i] = rng.choice(grid, p=weights)
+                total[i] += (turn >= burnt) * float(weights @ grid)
+    return np.asarray(total / rounds)
 
 
-def _drawn(mixed: MixedModel, centre: Array) -> Array:
-    """(K, c) log variances of the posterior, begun at its maximum."""
-    spread = _spread(mixed, centre)
-    rng = np.random.default_rng(0)
-    here, (deviance, slope) = centre, deviance_slope(centre, mixed)
-    out = []
-    wanted = int(np.clip(_DRAWS * (_AMONG / mixed.size) ** 3, _BURNT, _DRAWS))
-    for _ in range(_BURNT + wanted):
-        momentum = rng.standard_normal(len(centre))
-        leap, energy = rng.uniform(*_LEAP), 0.5 * deviance + 0.5 * momentum @ momentum
-        there, next_deviance, next_slope = here, deviance, slope
-        for _ in range(_LEAPS):
-            momentum = momentum - 0.5 * leap * spread.T @ (0.5 * next_slope)
-            there = there + leap * spread @ momentum
-            next_deviance, next_slope = deviance_slope(there, mixed)
-            momentum = momentum - 0.5 * leap * spread.T @ (0.5 * next_slope)
-        if np.log(rng.uniform()) < energy - 0.5 * next_deviance - 0.5 * momentum @ momentum:
-            here, deviance, slope = there, next_deviance, next_slope
-        out.append(here)
-    return np.array(out[_BURNT:])
+def _without_mean(mixed: MixedModel) -> _Seen:
+    """All numbers as one block, turned to where the mean's columns are nothing: their likelihood is the restricted."""
+    free = np.linalg.svd(column_space(rows_of_blocks(mixed.A)), full_matrices=True)
+    turn = free[0][:, free[1].size :].T
+    roots = []
+    for blocks in mixed.components:
+        C = turn @ (blocks[0] if len(blocks) == 1 else block_diag(*blocks)) @ turn.T
+        values, vectors = np.linalg.eigh(C)
+        keep = values > _ROUNDING * max(float(values[-1]), 1e-300)
+        roots.append(vectors[:, keep] * np.sqrt(values[keep]))
+    n = len(turn)
+    fixed = np.zeros((n, n)) if mixed.fixed is None else turn @ block_diag(*mixed.fixed) @ turn.T
+    return _Seen(turn @ mixed.z.ravel(), roots, fixed)
 
 
-def _spread(mixed: MixedModel, centre: Array) -> Array:
-    """(c, c) square root of the covariance that the curvature at the maximum gives the log variances."""
-    steps = _STEP * np.eye(len(centre))
-    curvature = np.array([deviance_slope(centre + s, mixed)[1] - deviance_slope(centre - s, mixed)[1] for s in steps])
-    values, vectors = np.linalg.eigh((curvature + curvature.T) / (8 * _STEP))
-    spread = np.asarray(vectors / np.sqrt(np.clip(values, _WIDEST**-2, _SHARPEST**-2)))
-    # What no number has stays where it is.
-    spread[np.einsum("cbii->c", mixed.components) == 0] = 0.0
-    return spread
+def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
+    """Per component the variances that it may have; the first of those that may be absent stands for all below."""
+    usual = 1e-4 * usual_variances(mixed.z, mixed.components)
+    usual[NOISE] = likeliest[NOISE]
+    if mixed.scales is not None:
+        usual[NOISE + 1 :] = mixed.scales**2
+    step = min(_LONGEST, _SHARE * float(np.sqrt(2 / mixed.size)))
+    return [np.maximum(size, 1e-300) * np.exp(np.arange(_BELOW, _ABOVE, step)) for size in usual]
+
+
+def _weights(seen: _Seen, here: Array, i: int, grid: Array, density: Array) -> Array:
+    """(g,) probabilities of the values of variance i while the others stand.
+
+    V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
+    """
+    half = seen.half(here)
+    root = solve_triangular(half, seen.roots[i], lower=True)
+    values, vectors = np.linalg.eigh(root.T @ root)
+    values = np.maximum(values, 1e-300)
+    along = vectors.T @ (root.T @ solve_triangular(half, seen.z, lower=True))
+    # Rounding must not take away more than there is.
+    times = np.maximum(1 + (grid[:, None] - here[i]) * values, 1e-12)
+    logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())

@@ -29,6 +29,19 @@ def log_prior(log_variances: Array, scales: Array | None) -> tuple[float, Array]
     return value, slope
 
 
+def log_density(component: int, log_variances: Array, scales: Array | None) -> Array:
+    """(g,) of one component at log variances (g,) in equal steps, up to a constant; its first stands for all below."""
+    if component == NOISE:
+        return np.asarray(-0.5 * ((log_variances - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD) ** 2)
+    if component < NOISE or scales is None:
+        return 0.5 * log_variances
+    over = log_variances - 2 * float(np.log(scales[component - NOISE - 1]))
+    out = 0.5 * _SPIKE * over - 0.5 * (1 + _SPIKE) * np.log1p(np.exp(over))
+    # ∫ exp(½·_SPIKE·x) dx from −∞ to the first, in steps.
+    out[0] += float(np.log(2 / _SPIKE / (log_variances[1] - log_variances[0]) + 0.5))
+    return np.asarray(out)
+
+
 def prior_information(variances: Array, scales: Array | None) -> Array:
     """(c,) what the prior alone knows of the log variances: half the curvature of `log_prior`."""
     out = np.zeros(len(variances))

@@ -8,7 +8,9 @@ from scipy.stats import chi2
 
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import with_part
 from data_synth.ordinary_arm import draw_arm, with_memory
+from data_synth.simulate import simulate
 from stitch import frames
 from stitch.diagnosis.variance_budget import variance_budget
 from stitch.measurement.measurement import measurement_of
@@ -42,6 +44,12 @@ def moved(cell, T_base_flange) -> np.ndarray:
     model = measurement.capture.poses(measured.T_mount)
     true = frames.inverse(T_base_flange) @ measured.T_mount
     return frames.log(to_centre @ true @ frames.inverse(to_centre @ model))
+
+
+def about(freed, other, twists) -> np.ndarray:
+    """Left twists (V, 6) about the centre of `freed` that count about that of `other`."""
+    between = frames.make(np.eye(3), other.overlaps.gram.centre - freed.overlaps.gram.centre)
+    return np.asarray(twists @ frames.adjoint(between).T)
 
 
 def test_offsets_and_links_move_the_views_as_another_kinematics_says(cell):
@@ -110,6 +118,31 @@ def test_sigmas_hold_on_arms_that_are_a_little_wrong_everywhere(cell):
             squares[k] += xi @ np.linalg.solve(found.covariance, xi)
     assert squares[0] < chi2.ppf(0.999, 36)
     assert squares[1] > chi2.ppf(0.999, 36)
+
+
+def test_a_rig_at_equal_poses_knows_its_hand_eye_no_better_than_one_session(cell):
+    """Arms that err by pose err alike before a second part. Of independent errors sigmas would fall by √2: the median
+    of three arms stays above half-way, and χ² of the rig within 99.9 %."""
+    measured, measurement, freed = cell
+    arm, q, T = measured.scene.arm, measured.plan.joints, measured.T_mount
+    part = with_part(measured.scene, "blade", span=120.0, thickness=0.2)
+    other = simulate(part, {}, 4, planned=(measured.plan, np.zeros(VIEWS)))
+    np.testing.assert_allclose(other.T_mount, T, atol=1e-12)
+    capture = captured(other)
+    sessions = [measurement, measurement_of(session_of(other), capture)]
+    both, captures = [freed, free_poses(capture, capture.poses(T), 1.0)], [measurement.capture, capture]
+    prior = pose_errors(sessions, Model(T), [f.overlaps.gram.centre for f in both])
+    falls, square = [], 0.0
+    for seed in range(3):
+        x = moved(cell, draw_arm(arm.joints, SIZE, np.random.default_rng(seed)).flange(arm, q))
+        seen = [replace(f, twists=f.twists + about(f, freed, x)) for f in both]
+        one = fit_hand_eye(captures[:1], seen[:1], T, errors=prior_of(cell)).covariance
+        rig = fit_hand_eye(captures, seen, T, errors=prior)
+        falls.append(np.exp((np.linalg.slogdet(rig.covariance)[1] - np.linalg.slogdet(one)[1]) / 12))
+        xi = frames.log(frames.inverse(rig.T_mount) @ T)
+        square += xi @ np.linalg.solve(rig.covariance, xi)
+    assert np.median(falls) > (1 + np.sqrt(0.5)) / 2
+    assert square < chi2.ppf(0.999, 18)
 
 
 def test_the_budget_adds_up_and_tells_an_ordinary_arm_from_one_that_wanders(cell):

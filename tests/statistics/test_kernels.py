@@ -27,8 +27,8 @@ def test_what_one_joint_moves_far_stays_half_alike_and_near_views_are_alike():
 
 def test_time_forgets():
     alike = alike_in_time(np.array([0.0, 1.0, 500.0]))
-    assert alike[0, 1] == pytest.approx(0.5 * (np.exp(-0.5) + np.exp(-0.1)))
-    assert alike[0, 2] < 1e-12
+    assert alike[0, 1] == pytest.approx(np.exp(-1 / 20))
+    assert alike[0, 2] < 1e-10
 
 
 def test_spread_is_the_covariance_of_drawn_processes():

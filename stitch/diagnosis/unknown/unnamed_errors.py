@@ -12,7 +12,7 @@ from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
 _JOINTS = "follow the joints"
-_WANDERING, _STOPS = ("wandering rotation", "wandering translation"), ("stop rotation", "stop translation")
+_WANDERING, _STOPS = ("wandering",), ("stop rotation", "stop translation")
 
 
 @dataclass(frozen=True)
