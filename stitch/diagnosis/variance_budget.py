@@ -7,6 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
+from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors
 from stitch.statistics.identifiability import project_out
@@ -23,7 +24,7 @@ _CALLED = {
     "white rotation": "white repeatability",
     "white translation": "white repeatability",
     "smooth": "smooth, unnamed",
-    "wandering": "wandering in time",
+    **dict.fromkeys(WANDERING, "wandering in time"),
     "stop rotation": "shared by the scans of a stop",
     "stop translation": "shared by the scans of a stop",
 }

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
 from stitch.frames import Array
@@ -25,12 +24,12 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
-from stitch.statistics.kernels import SmoothErrors, alike_in_joints, alike_in_time, same_stop, spread_over
+from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
+from stitch.statistics.kernels import SmoothErrors, alike_in_joints, same_stop, spread_over
 
-# Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth, or
-# wanders, is usually smaller (rad, mm).
-_ARM, _SMOOTH, _ROTATION, _TRANSLATION = 0.1, 0.03, 2e-5, 0.02
-_PER_MM = {"mm": 1.0, "m": 1e-3}
+# Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
+# smaller.
+_ARM, _SMOOTH = 0.1, 0.03
 # Dense matrices of more views take minutes; there the scatter alone must do.
 _MOST_VIEWS = 150
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
@@ -42,7 +41,7 @@ _CONSTANT = ("joint_offset", "link_geometry")
 def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
     arm = ("joint_offset", "link_geometry", "joint_compliance", *_FAMILY.values())
-    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2, "wandering": 1.0}
+    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2} | dict.fromkeys(WANDERING, 1 / len(WANDERING))
 
 
 @dataclass(frozen=True)
@@ -113,23 +112,15 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found["smooth"] = (spread_over(links, alike), _SMOOTH)
         if constant[0].name == _CONSTANT[0]:
             of_joints = SmoothErrors(links[:, : joints.shape[1]], alike)
-    flange = np.concatenate([_carried(m, centre) for m, centre in sessions])
-    halves = {"rotation": flange[:, :, :3].reshape(-1, 3), "translation": flange[:, :, 3:].reshape(-1, 3)}
-    unit = {"rotation": _ROTATION, "translation": _TRANSLATION * _PER_MM[measurements[0].length_unit]}
-    # What warms up or settles turns and moves: one size for both, in units of the usual ones.
-    usual = np.concatenate([unit[name] * half.reshape(-1, 6, 3) for name, half in halves.items()], axis=2)
-    found["wandering"] = (spread_over(usual.reshape(-1, 6), _near_in_time(measurements)), 1.0)
+    flange = flange_twists(measurements, centres)
+    for name, memory in WANDERING.items():
+        found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
-        for name, half in halves.items():
-            found[f"stop {name}"] = (spread_over(half, same.astype(float)), unit[name])
+        halves = {"stop rotation": flange[:, :3], "stop translation": flange[:, 3:]}
+        found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     return PoseErrors(tuple(found), components, np.array([s for _, s in found.values()]), members, of_joints)
-
-
-def _carried(measurement: Measurement, centre: Array) -> Array:
-    """(V, 6, 6) twists of the views about the centre for twists of the flange in its own frame."""
-    return np.asarray(frames.adjoint(frames.make(np.eye(3), -centre) @ measurement.capture.T_reference_flange))
 
 
 def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
@@ -157,16 +148,3 @@ def _columns(measurement: Measurement, model: Model, centre: Array, effects: Seq
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     found = zip(terms, twists(measurement, model, terms, centre), strict=True)
     return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
-
-
-def _near_in_time(measurements: Sequence[Measurement]) -> Array:
-    """(V, V) how alike views err that are near in time; sessions are far from each other."""
-    counts = [m.views.count for m in measurements]
-    out, at = np.zeros((sum(counts), sum(counts))), 0
-    for m, count in zip(measurements, counts, strict=True):
-        steps = np.diff(m.views.time)
-        usual = float(np.median(steps)) if m.views.has("time") and (steps > 0).any() else 0.0
-        time = m.views.time / usual if usual > 0 else np.arange(count, dtype=float)
-        out[at : at + count, at : at + count] = alike_in_time(time)
-        at += count
-    return out

@@ -6,10 +6,6 @@ import numpy as np
 
 from stitch.frames import Array, Mask
 
-# Correlation time in steps from view to view: that of a usual session. How much neighbours differ says how large the
-# wandering is, its memory says what of it all views share: of a shorter one too little. What is forgotten sooner is
-# much like white scatter, which is there beside it.
-_MEMORY = 20.0
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
 # How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike.
@@ -31,9 +27,9 @@ def alike_joint_by_joint(some: Array, others: Array) -> Array:
     return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / _REACH**2)) / 2)
 
 
-def alike_in_time(time: Array) -> Array:
-    """(V, V) of a process that forgets (Ornstein–Uhlenbeck); time (V,) in steps from view to view."""
-    return np.asarray(np.exp(-np.abs(time[:, None] - time[None, :]) / _MEMORY))
+def alike_in_time(time: Array, memory: float) -> Array:
+    """(V, V) of a process that forgets (Ornstein–Uhlenbeck); time (V,) and memory in steps from view to view."""
+    return np.asarray(np.exp(-np.abs(time[:, None] - time[None, :]) / memory))
 
 
 def same_stop(T_base_flange: Array) -> Mask:

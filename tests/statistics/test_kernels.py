@@ -9,7 +9,7 @@ JOINTS = np.random.default_rng(0).uniform(-np.pi, np.pi, (25, 6))
 
 
 def test_covariances_have_no_negative_direction():
-    for alike in (alike_in_joints(JOINTS), alike_in_time(np.cumsum(JOINTS[:, 0] ** 2))):
+    for alike in (alike_in_joints(JOINTS), alike_in_time(np.cumsum(JOINTS[:, 0] ** 2), 2.0)):
         assert np.linalg.eigvalsh(alike).min() > -1e-12
         assert np.diag(alike) == pytest.approx(1.0)
 
@@ -26,7 +26,7 @@ def test_what_one_joint_moves_far_stays_half_alike_and_near_views_are_alike():
 
 
 def test_time_forgets():
-    alike = alike_in_time(np.array([0.0, 1.0, 500.0]))
+    alike = alike_in_time(np.array([0.0, 1.0, 500.0]), 20.0)
     assert alike[0, 1] == pytest.approx(np.exp(-1 / 20))
     assert alike[0, 2] < 1e-10
 
@@ -34,7 +34,7 @@ def test_time_forgets():
 def test_spread_is_the_covariance_of_drawn_processes():
     """10,000 draws of two processes through their columns; each number within five of its standard errors."""
     rng = np.random.default_rng(1)
-    alike, columns, draws = alike_in_time(np.arange(4.0)), rng.normal(size=(24, 2)), 10_000
+    alike, columns, draws = alike_in_time(np.arange(4.0), 5.0), rng.normal(size=(24, 2)), 10_000
     half = np.linalg.cholesky(alike)
     drawn = np.zeros((draws, 24))
     for p in range(2):

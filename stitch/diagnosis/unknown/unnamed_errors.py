@@ -6,13 +6,14 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
+from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
 _JOINTS = "follow the joints"
-_WANDERING, _STOPS = ("wandering",), ("stop rotation", "stop translation")
+_STOPS = ("stop rotation", "stop translation")
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,8 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
-        _JOINTS: tuple(n for n in names if n not in (*_WANDERING, *_STOPS)),
-        "wander in time": _WANDERING,
+        _JOINTS: tuple(n for n in names if n not in (*WANDERING, *_STOPS)),
+        "wander in time": tuple(WANDERING),
         "are shared by the scans of a stop": _STOPS,
     }
     found = [

@@ -1,0 +1,49 @@
+"""How a flange errs whatever the joints do: how much it usually turns and moves, and how long that lasts."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
+from stitch.statistics.kernels import alike_in_time
+
+# Usual sizes, rad and mm.
+_ROTATION, _TRANSLATION = 2e-5, 0.02
+_PER_MM = {"mm": 1.0, "m": 1e-3}
+# What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
+# a usual session. Each has a size of its own: how much neighbours differ says how large it is, its memory what of it
+# all views share; with both in one size that was understated.
+WANDERING = {"quickly wandering": 2.0, "slowly wandering": 20.0}
+
+
+def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
+    """(6V, 6) twists of all views of a rig by a flange that turns and moves by its usual sizes, in its own frame.
+
+    Args:
+        centres: per session the point (3,) about which twists count, reference frame.
+    """
+    unit = np.repeat([_ROTATION, _TRANSLATION * _PER_MM[measurements[0].length_unit]], 3)
+    own = [
+        frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
+        for m, centre in zip(measurements, centres, strict=True)
+    ]
+    return np.asarray(np.concatenate(own).reshape(-1, 6) * unit)
+
+
+def near_in_time(measurements: Sequence[Measurement], memory: float) -> Array:
+    """(V, V) how alike views err that are near in time; sessions are far from each other.
+
+    Args:
+        memory: correlation time in steps from view to view.
+    """
+    counts = [m.views.count for m in measurements]
+    out, at = np.zeros((sum(counts), sum(counts))), 0
+    for m, count in zip(measurements, counts, strict=True):
+        steps = np.diff(m.views.time)
+        usual = float(np.median(steps)) if m.views.has("time") and (steps > 0).any() else 0.0
+        time = m.views.time / usual if usual > 0 else np.arange(count, dtype=float)
+        out[at : at + count, at : at + count] = alike_in_time(time, memory)
+        at += count
+    return out
