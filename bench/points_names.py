@@ -1,0 +1,98 @@
+"""Labelled points of many poses and laws of no library: how often does something get a name that is not its own?
+
+Usage: python bench/points_names.py [--views N] [--size S] [--seeds FIRST LAST] [--write]
+
+An arm with four reflectors before a tracker; every law of data_synth's unnamed ones, poses with memory, and nothing.
+With labelled points poses count as scattering independently: what guards a name there is that it holds beside all
+others found with it and at left-out ends of joints. No name given here is right. --size is in
+units of the laws' own sizes. --write puts the table into docs/points.md.
+"""
+
+import argparse
+import re
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from blind_trials import pin
+from scipy.stats import binomtest
+
+from data_synth.arms import ARMS
+from data_synth.fixtures.labelled_arm import joints_of, labelled_cell
+from data_synth.moment import Plan
+from data_synth.ordinary_arm import with_memory
+from data_synth.unnamed_laws import UNNAMED
+from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.plausible_scatter import scatter_limit
+from stitch.diagnosis.selection.verdict import Selection
+from stitch.frames import Array
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import measurement_of
+from stitch.model.model import Model
+from stitch.observations.targets.target_model import target_model
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
+MARKS = ("<!-- names: begin -->", "<!-- names: end -->")
+NOTHING, MEMORY = "nothing hidden", "memory"
+KINDS = (NOTHING, MEMORY, *UNNAMED)
+
+
+def errors_of(kind: str, size: float, joints: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Errors of the joints (V, n) and of the flange (V, 6); memory is AR(1), 0.9, of 40 µm and 40 µrad."""
+    off, moved = np.zeros_like(joints), np.zeros((len(joints), 6))
+    if kind == MEMORY:
+        moved = with_memory(len(joints), 0.9, rng) * np.repeat([40e-6, 0.04], 3) * size
+    elif kind != NOTHING:
+        plan = Plan(joints, 0 * joints, 0 * joints, next(iter(ARMS.values())), useful=tuple(range(joints.shape[1])))
+        found = size * UNNAMED[kind](plan, rng)
+        # Six joints, six numbers of a flange: the laws of time move the flange.
+        off, moved = (off, found) if kind in ("thermal_cycle", "gust") else (found, moved)
+    return off, moved
+
+
+def said(kind: str, size: float, seed: int, views: int) -> Selection:
+    """What is concluded of one cell with an error of some kind in it."""
+    joints = joints_of(np.random.default_rng(seed), views)
+    errors = errors_of(kind, size, joints, np.random.default_rng([seed, KINDS.index(kind)]))
+    session, T_mount, _ = labelled_cell(seed, views=views, errors=errors)
+    linear = target_model(measurement_of(session, capture(session)), Model(T_mount), None)
+    return concluded(linear, candidates_of(linear)[0], scatter_limit(session))
+
+
+def share(count: int, total: int) -> str:
+    """With its 95 % Wilson interval."""
+    low, high = binomtest(count, total).proportion_ci(0.95, method="wilson")
+    return f"{count} of {total} ({low:.2f} … {high:.2f})"
+
+
+def main() -> None:
+    """Print the table, and every name that was given."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--views", type=int, default=120)
+    parser.add_argument("--size", type=float, default=1.0)
+    parser.add_argument("--seeds", type=int, nargs=2, default=(0, 3))
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    pin(0)
+    rows = ["| hidden | one name | a group | unknown | names given |", "|---|---|---|---|---|"]
+    begun = time.process_time()
+    for kind in KINDS:
+        verdicts, names = Counter[str](), Counter[str]()
+        for seed in range(*options.seeds):
+            found = said(kind, options.size, seed, options.views)
+            verdicts[found.verdict] += 1
+            names.update(r.name for r in found.named if found.verdict == "missing_effect")
+        told = [verdicts[v] for v in ("missing_effect", "cannot_tell", "unknown_effect")]
+        total = len(range(*options.seeds))
+        rows.append(f"| {kind} | {' | '.join(share(k, total) for k in told)} | {', '.join(names) or '–'} |")
+        print(rows[-1], f"{time.process_time() - begun:.0f} s of processor time", flush=True)
+    if options.write:
+        table = "\n".join((MARKS[0], *rows, MARKS[1]))
+        page = re.sub(f"{MARKS[0]}.*?{MARKS[1]}", lambda _: table, PAGE.read_text(), flags=re.S)
+        PAGE.write_text(page)
+
+
+if __name__ == "__main__":
+    main()
