@@ -120,6 +120,7 @@ def test_sigmas_hold_on_arms_that_are_a_little_wrong_everywhere(cell):
     assert squares[1] > chi2.ppf(0.999, 36)
 
 
+@pytest.mark.slow
 def test_a_rig_at_equal_poses_knows_its_hand_eye_no_better_than_one_session(cell):
     """Arms that err by pose err alike before a second part. Of independent errors sigmas would fall by √2: the median
     of three arms stays above half-way, and χ² of the rig within 99.9 %."""
