@@ -32,11 +32,13 @@ def show_ledger(result: Run) -> None:
 
 def remarks(result: Run) -> list[str]:
     """Did the effects earn their place? Are they of a believable size?"""
-    out = []
+    out, earned = [], set[str]()
     if len(result.ledger) > 1:
         before, after = result.ledger[-2], result.ledger[-1]
         grown = sorted(set(after.effects) - set(before.effects))
-        if grown and not after.heldout_rms < FALL * before.heldout_rms:
+        if after.heldout_rms < FALL * before.heldout_rms:
+            earned = set(grown)
+        elif grown:
             clear = max(_clearest(term) for term in result.terms if term.name in grown)
             out.append(
                 f"{', '.join(grown)}: {clear:.0f} sigmas from zero, but too small for a residual to show."
@@ -48,7 +50,11 @@ def remarks(result: Run) -> list[str]:
         if wild:
             out.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
         if _clearest(term) < FAINT:
-            out.append(f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped.")
+            out.append(
+                f"{term.name}: views left out say that it is there; its sigmas count all that an arm may do beside it."
+                if term.name in earned
+                else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
+            )
     return out
 
 
