@@ -153,6 +153,7 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
     monkeypatch.setattr(changed_run, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
     monkeypatch.setattr(changed_run, "suggest", lambda state, at_most: (fitted, [], None))
     monkeypatch.setattr(changed_run, "write_diagnosis", lambda found, state, run: {})
+    monkeypatch.setattr(changed_run, "next_step", lambda found, run: "")
     stitch_command("add", run, "--suggested")
     steps = json.loads((run / "ledger.json").read_text())
     assert len(steps) == len(fitted.ledger)
