@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData
 
-# Settings of both: distances between partners, coarse to fine (mm), and how much of a view must meet another.
-DISTANCES, OVERLAP = (6.0, 2.0, 0.8), 0.1
+# Settings of both, the best of some that were tried: distances between partners, coarse to fine (mm), and how much of a
+# view must meet another.
+DISTANCES, OVERLAP = (2.0, 0.8, 0.4), 0.3
 # Of the alignments: neighbours of a normal or covariance, robust scale of point-to-plane (mm).
-NEIGHBOURS, ROBUST = 20, 0.1
+NEIGHBOURS, ROBUST = 20, 0.2
 
 
 def main() -> None:
@@ -72,7 +73,7 @@ def small_gicp_edges(clouds, poses):
 
 
 def optimised(poses, edges):
-    """T_reference_scanner (V, 4, 4) by Open3D's graph of poses, every pair an edge that may be wrong."""
+    """T_reference_scanner (V, 4, 4) by Open3D's graph of poses, every pair that meets an edge."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
@@ -80,7 +81,7 @@ def optimised(poses, edges):
     graph.nodes.extend([registration.PoseGraphNode(T) for T in poses])
     for i, j, T, information in edges:
         # An edge of Open3D leads from its source to its target.
-        graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=True))
+        graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=False))
     registration.global_optimization(
         graph,
         registration.GlobalOptimizationLevenbergMarquardt(),
