@@ -86,7 +86,7 @@ def sparse(scan: Scan, at_most: int) -> Scan:
     """The scan with at most `at_most` of its points, evenly over the scan order, and a tree over those alone."""
     if len(scan.points) <= at_most:
         return scan
-    picked = np.linspace(0, len(scan.points) - 1, at_most).astype(int)
+    picked = evenly(len(scan.points), at_most)
     points = np.ascontiguousarray(scan.points[picked])
     tree = KDTree(points, leafsize=16)
     return replace(
@@ -99,6 +99,11 @@ def sparse(scan: Scan, at_most: int) -> Scan:
         tree=tree,
         spacing=_spacing(points, tree),
     )
+
+
+def evenly(count: int, at_most: int) -> Indices:
+    """At most `at_most` of `count` indices, evenly from the first to the last."""
+    return np.linspace(0, count - 1, min(count, at_most)).astype(np.int64)
 
 
 def _spacing(points: Array, tree: Any) -> float:

@@ -15,12 +15,12 @@ from stitch.frames import Indices
 from stitch.measurement.bounding_box import box_of
 from stitch.measurement.capture import Capture, capture
 from stitch.measurement.cloud import Cloud, WholeCloud
-from stitch.measurement.scan import prepare_view, sparse
+from stitch.measurement.scan import evenly, prepare_view, sparse
 from stitch.measurement.session import Session, View
 from stitch.system.threads import parallel
 
 # Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most. Hand-eye and
-# fused surface are then as near to the truth as with all points (docs/scale.md).
+# fused surface are then as near to the truth as with all points (docs/large-sessions.md).
 ENOUGH = 39_000
 # Four points for every query still lie within two of their spacings.
 _LEAST = 12_000
@@ -64,7 +64,7 @@ def thinned_cloud(name: str, cloud: Cloud, at_most: int, again: Callable[[], Clo
         name: of the view.
         again: reads the whole cloud again; None: it stays in memory.
     """
-    picked = _pick(len(cloud.points), at_most)
+    picked = evenly(len(cloud.points), at_most)
     if len(picked) == len(cloud.points):
         return cloud
     if cloud.whole is not None:
@@ -72,10 +72,6 @@ def thinned_cloud(name: str, cloud: Cloud, at_most: int, again: Callable[[], Clo
     scan = prepare_view(name, cloud.points, picked)
     whole = WholeCloud(again or (lambda: cloud), len(cloud.points), box_of(cloud.points), scan)
     return _taken(cloud, picked, whole)
-
-
-def _pick(count: int, at_most: int) -> Indices:
-    return np.linspace(0, count - 1, min(count, at_most)).astype(np.int64)
 
 
 def _taken(cloud: Cloud, index: Indices, whole: WholeCloud) -> Cloud:

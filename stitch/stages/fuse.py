@@ -1,7 +1,7 @@
 """Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -32,12 +32,12 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    return fused(_placed(capture.scans, poses), cell or capture.spacing)
+    return fused(together(_placed(capture.scans, poses)), cell or capture.spacing)
 
 
-def fused(placed: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
+def fused(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
     """The same of placed points, in the order of cells along `axis`; the grid is the reference frame's own."""
-    cells = _Cells(placed, cell, axis)
+    cells = _Cells(points_of_views, cell, axis)
     points, normals, _weight = cells.mean()
     view_cell, offset, view_weight = cells.view_means(points, normals)
     count = np.bincount(view_cell, minlength=len(points))
@@ -53,7 +53,7 @@ def view_residuals(capture: Capture, poses: Array, cell: float) -> list[Array]:
     Args:
         cell: grid size; wide enough to hold the step between the views.
     """
-    cells = _Cells(_placed(capture.scans, poses), cell)
+    cells = _Cells(together(_placed(capture.scans, poses)), cell)
     points, normals, weight = cells.mean()
     own_points, own_weight = cells.own()
     rest = weight[cells.cell] - own_weight
@@ -69,14 +69,22 @@ def weights(confidence: Array, usable: Array) -> Array:
     return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
 
 
-def _placed(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
-    pairs = list(zip(scans, poses, strict=True))
-    return PlacedPoints(
-        np.concatenate([frames.transform(T, s.points) for s, T in pairs]),
-        np.concatenate([frames.rotate(T, s.normals) for s, T in pairs]),
-        np.concatenate([weights(s.confidence, s.usable) for s in scans]),
-        np.repeat(np.arange(len(scans)), [len(s.points) for s in scans]),
-    )
+def together(parts: Sequence[PlacedPoints]) -> PlacedPoints:
+    """The points of several views, one view after the other."""
+    names = [f.name for f in fields(PlacedPoints)]
+    return PlacedPoints(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def placed(T: Array, view: int, points: Array, normals: Array, weight: Array) -> PlacedPoints:
+    """Points (N, 3) of one view with normals and weights, scanner frame, by its T_reference_scanner (4, 4)."""
+    return PlacedPoints(frames.transform(T, points), frames.rotate(T, normals), weight, np.full(len(points), view))
+
+
+def _placed(scans: Sequence[Scan], poses: Array) -> list[PlacedPoints]:
+    return [
+        placed(T, v, s.points, s.normals, weights(s.confidence, s.usable))
+        for v, (s, T) in enumerate(zip(scans, poses, strict=True))
+    ]
 
 
 class _Cells:

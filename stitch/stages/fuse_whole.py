@@ -4,7 +4,8 @@ The slabs end where cells of the grid end, so that what comes out does not depen
 normal and edge from the nearest one in memory, whose surface was that of all points.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -18,7 +19,7 @@ from stitch.measurement.session import Session
 from stitch.model.forward import moves_points, undone
 from stitch.model.model import Model
 from stitch.runs.run import FusedCloud
-from stitch.stages.fuse import PlacedPoints, fuse, fused, weights
+from stitch.stages.fuse import PlacedPoints, fuse, fused, placed, together, weights
 from stitch.system.mapped_file import mapped
 from stitch.system.threads import parallel
 
@@ -38,12 +39,17 @@ class Registered:
     own: Capture  # without them
     poses: Array  # (V, 4, 4) T_reference_scanner
 
+    @cached_property
+    def intensity_scale(self) -> tuple[float, float] | None:
+        """Mean and standard deviation by which the model's effects count intensities."""
+        return intensity_scale(self.session)
+
 
 def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
     """Fuse all points that were scanned, those in memory and those in files.
 
     Args:
-        slab: points that are fused at a time; with more of them the result is held in a file without a name.
+        slab: points that are fused at a time; with more of them the result is held in files without a name.
 
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
@@ -56,11 +62,8 @@ def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
 
     def of_slab(bounds: tuple[float, float]) -> FusedCloud | None:
         low, high = (cell * number for number in bounds)
-        parts = [_within(registered, v, axis, low, high) for v in range(len(own.scans))]
-        placed = PlacedPoints(
-            **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PlacedPoints)}
-        )
-        return fused(placed, cell, axis) if len(placed.points) else None
+        every = together([_within(registered, v, axis, low, high) for v in range(len(own.scans))])
+        return fused(every, cell, axis) if len(every.points) else None
 
     clouds = parallel(of_slab, pairwise(ends), "fusing slabs")
     found = (cloud for cloud in clouds if cloud is not None)
@@ -70,14 +73,14 @@ def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
 def _slabs(registered: Registered, cell: float, slab: int) -> tuple[list[float], int]:
     """Numbers of cells at which slabs end along the part's longest axis, and that axis."""
     own, poses = registered.own, registered.poses
-    placed = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
-    low, high = (f([f(p, axis=0) for p in placed], axis=0) for f in (np.min, np.max))
+    shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
+    low, high = (f([f(p, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
     axis = int(np.argmax(high - low))
     first = np.floor(low[axis] / cell)
     share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
     length = int(np.floor(high[axis] / cell) - first) + 1
     along = np.zeros(length)
-    for points, per_point in zip(placed, share, strict=True):
+    for points, per_point in zip(shown, share, strict=True):
         along += per_point * np.bincount((np.floor(points[:, axis] / cell) - first).astype(np.int64), minlength=length)
     number = np.floor((np.cumsum(along) - along / 2) / slab)
     ends = first + np.flatnonzero(np.diff(number) > 0) + 1
@@ -94,14 +97,14 @@ def _within(registered: Registered, v: int, axis: int, low: float, high: float) 
         ends = frames.transform(T, corners(whole.box))[:, axis]
         margin = _MOVED * float(np.ptp(whole.box, axis=0).max())
         if ends.max() + margin < low or ends.min() - margin > high:
-            return _nothing()
+            return placed(T, v, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         every = whole.read()
         height = frames.transform(T, every.points)[:, axis]
         near = np.flatnonzero((height >= low - margin) & (height < high + margin))
         points, normals, weight = _surface(registered, v, every.points[near], every.scalars, near)
-    placed = frames.transform(T, points)
-    keep = (placed[:, axis] >= low) & (placed[:, axis] < high)
-    return PlacedPoints(placed[keep], frames.rotate(T, normals[keep]), weight[keep], np.full(keep.sum(), v))
+    height = frames.transform(T, points)[:, axis]
+    keep = (height >= low) & (height < high)
+    return placed(T, v, points[keep], normals[keep], weight[keep])
 
 
 def _surface(
@@ -115,7 +118,7 @@ def _surface(
     confidence = np.abs(np.einsum("ij,ij->i", normals, ray))
     terms = registered.model.terms
     if moves_points(terms):
-        scale = intensity_scale(registered.session)
+        scale = registered.intensity_scale
         view = replace(
             registered.measurement.scan_views[v],
             cosine=np.maximum(confidence, SMALLEST_COSINE),
@@ -123,7 +126,3 @@ def _surface(
         )
         points = points + undone(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
     return points, normals, weights(confidence, scan.usable[nearest])
-
-
-def _nothing() -> PlacedPoints:
-    return PlacedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
