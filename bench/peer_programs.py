@@ -61,15 +61,14 @@ def small_gicp_edges(clouds, poses):
     for i, j in combinations(range(len(clouds)), 2):
         T = np.linalg.inv(poses[i]) @ poses[j]
         (target, tree), (source, _) = made[i], made[j]
+        moved = clouds[j] @ T[:3, :3].T + T[:3, 3]
+        _, squared = tree.batch_nearest_neighbor_search(moved, num_threads=2)
+        if np.mean(np.asarray(squared) < DISTANCES[0] ** 2) < OVERLAP:
+            continue
         for distance in DISTANCES:
-            found = small_gicp.align(
-                target, source, tree, T, max_correspondence_distance=distance, max_iterations=50, num_threads=2
-            )
-            if found.num_inliers < OVERLAP * source.size():
-                break
+            found = small_gicp.align(target, source, tree, T, max_correspondence_distance=distance, num_threads=2)
             T = found.T_target_source
-        else:
-            yield i, j, T, found.H
+        yield i, j, T, found.H
 
 
 def optimised(poses, edges):

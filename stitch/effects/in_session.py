@@ -14,7 +14,7 @@ _WHERE_FROM = {
     "velocity": "columns j1_velocity_deg_s … in views.csv",
     "time": "a column time_s in views.csv",
     "intensity": "an intensity for every point",
-    "optics": "a sensor with optics (kind area, line or camera under [scanner])",
+    "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
     "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
 }
 

@@ -8,6 +8,7 @@ what stands right of it, and the points are those that sensor and part would hav
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from stitch.measurement.views import ScanView, Views, views_of
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 SMALLEST_COSINE = 0.1
+# Cosine of the angle from the axis beyond which no lens shows anything that measures, 75°.
+_WIDEST = 0.26
 
 
 @dataclass(frozen=True)
@@ -46,10 +49,17 @@ class Measurement:
         """True if every point has an intensity."""
         return bool(self.scan_views) and all(view.intensity is not None for view in self.scan_views)
 
-    @property
+    @cached_property
     def has_optics(self) -> bool:
-        """True unless the sensor is known to have no lens: a tracker, or the probe that it follows."""
-        return self.sensor not in ("tracker", "probe")
+        """True unless the sensor has no lens: a tracker, or the probe that it follows; if it is not stated, one that
+        shows points where no lens looks, beside it or behind."""
+        if self.sensor is not None:
+            return self.sensor not in ("tracker", "probe")
+        sets = self.capture.point_sets
+        ahead = np.concatenate([points[:, 2] / np.maximum(np.linalg.norm(points, axis=1), 1e-300) for points in sets])
+        # A stray point in a hundred says nothing.
+        least, most = np.quantile(ahead, [0.01, 0.99])
+        return bool(least > _WIDEST or most < -_WIDEST)
 
     @property
     def has_surfaces(self) -> bool:

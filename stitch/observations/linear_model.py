@@ -49,6 +49,15 @@ class Trial(Protocol):
 class Observation(Protocol):
     """What was observed of one session under its model, in its own coordinates."""
 
+    @property
+    def centre(self) -> Array:
+        """(3,) about which twists of the views count, reference frame."""
+        ...
+
+    def by_twists(self, moved: Array) -> Array:
+        """(n, P) numbers of the channel of left twists (6V, P) of the views."""
+        ...
+
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
         ...

@@ -12,19 +12,21 @@ _SAME = 1e-4
 _REACH = 1.0
 
 
-def alike_in_joints(joints: Array) -> Array:
+def alike_in_joints(joints: Array, reach: float = _REACH) -> Array:
     """(V, V) of a smooth function of all joints (V, n) rad: of each alone, of pairs, …, of all, equally likely.
+
+    It stays alike as far as `reach`, rad.
 
     The product over joints of (1 + k)/2, with k a Gaussian on the circle (analysis-of-variance kernel; Durrande et
     al. 2013, J. Multivariate Analysis 115:57; periodic: MacKay 1998).
     """
-    return np.asarray(np.prod(alike_joint_by_joint(joints, joints), axis=2))
+    return np.asarray(np.prod(alike_joint_by_joint(joints, joints, reach), axis=2))
 
 
-def alike_joint_by_joint(some: Array, others: Array) -> Array:
+def alike_joint_by_joint(some: Array, others: Array, reach: float = _REACH) -> Array:
     """(S, O, n) factors of that product between joints (S, n) and (O, n), rad."""
     apart = some[:, None, :] - others[None, :, :]
-    return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / _REACH**2)) / 2)
+    return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
 
 
 def alike_in_time(time: Array, memory: float) -> Array:

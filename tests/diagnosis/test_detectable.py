@@ -19,6 +19,13 @@ def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
     assert np.sqrt(least) == pytest.approx(norm.isf(ALPHA_NAME / 2 / tests) + norm.ppf(0.8), rel=5e-3)
 
 
+def test_far_beyond_what_is_needed_nothing_is_asked_of_the_distribution():
+    """There its series ends in NaN: scipy's for 898 degrees of freedom, an F of 266 and a shift of 2,496."""
+    white = np.full((1760, 1), 30.0)
+    least = least_noncentrality(white, 1e-112, 8, 1760, 897.9767842812669)
+    assert np.isfinite(least) and least > 500
+
+
 @pytest.mark.slow
 def test_the_smallest_size_shows_in_eight_of_ten():
     """Drawn with few views: the likelihoods and the F test themselves, not the approximation."""

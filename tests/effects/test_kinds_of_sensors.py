@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -34,3 +35,17 @@ def test_a_tracker_has_no_lens_and_a_camera_sees_no_slant(kind, never):
     if kind == "tracker":
         with pytest.raises(InputError, match=r"lens_distortion needs a sensor with optics .*\[scanner\]"):
             require(measurement, EFFECTS["lens_distortion"])
+
+
+def test_what_shows_points_beside_and_behind_itself_has_no_lens():
+    """If its kind is not stated: a tracker turns to every target, a lens has all of them ahead."""
+    session, *_ = labelled_cell(2, views=40)
+    assert measurement_of(session, capture(session)).has_optics
+    middle = np.mean([view.sighting.points.mean(axis=0) for view in session.views], axis=0)
+    around = [
+        replace(view, sighting=replace(view.sighting, points=view.sighting.points - middle)) for view in session.views
+    ]
+    session = replace(session, views=tuple(around))
+    assert not measurement_of(session, capture(session)).has_optics
+    session = replace(session, scanner=replace(session.scanner, kind="camera"))
+    assert measurement_of(session, capture(session)).has_optics

@@ -49,7 +49,7 @@ def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequenc
     chosen = list(chosen)
     while len(chosen) < AT_ONCE:
         following = _following(
-            _conditioned(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
+            conditioned(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
         )
         if following is None:
             break
@@ -57,17 +57,17 @@ def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequenc
     return chosen
 
 
-def _following(conditioned: LinearModel, others: Sequence[Candidate]) -> Ranked | None:
+def _following(beside: LinearModel, others: Sequence[Candidate]) -> Ranked | None:
     """The effect that explains most of what is left, if it can be named.
 
     What seems to gain less than half of the best is fitted only where nothing else can be named: beside that one it
     has its turn again.
     """
-    likely = promising(conditioned, others, TRIED)
+    likely = promising(beside, others, TRIED)
     near = [c for c, gain in likely if gain >= 0.5 * likely[0][1]]
     for tried in (near, [c for c, _ in likely if c not in near]):
         # Preselected by what they gain: all that were looked at count as tests.
-        ranked, _ = rank([score(conditioned, c) for c in tried], tests=len(others))
+        ranked, _ = rank([score(beside, c) for c in tried], tests=len(others))
         following = next((r for r in ranked if certain(r)), None)
         if following is not None:
             return following
@@ -96,10 +96,11 @@ def _eliminated_back(
 
 def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:
     """The evidence beside all effects but one."""
-    return _conditioned(linear, [r for r in chosen if r.name != one.name])
+    return conditioned(linear, [r for r in chosen if r.name != one.name])
 
 
-def _conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
+def conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
+    """The evidence beside some effects."""
     if not chosen:
         return linear
     forms = [r.score.form for r in chosen]

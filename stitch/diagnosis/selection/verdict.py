@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
-from stitch.diagnosis.selection.forward_selection import forward_selection
+from stitch.diagnosis.selection.forward_selection import conditioned, forward_selection
 from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
 from stitch.diagnosis.selection.ranking import Ranked, beside, certain, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
@@ -17,12 +17,13 @@ from stitch.diagnosis.thresholds import (
     ODDS,
     PRIOR_PHYSICAL,
 )
-from stitch.diagnosis.unknown import joint_laws
+from stitch.diagnosis.unknown import joint_laws, unnamed_courses
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.observations.linear_model import LinearModel
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
 _GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
+_UNWANTED = "{}: an error without a name, smooth in the joint angles or in time, explains these views as well"
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if not contenders:
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
+    others: Sequence[Ranked] = ()
     stray, law = stray and rescored(base, stray), joint_laws.log_posterior(base)
     ranked = beside(ranked, best, law)
     adequate, unknown = replace(adequate, ranked=ranked), replace(unknown, ranked=ranked)
@@ -61,18 +63,21 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         explained = max(found.explained, best.log_posterior)
         if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):
             return replace(unknown, notes=tuple(refused.values()))
-        best = found.effects[0] if found.effects else best
-        second = found.effects[1] if len(found.effects) > 1 else None
+        best, *others = found.effects or (best,)
+        second = others[0] if others else None
     elif _outdone(best, stray, law):
         # Two known effects at once may look like none of them: try the best with a second one.
         second = _second(linear, candidates, best)
         if second is None or _outdone(best, stray, law, second, len(ranked)):
             return unknown
+        others = [second]
+    if not _wanted(linear, best, others):
+        return replace(unknown, notes=(*refused.values(), _UNWANTED.format(best.name)))
     if _order_open(base, best, empirical):
         return unknown
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
-    others = (r for r in likely if r.name != best.name and r.name not in refused)
-    group = (best, *(() if second is not None else others))
+    rivals = (r for r in likely if r.name != best.name and r.name not in refused)
+    group = (best, *(() if second is not None else rivals))
     if len(group) > 1 and linear.measurement.views.count < MANY_VIEWS:
         two = _both(linear, candidates, best)
         if two is not None:
@@ -103,6 +108,14 @@ def _outdone(best: Ranked, stray: Ranked | None, law: float, second: Ranked | No
     if second is not None:
         known += second.score.log_bayes_factor + float(np.log(PRIOR_PHYSICAL / tests))
     return (stray is not None and stray.log_posterior > known + ODDS) or law > known - ODDS
+
+
+def _wanted(linear: LinearModel, best: Ranked, others: Sequence[Ranked]) -> bool:
+    """True if an effect is 20 to 1 wanted beside others and any course without a name; a prior of pose errors has
+    asked already."""
+    return linear.pose_errors is not None or (
+        unnamed_courses.least_wanted(conditioned(linear, others), best.score.form) > ODDS
+    )
 
 
 def _order_open(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) -> bool:

@@ -41,7 +41,11 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degr
     def missed(shift: float) -> float:
         return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - POWER
 
-    return float(brentq(missed, 1e-9, 9 * needed + 99))
+    # From below: the series of the distribution fails for shifts far beyond what is needed.
+    enough = needed + 10.0
+    while missed(enough) < 0:
+        enough *= 1.5
+    return float(brentq(missed, 1e-9, enough))
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,15 @@ class Surfaces:
     freed: FreePoses
     channel: PoseChannel
 
+    @property
+    def centre(self) -> Array:
+        """(3,) of the overlaps, reference frame."""
+        return self.freed.overlaps.gram.centre
+
+    def by_twists(self, moved: Array) -> Array:
+        """(n, P) visible directions of twists (6V, P): a response counts nothing else."""
+        return self.reduce(moved)
+
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Twists (6V, P) of each term, and the sums of point effects."""
         return view_responses(measurement, model, terms, self.freed)

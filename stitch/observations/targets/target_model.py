@@ -29,6 +29,15 @@ class Targets:
     rows: Rows
     landmarks: Landmarks
 
+    @property
+    def centre(self) -> Array:
+        """(3,) of the targets, reference frame."""
+        return self.rows.centre
+
+    def by_twists(self, moved: Array) -> Array:
+        """(n, P) rows of left twists (6V, P) of the views."""
+        return self.rows.by_twists(moved).reshape(self.rows.residual.size, -1)
+
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Rows (n, P) of each term."""
         found = effect_rows(self.rows, measurement, model, terms)

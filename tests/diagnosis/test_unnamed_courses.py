@@ -1,0 +1,53 @@
+"""Names of labelled points beside errors that have none: laws and memory of another program, and what is really there."""
+
+import numpy as np
+import pytest
+
+from data_synth.arms import ARMS
+from data_synth.fixtures.labelled_arm import TARGETS, joints_of, labelled_cell
+from data_synth.moment import Plan
+from data_synth.ordinary_arm import with_memory
+from data_synth.unnamed_laws import UNNAMED
+from stitch.diagnosis.unknown.unnamed_courses import least_wanted, unnamed_courses
+from stitch.pipeline import diagnose, run
+
+VIEWS, SEED = 120, 31
+
+
+def law(name: str) -> np.ndarray:
+    """(V, 6) rad, three times as large as a good arm's."""
+    joints = joints_of(np.random.default_rng(SEED), VIEWS)
+    plan = Plan(joints, 0 * joints, 0 * joints, next(iter(ARMS.values())), useful=tuple(range(6)))
+    return 3 * UNNAMED[name](plan, np.random.default_rng([SEED, 1]))
+
+
+def memory() -> np.ndarray:
+    """(V, 6) rad and mm of a flange: AR(1), 0.9, of 120 µm and 0.12 mrad."""
+    return with_memory(VIEWS, 0.9, np.random.default_rng([SEED, 2])) * np.repeat([1.2e-4, 0.12], 3)
+
+
+@pytest.mark.parametrize("which", ["hysteresis", pytest.param("dress_pack", marks=pytest.mark.slow), "memory"])
+def test_what_no_library_has_gets_no_name(which):
+    nothing = np.zeros((VIEWS, 6))
+    errors = (nothing, memory()) if which == "memory" else (law(which), nothing)
+    session, *_ = labelled_cell(SEED, views=VIEWS, errors=errors, targets=TARGETS[:2])
+    found = diagnose(run(session))
+    assert found.verdict == "unknown_effect", found.sentence
+
+
+def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle():
+    """Beside a joint without a name that errs too: what is left of the evidence for the offset still names it."""
+    errors = (law("dress_pack"), np.zeros((VIEWS, 6)))
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(SEED, views=VIEWS, offset=offset, errors=errors, targets=TARGETS[:2])
+    found = diagnose(run(session))
+    assert found.effects == ("joint_offset",), found.sentence
+    form = found.candidates[0].ranked.score.form
+    assert found.candidates[0].name == "joint_offset" and least_wanted(found.linear, form) > 20
+    beside = found.linear.conditioned_on(form.columns, form.sizes)
+    idle = next(c.ranked.score.form for c in found.candidates if c.name == "gear_harmonic")
+    assert least_wanted(beside, idle) < 3
+    # The law that is there is seen: a process explains it, with less scatter than the views seemed to have.
+    likeliest = unnamed_courses(beside)[0]
+    assert 0.5 * (beside.null.deviance - likeliest.fit.deviance) > 20
+    assert likeliest.fit.variances[0] < beside.null.variances[0]
