@@ -90,7 +90,10 @@ def _held(
     if selection.verdict != "missing_effect":
         return selection, selection.notes
     asked = [r for r in (*selection.named, selection.second) if r is not None]
-    wrong_anyway = implausible(linear, limit) or bool(unnamed_errors(linear))
+
+    def wrong_anyway() -> bool:
+        return implausible(linear, limit) or bool(unnamed_errors(linear))
+
     return validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
 
 

@@ -7,31 +7,21 @@ and beside a flange that wanders in time: smooth processes of few numbers each (
 covariance) and of a size that the views tell.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch.diagnosis.candidates import Form
-from stitch.effects.contract import EFFECTS
+from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.unknown.smooth_processes import alone, in_pairs, of_joints, wandering
 from stitch.frames import Array
-from stitch.model.jacobian import twists
-from stitch.model.term import term_of
-from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import alike_in_joints
 from stitch.statistics.variance_components import VarianceFit, fit_variances
 
-# Columns of a process, and the share of its largest variance that the last of them has at least.
-_MOST, _LEAST = 96, 1e-3
-# Of so many views the covariance is drawn apart, and the others follow these.
-_KNOTS = 400
 # Sizes that are tried, as multiples of the one at which the clearest column is as large as its own sigma.
 _SIZES = np.geomspace(0.1, 1e5, 49)
 # Beside an effect a process may be that much smaller than alone.
 _SMALLER = (1.0, 0.3, 0.1, 0.01)
-# How far, rad, what a tooth or a seal does to a joint reaches.
-_SHORT = 0.2
 # Joints for which a second one is sought that theirs may follow, and processes whose size is sought with all variances.
 _JOINTS, _FITTED = 2, 2
 
@@ -40,25 +30,33 @@ _JOINTS, _FITTED = 2, 2
 class UnnamedCourse:
     """A process without a name, at its likeliest size."""
 
+    joint: int | None  # that follows it, counted from 1; None: the flange, in time
     columns: Array  # (n, R) of the channel, per unit of that size
     size: float
     fit: VarianceFit  # of the views with the process
+    log_bayes_factor: float  # over scatter alone, less the number of processes that were tried
 
 
 def unnamed_courses(linear: LinearModel) -> tuple[UnnamedCourse, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
     if linear.pose_errors is not None:
         return ()
-    found = [_likeliest(linear, _wandering(linear))]
+    found = [_likeliest(linear, None, wandering(linear))]
     if linear.measurement.views.has("joints"):
-        motions = _of_joints(linear)
+        motions = of_joints(linear)
         joints = range(len(motions))
-        alone = [[_likeliest(linear, own) for own in _alone(linear, motions, k)] for k in joints]
-        found += [course for own in alone for course in own]
-        first = sorted(joints, key=lambda k: -max(course.gain for course in alone[k]))[:_JOINTS]
-        found += [_likeliest(linear, own) for k in first for own in _in_pairs(linear, motions, k)]
+        by_joint = [[_likeliest(linear, k + 1, own) for own in alone(linear, motions, k)] for k in joints]
+        found += [course for own in by_joint for course in own]
+        first = sorted(joints, key=lambda k: -max(course.gain for course in by_joint[k]))[:_JOINTS]
+        found += [_likeliest(linear, k + 1, own) for k in first for own in in_pairs(linear, motions, k)]
+    tried = float(np.log(len(found)))
     likeliest = sorted(found, key=lambda course: -course.gain)[:_FITTED]
-    return tuple(_fitted(linear, course.columns, course.size) for course in likeliest)
+    return tuple(sorted((_fitted(linear, c, tried) for c in likeliest), key=lambda c: -c.log_bayes_factor))
+
+
+def clear_course(linear: LinearModel) -> UnnamedCourse | None:
+    """The likeliest of them, where it is 20 to 1 likelier than scatter alone though it is the best of all."""
+    return next((course for course in unnamed_courses(linear) if course.log_bayes_factor > ODDS), None)
 
 
 def least_wanted(linear: LinearModel, form: Form) -> float:
@@ -83,22 +81,29 @@ def _deviance(linear: LinearModel, G: Array, prior: Array) -> float:
 class _Likeliest:
     """A process at the size that is likeliest at the null's variances, and its log Bayes factor there."""
 
+    joint: int | None
     columns: Array  # (n, R)
     size: float
     gain: float
 
+    def sizes(self, size: float) -> Array:
+        """(R,) of the prior of its coefficients."""
+        return np.full(self.columns.shape[1], size)
 
-def _fitted(linear: LinearModel, columns: Array, size: float) -> UnnamedCourse:
+
+def _fitted(linear: LinearModel, found: _Likeliest, tried: float) -> UnnamedCourse:
     """With all variances sought anew: what a process explains is no scatter, and where the scatter is less it is
     likelier of another size."""
-    G = linear.in_blocks(columns)
-    first = fit_variances(linear.mixed, G, np.full(columns.shape[1], size), start=linear.null.variances)
-    again = _likeliest(replace(linear, null=first), columns).size
-    second = fit_variances(linear.mixed, G, np.full(columns.shape[1], again), start=first.variances)
-    return UnnamedCourse(columns, *((again, second) if second.deviance < first.deviance else (size, first)))
+    G = linear.in_blocks(found.columns)
+    fit = fit_variances(linear.mixed, G, found.sizes(found.size), start=linear.null.variances)
+    size = _likeliest(replace(linear, null=fit), found.joint, found.columns).size
+    again = fit_variances(linear.mixed, G, found.sizes(size), start=fit.variances)
+    size, fit = (size, again) if again.deviance < fit.deviance else (found.size, fit)
+    gained = 0.5 * (linear.null.deviance - fit.deviance)
+    return UnnamedCourse(found.joint, found.columns, size, fit, gained - tried)
 
 
-def _likeliest(linear: LinearModel, columns: Array) -> _Likeliest:
+def _likeliest(linear: LinearModel, joint: int | None, columns: Array) -> _Likeliest:
     """Its size at the null's variances.
 
     Over the eigenvalues k of the columns' information and the shares g of what was seen: log BF(s) =
@@ -108,62 +113,8 @@ def _likeliest(linear: LinearModel, columns: Array) -> _Likeliest:
     k, vectors = np.linalg.eigh(white.T @ white)
     k, g = np.maximum(k, 0.0), vectors.T @ (white.T @ linear.white_residual)
     if not k[-1] > 0:
-        return _Likeliest(columns, 1.0, -np.inf)
+        return _Likeliest(joint, columns, 1.0, -np.inf)
     sizes = _SIZES / np.sqrt(k[-1])
     gains = g**2 / (k + 1 / sizes[:, None] ** 2) - np.log1p(sizes[:, None] ** 2 * k)
     found = 0.5 * gains.sum(axis=1)
-    return _Likeliest(columns, float(sizes[found.argmax()]), float(found.max()))
-
-
-def _of_joints(linear: LinearModel) -> Array:
-    """(n, V, 6) twists of the views by a radian of each joint."""
-    offset = term_of(linear.measurement, EFFECTS["joint_offset"])
-    return twists(linear.measurement, linear.model, [offset], linear.observation.centre)[0]
-
-
-def _alone(linear: LinearModel, motions: Array, k: int) -> Iterator[Array]:
-    """(n, R) of joint k that follows all joints, its own angle closely, or its own and the one that it comes from."""
-    views = linear.measurement.views
-    own, came = views.joints[:, [k]], views.previous[:, [k]]
-    for alike in (
-        alike_in_joints(views.joints),
-        alike_in_joints(own, _SHORT),
-        alike_in_joints(np.hstack([own, came])),
-    ):
-        yield _by_courses(linear, motions[k], alike)
-
-
-def _in_pairs(linear: LinearModel, motions: Array, k: int) -> Iterator[Array]:
-    """(n, R) of joint k that follows its own angle and that of one other."""
-    joints = linear.measurement.views.joints
-    for other in range(joints.shape[1]):
-        if other != k:
-            yield _by_courses(linear, motions[k], alike_in_joints(joints[:, [k, other]]))
-
-
-def _by_courses(linear: LinearModel, motion: Array, alike: Array) -> Array:
-    """(n, R) of one motion (V, 6) in each course of a process, without what is alike in all views: that has a name."""
-    shapes = _shapes(alike, _MOST)
-    return linear.observation.by_twists(_spread(motion[:, :, None], shapes - shapes.mean(axis=0)))
-
-
-def _wandering(linear: LinearModel) -> Array:
-    """(n, R) of a flange that wanders."""
-    measurement = linear.measurement
-    shapes = _shapes(near_in_time([measurement], WANDERING["slowly wandering"]), _MOST // 6)
-    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(shapes), 6, 6)
-    return linear.observation.by_twists(_spread(carried, shapes))
-
-
-def _spread(moved: Array, shapes: Array) -> Array:
-    """(6V, p·R) twists of the views by each of p motions (V, 6, p) in each of the courses (V, R)."""
-    return (moved[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(moved), -1)
-
-
-def _shapes(alike: Array, most: int) -> Array:
-    """(V, R) courses with unit coefficients of which the covariance of a process (V, V) is made."""
-    knots = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _KNOTS)).astype(np.int64))
-    values, vectors = np.linalg.eigh(alike[np.ix_(knots, knots)])
-    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
-    keep = values > _LEAST * values[0]
-    return np.asarray(alike[:, knots] @ (vectors[:, keep] / np.sqrt(values[keep])))
+    return _Likeliest(joint, columns, float(sizes[found.argmax()]), float(found.max()))

@@ -6,13 +6,14 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
+from stitch.diagnosis.unknown.unnamed_courses import clear_course
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
-_JOINTS = "follow the joints"
+_JOINTS, _TIME = "follow the joints", "wander in time"
 _STOPS = ("stop rotation", "stop translation")
 
 
@@ -29,19 +30,21 @@ class Unnamed:
 def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     """Kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
 
+    Without a prior of pose errors the likeliest alone (`unnamed_courses.py`).
+
     Each is left out of the prior in turn, all other sizes fitted anew. A size that is not wanted goes to where its
     prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
     three nats (`variance_prior.py`), which the odds of 20 to 1 stand for.
     """
     if linear.pose_errors is None:
-        return ()
+        return _course(linear)
     law = _clear_law(linear)
     if _gain(linear, linear.scatter_only.null.deviance) < ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
         _JOINTS: tuple(n for n in names if n not in (*WANDERING, *_STOPS)),
-        "wander in time": tuple(WANDERING),
+        _TIME: tuple(WANDERING),
         "are shared by the scans of a stop": _STOPS,
     }
     found = [
@@ -61,6 +64,15 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
     laws = clear_laws(linear)
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
     return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, True, laws) if laws else None
+
+
+def _course(linear: LinearModel) -> tuple[Unnamed, ...]:
+    """Where poses count as scattering independently."""
+    course = clear_course(linear)
+    if course is None:
+        return ()
+    words = _TIME if course.joint is None else f"{_JOINTS}, joint {course.joint} above all"
+    return (Unnamed(words, course.log_bayes_factor, course.joint is not None),)
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:
