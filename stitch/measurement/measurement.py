@@ -23,6 +23,8 @@ from stitch.measurement.views import ScanView, Views, views_of
 SMALLEST_COSINE = 0.1
 # Cosine of the angle from the axis beyond which no lens shows anything that measures, 75°.
 _WIDEST = 0.26
+# Points of a view that say where a sensor looks.
+_ENOUGH = 1000
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,11 @@ class Measurement:
         shows points where no lens looks, beside it or behind."""
         if self.sensor is not None:
             return self.sensor not in ("tracker", "probe")
-        sets = self.capture.point_sets
-        ahead = np.concatenate([points[:, 2] / np.maximum(np.linalg.norm(points, axis=1), 1e-300) for points in sets])
+        some = [points[:: 1 + len(points) // _ENOUGH] for points in self.capture.point_sets]
+        if not some:
+            return True
+        shown = np.concatenate(some)
+        ahead = shown[:, 2] / np.maximum(np.linalg.norm(shown, axis=1), 1e-300)
         # A stray point in a hundred says nothing.
         least, most = np.quantile(ahead, [0.01, 0.99])
         return bool(least > _WIDEST or most < -_WIDEST)
