@@ -5,6 +5,16 @@ FIELD = (
     "that the scanner's noise is gone. What fades from one step to the next is what that step explained. Grey: seen by "
     "one view only."
 )
+CARRIED_TARGETS = (
+    "In the frame of the robot's base. Every target stands wherever a view saw it on the arm; its colour says how far "
+    "off its place it was seen there. What fades from one step to the next is what that step explained. Grey: the "
+    "robot's base, and the scanner if it stands near."
+)
+SEEN_TARGETS = (
+    "In the frame of the robot's base. Balls are the targets, pyramids the scanner where each view was taken; colours "
+    "say how far off their place the targets were seen (rms, of a target over its views, of a view over its targets). "
+    "What fades from one step to the next is what that step explained. Grey: the robot's base."
+)
 HANDLING = "Drag to turn, click and scroll to come closer."
 CONVERGENCE = "Near the dashed line only the scanner's own noise remains; further iterations bring nothing."
 PER_VIEW = (

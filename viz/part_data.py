@@ -74,7 +74,7 @@ def part_data(
         ],
         "full": full_colour(first) * um,
         "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour(first) * um),
-        "colours": {"field": _stops(FIELD), "signed": _stops(SIGNED)},
+        "colours": colour_stops(),
         "radius": f"{history.patches.radius:.3g} {length_unit}",
         "begin": 1,
         "end": len(history.steps) - 2,
@@ -104,6 +104,10 @@ def _mean_abs(values: Array) -> float:
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def _stops(name: str) -> list[list[int]]:
-    """RGB of a colour map at equal steps."""
-    return [[round(255 * c) for c in colormaps[name](x)[:3]] for x in np.linspace(0, 1, _STOPS)]
+def colour_stops() -> dict[str, list[list[int]]]:
+    """RGB of both colour maps of a viewer at equal steps."""
+    steps = np.linspace(0, 1, _STOPS)
+    return {
+        kind: [[round(255 * c) for c in colormaps[name](x)[:3]] for x in steps]
+        for kind, name in (("field", FIELD), ("signed", SIGNED))
+    }

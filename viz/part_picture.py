@@ -18,6 +18,7 @@ from viz.part_surface import PartSurface
 # Light that comes from the eye, a little from above and from the left.
 _LIGHT = np.array([-0.25, 0.45, 0.86])
 _AMBIENT = 0.55
+DISAGREE = "views disagree by (µm)"
 _PIXELS = 560  # along the longer side of the picture
 _INCHES = 4.4
 
@@ -37,9 +38,9 @@ def step_shown(step: ModelStep, um: float) -> tuple[str, Array]:
 
 
 def part_picture(
-    surface: PartSurface, camera: Camera, states: list[tuple[str, Array]], limit: float, unit: str
+    surface: PartSurface, camera: Camera, states: list[tuple[str, Array]], limit: float, label: str
 ) -> Figure:
-    """The part once for every state, title and values (K,) of the patches in `unit`, with one scale of colours."""
+    """The part once for every state, title and values (K,) of the patches, with one scale of colours."""
     seen = visible(surface, camera)
     high, wide = seen.shape
     inches = _INCHES / max(high, wide)
@@ -53,7 +54,7 @@ def part_picture(
         axes.axis("off")
         axes.set_title(title, fontsize=9)
     scale = ScalarMappable(Normalize(0, limit), colormaps[FIELD])
-    figure.colorbar(scale, ax=panels, label=f"views disagree by ({unit})", extend="max", shrink=0.8, aspect=30)
+    figure.colorbar(scale, ax=panels, label=label, extend="max", shrink=0.8, aspect=30)
     return figure
 
 

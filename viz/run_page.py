@@ -17,8 +17,9 @@ from viz.page_parts import png, svg
 from viz.page_tables import effect_rows, hand_eye_rows, matrix, note_rows, target_rows, view_rows
 from viz.part_camera import camera_for
 from viz.part_data import part_data
-from viz.part_picture import part_picture, step_shown
+from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import part_surface
+from viz.target_scene import target_scene
 
 # Views that are listed before the others are folded.
 _FIRST = 6
@@ -54,7 +55,8 @@ def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
     return {
         "run": run,
         "um": MICROMETRES[unit],
-        "part": None if history is None else _part(run, history),
+        "part": _targets(run) if history is None else _part(run, history),
+        "surfaces": history is not None,
         "first": rows[:_FIRST],
         "rest": rows[_FIRST:],
         "hand_eye": hand_eye_rows(run),
@@ -78,9 +80,19 @@ def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
     data = part_data(surface, camera, history, names, run.session.length_unit)
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in steps[1:]]
-    still = part_picture(surface, camera, shown[-4:], full_colour(history.models[0].field) * um, "µm")
-    words = {"caption": captions.FIELD, "handling": captions.HANDLING}
+    still = part_picture(surface, camera, shown[-4:], full_colour(history.models[0].field) * um, DISAGREE)
+    words = {"title": "Where the views disagree", "caption": captions.FIELD, "handling": captions.HANDLING}
+    words |= {"alt": "The part, coloured by how far the views disagree, at every step of the model"}
     return {"data": script_json(data), "still": png(still, 110), **words}
+
+
+def _targets(run: Run) -> dict[str, Any] | None:
+    """The same of labelled points; None where there are none."""
+    scene = target_scene(run)
+    caption = captions.CARRIED_TARGETS if run.session.mount == "eye_to_hand" else captions.SEEN_TARGETS
+    words = {"title": "Where the targets lie off", "caption": caption, "handling": captions.HANDLING}
+    words |= {"alt": "The targets, coloured by how far the views see them off their place, at every step of the model"}
+    return None if scene is None else scene | words
 
 
 def _pictures(run: Run) -> list[tuple[str, str, str]]:

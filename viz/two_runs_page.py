@@ -18,7 +18,7 @@ from viz.page_head import Head, Subject, write_page
 from viz.page_parts import png, svg
 from viz.part_camera import Camera, camera_for
 from viz.part_data import Extent, extent_of, part_data
-from viz.part_picture import part_picture, step_shown
+from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import PartSurface, part_surface
 from viz.two_runs_tables import error_rows, facts, hand_eye_change_rows, parameter_rows, view_change_rows
 
@@ -120,7 +120,7 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
                 "id": f"part-{letter.lower()}",
                 "name": f"{letter}: {sides[i].name}",
                 "data": script_json(data[i] | {"full": limit, "fullSigned": signed}),
-                "still": png(part_picture(surfaces[i], cameras[i], shown, limit, "µm"), 100),
+                "still": png(part_picture(surfaces[i], cameras[i], shown, limit, DISAGREE), 100),
             }
         )
     return out

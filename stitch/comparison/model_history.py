@@ -62,7 +62,7 @@ def _found(run: Run) -> ModelHistory | None:
     if run.registered is None:
         return None
     matches = run.registered.matches
-    states = [(name, *placed(run.measurement, model)) for name, model in _models(run)]
+    states = [(name, *placed(run.measurement, model)) for name, model in models_of(run)]
     states.append((REGISTER, run.poses, states[-1][2]))
     apart = [distances(matches, poses, points) for _, poses, points in states]
     patches = patches_of(matches, len(run.poses), run.registered.gram.scale, shown=apart[1])
@@ -79,7 +79,7 @@ def change_of(ledger: Sequence[LedgerStep], i: int) -> str:
     return ", ".join([*new, *gone]) or "fitted again"
 
 
-def _models(run: Run) -> list[tuple[str, Model]]:
+def models_of(run: Run) -> list[tuple[str, Model]]:
     """Name of the step and model: coarse, each line of the ledger, the present one as the last."""
     out = [(COARSE, Model(run.T_mount_coarse))]
     for i, step in enumerate(run.ledger[:-1]):

@@ -1,5 +1,6 @@
 """Runs on labelled points where people look: page, page of two runs, review, terminal."""
 
+import base64
 import json
 import re
 import shutil
@@ -22,6 +23,12 @@ def told(capsys, *words):
     except SystemExit as ended:
         assert not ended.code
     return " ".join(capsys.readouterr().err.split())
+
+
+def unpacked(values):
+    """Numbers as the browser unpacks them; NaN where nobody knows."""
+    counts = np.frombuffer(base64.b64decode(values["data"]), "<i2")
+    return np.where(counts == -32768, np.nan, counts * values["count"])
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -48,8 +55,33 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     )
     state = RunReview(run).state()
     assert result["plain"] in added
-    assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], False)
-    assert state["labelled"]
+    assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], True)
+    assert state["labelled"] and not state["outdated"]
+    # The picture counts what the ledger does, step by step.
+    scene = json.loads(RunReview(run).snapshot().part)
+    names = ["coarse", "hand-eye alone", "+ joint_offset", "register"]
+    assert [step["name"] for step in scene["steps"]] == names
+    shown = [step["mean"] for step in scene["steps"][1:3]]
+    assert shown == pytest.approx([1e3 * step["residual_rms"] for step in ledger], rel=0.02)
+    assert shown[1] == pytest.approx(1e3 * result["residual_rms"], rel=1e-6)
+    # Every mark has the value that residuals.parquet has of its view and target, also where one of them was chosen.
+    table = pq.read_table(run / "residuals.parquet")
+    distance = {
+        (v, t): 1e3 * e
+        for v, t, e in zip(*(table[c].to_pylist() for c in ("view", "partner", "residual")), strict=True)
+    }
+    marks = [tuple(mark) for mark in scene["marks"]]
+    assert sorted(mark for mark in marks if any(mark)) == sorted(distance)
+    some = {view for view, _ in distance if view.endswith("1")}
+    for values, known in (
+        (scene["steps"][2]["values"], distance),
+        (
+            RunReview(run).chosen(Choice(views=frozenset(some)))["chosen"]["values"],
+            {key: e for key, e in distance.items() if key[0] in some},
+        ),
+    ):
+        expected = np.array([known.get(mark, np.nan) for mark in marks])
+        np.testing.assert_allclose(unpacked(values), expected, atol=values["count"])
     # Chosen in a plot, the numbers are those of `stitch compare`.
     told(capsys, "compare", run)
     tables = json.loads((run / "compare.json").read_text())["tables"]

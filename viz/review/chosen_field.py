@@ -26,6 +26,7 @@ class Choice:
     """What was chosen; everything where nothing is stated."""
 
     views: frozenset[str] = frozenset()
+    targets: frozenset[str] = frozenset()
     bins: dict[str, tuple[int, int]] = field(default_factory=dict)  # property -> first and last bin of its table
     place: tuple[float, float, float] | None = None  # reference frame
     within: float = 0.0  # length_unit
@@ -75,7 +76,7 @@ def chosen_field(
         comparison: compare.json, whose tables have the bins.
 
     Raises:
-        InputError: a view, a property or a bin that the run does not have.
+        InputError: a view, a target, a property or a bin that the run does not have.
     """
     mask = chosen_rows(rows, choice, comparison)
     overall, e = _overall(rows, weights, mask) * um, rows.residual[mask] * um
@@ -110,13 +111,17 @@ def chosen_rows(rows: ResidualRows, choice: Choice, comparison: dict[str, Any] |
     """(N,) sides that meet all that was stated.
 
     Raises:
-        InputError: a view, a property or a bin that the run does not have.
+        InputError: a view, a target, a property or a bin that the run does not have.
     """
     mask = np.ones(len(rows.view), bool)
     if choice.views:
         if unknown := sorted(choice.views - set(rows.views)):
             raise InputError(f"{unknown[0]}: no such view in this run")
         mask &= np.isin(rows.view, [rows.views.index(name) for name in choice.views])
+    if choice.targets:
+        if unknown := sorted(choice.targets - set(rows.targets)):
+            raise InputError(f"{unknown[0]}: no such target in this run")
+        mask &= np.isin(rows.target, [rows.targets.index(name) for name in choice.targets])
     for name, (first, last) in choice.bins.items():
         mask &= _in_bins(rows, name, first, last, comparison or {})
     if choice.place is not None:

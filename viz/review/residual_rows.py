@@ -1,6 +1,6 @@
 """The residuals of a run, from its residuals.parquet: both sides of every correspondence, or every labelled point."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ class ResidualRows:
     normal: Array  # (N, 3)
     poses: Array  # (V, 4, 4) T_reference_scanner
     share: float  # of all correspondences
+    targets: tuple[str, ...] = ()  # of labelled points
+    target: Indices = field(default_factory=lambda: np.zeros(0, np.int64))  # (N,) likewise
 
     @cached_property
     def properties(self) -> dict[str, Array]:
@@ -86,7 +88,7 @@ def read_sightings(run: Path, result: dict[str, Any]) -> ResidualRows:
         InputError: a damaged file.
     """
     try:
-        table = pq.read_table(run / "residuals.parquet", columns=["view", *_COLUMNS])
+        table = pq.read_table(run / "residuals.parquet", columns=["view", "partner", *_COLUMNS])
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
     names = tuple(row["view"] for row in result["views"])
@@ -94,7 +96,18 @@ def read_sightings(run: Path, result: dict[str, Any]) -> ResidualRows:
     values = np.column_stack([table[name].to_numpy() for name in _COLUMNS])
     view = np.array([number[name] for name in table["view"].to_pylist()], np.int64)
     poses = np.array([row["pose"] for row in result["views"]], float)
-    return ResidualRows(names, view, values[:, 6], values[:, :3], values[:, 3:6], poses, share=1.0)
+    targets, target = np.unique(np.array(table["partner"].to_pylist(), str), return_inverse=True)
+    return ResidualRows(
+        views=names,
+        view=view,
+        residual=values[:, 6],
+        place=values[:, :3],
+        normal=values[:, 3:6],
+        poses=poses,
+        share=1.0,
+        targets=tuple(targets.tolist()),
+        target=target.astype(np.int64),
+    )
 
 
 def _both_sides(table: pa.Table, result: dict[str, Any], share: float) -> ResidualRows:

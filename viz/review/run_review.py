@@ -85,7 +85,7 @@ class RunReview:
             self.chosen(Choice())
 
     def chosen(self, choice: Choice) -> dict[str, Any]:
-        """Field and numbers of a choice; of labelled points numbers alone.
+        """Field and numbers of a choice.
 
         Raises:
             InputError: the run has no such view, property or bin, or no field.

@@ -75,6 +75,8 @@ def _read(run: Path, version: str) -> Snapshot:
     part, predicted = (_script(page, name) for name in ("part-data", "candidate-data"))
     steps = (result.get("disagreement") or {}).get("steps", [])
     model = version_of(run, ("result.json",))
+    # A run without clouds says null; an older one says nothing.
+    labelled = result.get("disagreement", {}) is None
     state = {
         "version": version,
         "model": model,
@@ -84,8 +86,8 @@ def _read(run: Path, version: str) -> Snapshot:
         "sentence": result.get("plain") or result["verdict"],
         "evidence": result["verdict"],
         "length_unit": result["length_unit"],
-        # A run without clouds says null; an older one says nothing.
-        "labelled": result.get("disagreement", {}) is None,
+        "labelled": labelled,
+        "carried": result["mount"] == "eye_to_hand",
         "residual": result["residual_rms"] * um,
         "heldout": None if result["heldout_rms"] is None else result["heldout_rms"] * um,
         "floor": result["noise_floor"] * um,
@@ -96,7 +98,8 @@ def _read(run: Path, version: str) -> Snapshot:
         "comparison": None if comparison is None else comparison[1],
         "history": undo_history([step.effects for step in ledger]),
         "part": part is not None,
-        "outdated": part is not None and "patchRadius" not in part,
+        # Written by an older version, or taken away.
+        "outdated": part is None or ("marks" if labelled else "patchRadius") not in part,
         "pictured": re.findall(r'"name": "(\w+)"', predicted or ""),
         "recording": (run / "recording.rrd").is_file(),
         "notes": [*result["notes"], *(f"Not observable from these motions: {x}." for x in result["unobservable"])],

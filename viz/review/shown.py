@@ -69,12 +69,12 @@ class Shown:
         return Response(text, media_type="application/json", background=warm)
 
     async def chosen(self, request: Request) -> Response:
-        """{"views", "bins", "place", "within"}: field and numbers of a choice."""
+        """{"views", "targets", "bins", "place", "within"}: field and numbers of a choice."""
         asked = await asked_object(request)
         try:
             choice = _choice(asked or {})
         except (ValueError, TypeError, LookupError, AttributeError):
-            return wrong("a choice is {views, bins, place, within}")
+            return wrong("a choice is {views, targets, bins, place, within}")
         try:
             return told(await asyncio.to_thread(self.review.chosen, choice))
         except StitchError as error:
@@ -107,6 +107,7 @@ def _choice(asked: dict[str, Any]) -> Choice:
     place = asked.get("place")
     return Choice(
         views=frozenset(str(v) for v in asked.get("views", [])),
+        targets=frozenset(str(t) for t in asked.get("targets", [])),
         bins={str(name): (int(first), int(last)) for name, (first, last) in asked.get("bins", {}).items()},
         place=None if place is None else (float(place[0]), float(place[1]), float(place[2])),
         within=float(asked.get("within", 0.0)),

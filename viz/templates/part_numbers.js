@@ -25,5 +25,5 @@ function partNumbers(data) {
     }
     return out;
   };
-  return { bytes, vertices, normals, triangles, count, unpack, onVertices };
+  return { bytes, vertices, normals, triangles, near, count, unpack, onVertices };
 }

@@ -3,13 +3,14 @@
 
 // Show a part in the elements of `root`; `more` are the fields of candidate effects, `eye` where it was looked at from.
 function showPart(root, data, more, eye) {
-  const numbers = partNumbers(data), { bytes, vertices, count, unpack, onVertices } = numbers;
+  const numbers = partNumbers(data), { bytes, vertices, near, count, unpack, onVertices } = numbers;
   const canvas = root.querySelector("canvas"), drawing = partDrawing(canvas, numbers, data.colours);
   if (!drawing) return null;  // the still picture stays
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
   const play = root.querySelector("button[data-play]");
   let { yaw, pitch, zoom, panX, panY } = eye || { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
+  if (data.words) canvas.setAttribute("aria-label", `${data.words.picture} ${canvas.getAttribute("aria-label").split(". ").slice(1).join(". ")}`);
   let steps = [], shown = -1, wanted = false, selection = null;
 
   const candidates = [];
@@ -58,18 +59,18 @@ function showPart(root, data, more, eye) {
   }
   function label() {
     const k = Math.round(Number(slider.value)), s = steps[k], signed = isSigned();
-    title.textContent = `${s.name}: ${signed ? "this view lies off by" : "the views disagree by"} `
-      + `${digits(s.mean)} µm on average` + (s.noise === undefined ? "" : ` (noise alone ${digits(s.noise)} µm)`);
+    const words = signed ? "this view lies off by {} on average" : data.words?.all ?? "the views disagree by {} on average";
+    title.textContent = `${s.name}: ${words.replace("{}", length(s.mean))}` + (s.noise === undefined ? "" : ` (noise alone ${length(s.noise)})`);
     slider.setAttribute("aria-valuetext", title.textContent);
     root.querySelectorAll("[data-steps] button").forEach((b, i) => b.setAttribute("aria-pressed", String(i === k)));
     const colours = data.colours[signed ? "signed" : "field"].map(c => `rgb(${c.join(",")})`).join(",");
     bar.querySelector("i").style.background = `linear-gradient(90deg, ${colours})`;
-    const f = full();
+    const f = full(), large = f >= 999.5, shown = large ? f / 1e3 : f;
     bar.querySelectorAll("b").forEach((b, i) => {
-      const x = signed ? -f + i * f : i * f / 2;
-      b.textContent = `${signed && i === 2 ? "+" : ""}${digits(x)}${i === 2 ? " µm" : ""}`.replace("-", "−");
+      const x = signed ? -shown + i * shown : i * shown / 2;
+      b.textContent = `${signed && i === 2 ? "+" : ""}${digits(x)}${i === 2 ? large ? " mm" : " µm" : ""}`.replace("-", "−");
     });
-    const ends = signed ? ["inwards of the others", "outwards"] : ["views agree", "views disagree"];
+    const ends = signed ? ["inwards of the others", "outwards"] : data.words?.ends ?? ["views agree", "views disagree"];
     bar.querySelector("span").replaceChildren(...ends.map(end => {
       const text = document.createElement("span");
       text.textContent = end;
@@ -77,8 +78,10 @@ function showPart(root, data, more, eye) {
     }));
   }
   const digits = x => x === 0 ? "0" : Number(x.toPrecision(3)).toString();
+  const length = um => um >= 999.5 ? `${digits(um / 1e3)} mm` : `${digits(um)} µm`;
   function names() {
     const list = root.querySelector("[data-steps]");
+    choice.parentElement.hidden = choice.length < 2;
     list.replaceChildren(...steps.map((s, i) => {
       const b = document.createElement("button");
       b.type = "button"; b.textContent = s.name;
@@ -176,7 +179,7 @@ function showPart(root, data, more, eye) {
     if (best < 0) return;
     const flat = [0, 1, 2].map(k => vertices[3 * best + k] / 32767 * data.size + data.centre[k]);
     const place = [0, 1, 2].map(k => flat.reduce((sum, value, row) => sum + value * data.axes[row][k], 0));
-    root.dispatchEvent(new CustomEvent("pick", { detail: place }));  // reference frame, length_unit
+    root.dispatchEvent(new CustomEvent("pick", { detail: { place, patch: near[3 * best] } }));  // reference frame, length_unit
   }
   new ResizeObserver(draw).observe(canvas);
   root.classList.add("live");

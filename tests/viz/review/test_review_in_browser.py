@@ -3,9 +3,12 @@
 import json
 import re
 
+import numpy as np
 import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.write import write_session
 from tests.in_browser import barriers
 from tests.viz.review.conftest import compare_without_picture, served
@@ -105,6 +108,41 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     assert not story.wrong
     assert all(url.startswith(address) for url in story.asked)
     story.page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["points", "frames"])
+def test_the_story_of_labelled_points(browser, kind, tmp_path, stitch_command):
+    """Targets are seen where they stood, chosen by a click, and fade when an effect is added."""
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(2, views=24, offset=offset, probe=kind == "frames")
+    folder, run = write_labelled(tmp_path / "s", session, kind), tmp_path / "r"
+    stitch_command("run", folder, "-o", run, "--no-recording")
+    with served(run) as server:
+        story = Story(browser, server.address)
+        title = story.page.locator("#scene [data-title]")
+        rms = json.loads((run / "result.json").read_text())["residual_rms"]
+        playwright.expect(title).to_have_text(
+            re.compile(f"hand-eye alone: the views see the targets {1e3 * rms:.3g} µm off their place, rms")
+        )
+        story.says("#plots", "signed mean")
+        assert barriers(story.page) == []
+        # The mark in the middle of the picture may be any: some click near it meets one.
+        canvas = story.page.locator("#scene canvas").bounding_box()
+        for share in np.linspace(0.1, 0.9, 60):
+            story.page.mouse.click(canvas["x"] + canvas["width"] / 2, canvas["y"] + share * canvas["height"])
+            if story.page.locator("#plots [aria-pressed=true]").count():
+                break
+        story.says("#chosen", "1 of 24 views")
+        playwright.expect(title).to_contain_text("chosen: the views see the targets")
+        story.click("Find what is missing")
+        story.says("#missing", "joint_offset is missing")
+        story.click("Add joint_offset")
+        story.says("#ledger", "+ joint_offset")
+        story.says("#scene [data-steps]", "+ joint_offset")
+        assert not story.wrong
+        assert all(url.startswith(server.address) for url in story.asked)
+        story.page.close()
 
 
 @pytest.mark.slow

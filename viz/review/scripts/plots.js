@@ -4,10 +4,10 @@ import { showChoice } from "./scene.js";
 import { send } from "./server.js";
 
 // More bars than this are thinner than a finger, and slow.
-const FIRST = 5, MOST = 60, VIEWS = "view", PLACES = "place on the part";
+const FIRST = 5, MOST = 60, VIEWS = "view", TARGETS = "target", PLACES = "place on the part";
 let choice = empty(), state = null, all = false, asked = 0;
 
-function empty() { return { views: [], bins: {}, place: null, within: 0, name: "" }; }
+function empty() { return { views: [], targets: [], bins: {}, place: null, within: 0, name: "" }; }
 
 // Draw the plots of a state; a choice of another model is forgotten.
 export function showPlots(next) {
@@ -22,6 +22,16 @@ export function choosePlace(place, within = 0, name = "a place of the part") {
   draw(); ask();
 }
 
+// A click on the part: a place of it, or among labelled points the view or the target that stands there.
+export function chooseOnPart(place, mark) {
+  if (!mark) { choosePlace(place); return; }
+  if (mark.view) choice.views = toggled(choice.views, mark.view);
+  else if (mark.target) choice.targets = toggled(choice.targets, mark.target);
+  draw(); ask();
+}
+
+const toggled = (names, name) => names.includes(name) ? names.filter(n => n !== name) : [...names, name];
+
 function draw() {
   const root = at("plots");
   if (!state.comparison) {
@@ -35,27 +45,28 @@ function draw() {
   const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));
   const shown = all ? properties : properties.slice(0, FIRST);
   const focus = document.activeElement && document.activeElement.dataset.key;
-  root.replaceChildren(views(), ...shown.map(table => plot(table, follows)), places(),
+  root.replaceChildren(named(VIEWS, "Views", "views", state.labelled ? "rms of the labelled points of each" : "rms of each against the others"),
+    named(TARGETS, "Targets", "targets", "rms of each over the views"), ...shown.map(table => plot(table, follows)), places(),
     properties.length > FIRST && element("button", { type: "button", onclick: () => { all = !all; draw(); }, "aria-expanded": String(all) },
       all ? "Fewer properties" : `${properties.length - FIRST} further properties`));
   if (focus) root.querySelector(`[data-key="${CSS.escape(focus)}"]`)?.focus();
 }
 
-function views() {
-  const table = state.comparison.find(t => t.name === VIEWS);
-  if (!table) return "";
-  const rms = Object.fromEntries(table.label.map((name, i) => [name, table.rms[i] ?? 0]));
+// A bar for every view, or for every target.
+function named(name, title, key, what) {
+  const table = state.comparison.find(t => t.name === name);
+  if (!table || table.label.length < 2) return "";
+  const rms = Object.fromEntries(table.label.map((label, i) => [label, table.rms[i] ?? 0]));
   const worst = new Set([...table.label].sort((a, b) => rms[b] - rms[a]).slice(0, MOST));
-  const shown = table.label.filter(name => worst.has(name)), most = Math.max(...shown.map(name => rms[name]), 1e-9);
-  const what = state.labelled ? "rms of the labelled points of each" : "rms of each against the others";
+  const shown = table.label.filter(label => worst.has(label)), most = Math.max(...shown.map(label => rms[label]), 1e-9);
   const few = shown.length < table.label.length ? `: the ${shown.length} farthest off of ${table.label.length}` : "";
-  return card("Views", `${what}, up to ${um(most)}${few}`, "wide", shown.map((name, i) => bar({
-    key: `view ${name}`, height: rms[name] / most, from: 0, pressed: choice.views.includes(name),
-    label: `view ${name}: rms ${um(rms[name])}`,
+  return card(title, `${what}, up to ${um(most)}${few}`, "wide", shown.map((label, i) => bar({
+    key: `${name} ${label}`, height: rms[label] / most, from: 0, pressed: choice[key].includes(label),
+    label: `${name} ${label}: rms ${um(rms[label])}`,
     toggle: range => {
-      const before = choice.views, last = shown.indexOf(before[before.length - 1]);
-      const span = range && last >= 0 ? shown.slice(Math.min(i, last), Math.max(i, last) + 1) : [name];
-      choice.views = before.includes(name) ? before.filter(v => v !== name) : [...new Set([...before, ...span])];
+      const before = choice[key], last = shown.indexOf(before[before.length - 1]);
+      const span = range && last >= 0 ? shown.slice(Math.min(i, last), Math.max(i, last) + 1) : [];
+      choice[key] = span.length ? [...new Set([...before, ...span])] : toggled(before, label);
     },
   })), shown[0], shown[shown.length - 1]);
 }
@@ -114,7 +125,9 @@ function words() {
     const table = state.comparison.find(t => t.name === name);
     return `${name} ${digits(table.low[first])} … ${digits(table.high[last])} ${table.unit}`.trim();
   });
-  if (choice.views.length) out.push(choice.views.length > 3 ? `${choice.views.length} views` : choice.views.join(", "));
+  for (const [key, one] of [["views", ""], ["targets", "target "]]) {
+    if (choice[key].length) out.push(choice[key].length > 3 ? `${choice[key].length} ${key}` : one + choice[key].join(", "));
+  }
   if (choice.place) out.push(choice.name);
   return out.join(" · ");
 }
@@ -125,8 +138,8 @@ async function ask() {
   if (!name) { showChoice("", null); numbers(null); return; }
   at("chosen").setAttribute("aria-busy", "true");
   try {
-    const { views, bins, place, within } = choice;
-    const told = await send("chosen", { views, bins, place, within });
+    const { views, targets, bins, place, within } = choice;
+    const told = await send("chosen", { views, targets, bins, place, within });
     if (mine !== asked) return;
     if (told.model !== state.model) return;
     showChoice(name, told); numbers(name, told);

@@ -3,9 +3,9 @@ import { showCandidates } from "./candidates.js";
 import { at } from "./elements.js";
 import { showLedger } from "./ledger.js";
 import { heardOwn, showOwn } from "./own_effect.js";
-import { choosePlace, showPlots } from "./plots.js";
+import { chooseOnPart, showPlots } from "./plots.js";
 import { showRecording } from "./recording.js";
-import { onPick, show, showNumbers } from "./scene.js";
+import { markOf, onPick, show, showNumbers } from "./scene.js";
 import { listen, read, send } from "./server.js";
 import * as work from "./work.js";
 
@@ -82,7 +82,7 @@ listen(event => {
   }
 }, () => lost("The server does not answer; is `stitch review` still running? This page asks again by itself."));
 
-onPick(place => choosePlace(place));
+onPick((place, patch) => chooseOnPart(place, markOf(patch)));
 at("note-form").addEventListener("submit", async event => {
   event.preventDefault();
   await ask({ kind: "note", text: at("note").value, by: at("by").value });

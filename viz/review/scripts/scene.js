@@ -3,10 +3,11 @@ import { at, element, um } from "./elements.js";
 import { read } from "./server.js";
 
 const root = at("scene");
-let viewer = null, model = null, diagnosed = null;
+let viewer = null, model = null, diagnosed = null, marks = null;
 
 // Show the part of a state; true if it was made anew. `fade`: from the model before to the present one.
 export async function show(state) {
+  words(state);
   if (!state.part) { root.classList.remove("live"); model = null; return false; }
   const mark = state.pictured.join() + (state.diagnosis ? state.diagnosis.plain + state.diagnosis.sentence : "");
   if (state.model === model && mark === diagnosed) return false;
@@ -25,7 +26,8 @@ export async function show(state) {
   if (focused) fresh.focus();
   viewer = window.showPart(root, told.part, told.predicted, eye);
   at("no-part").hidden = viewer !== null;
-  model = told.model; diagnosed = mark;
+  at("no-part").textContent = "No picture: this browser has no WebGL.";
+  model = told.model; diagnosed = mark; marks = told.part.marks || null;
   if (!viewer) return true;
   const last = Math.max(viewer.names().length - 2, 0);  // the present model; register comes after it
   viewer.jump(changed ? Math.max(last - 1, 0) : last);
@@ -33,15 +35,24 @@ export async function show(state) {
   return true;
 }
 
+function words(state) {
+  at("scene-title").textContent = state.labelled ? "The targets" : "The part";
+  if (!state.labelled) return;
+  const click = state.carried ? "A click on a ball chooses its view." : "A click on a ball chooses its target, on a pyramid its view.";
+  at("fails-hint").textContent = `Choose bars, with Shift a range of them: colours and numbers follow. ${click}`;
+}
+
 export const predict = name => viewer !== null && viewer.predict(name);
-export const onPick = heard => root.addEventListener("pick", event => heard(event.detail));
+// View and target of a mark among labelled points, each null where it stands for all; null on a surface.
+export const markOf = patch => marks && { view: marks[patch][0], target: marks[patch][1] };
+export const onPick = heard => root.addEventListener("pick", event => heard(event.detail.place, event.detail.patch));
 
 // The field of a choice beside that of everything; null takes it away.
 export function showChoice(name, told) {
   if (!viewer) return;
   viewer.choose(name, told && [
-    { name: "everything", mean: told.all.mean, values: told.all.values },
-    { name: "chosen", mean: told.chosen.mean ?? 0, values: told.chosen.values },
+    { name: "everything", mean: told.all.mean ?? told.all.rms, values: told.all.values },
+    { name: "chosen", mean: told.chosen.mean ?? told.chosen.rms ?? 0, values: told.chosen.values },
   ]);
 }
 
