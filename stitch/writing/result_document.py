@@ -18,7 +18,8 @@ _VERSIONS = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kis
 
 
 def model_of(run: Run) -> ModelFile:
-    """The model that a run fitted, as model.toml states it."""
+    """The model that a run fitted, as model.toml states it; a file of effects is named while one of them is in use."""
+    own = any(term.effect.tier == "user" for term in run.terms)
     return ModelFile(
         length_unit=run.session.length_unit,
         mount=run.session.mount,
@@ -26,7 +27,7 @@ def model_of(run: Run) -> ModelFile:
         T_mount_coarse=run.T_mount_coarse,
         covariance=run.mount_covariance,
         effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
-        effects_file=run.effects_file,
+        effects_file=run.effects_file if own else None,
         targets=targets_of(run.targets),
         effects_covariance=run.model.effects_covariance,
     )

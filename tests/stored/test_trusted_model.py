@@ -1,11 +1,20 @@
 """A Python file that a model names is run only where somebody allows it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
+from stitch.model.model_toml import read_model
+from stitch.pipeline import add, drop, run
+from stitch.reading.session_folder import load_session
+from stitch.stored.load_state import load_state
 from stitch.stored.trusted_model import trusted_model
+from stitch.writing import run_folder
 
 EFFECT = """
 from pathlib import Path
@@ -58,3 +67,23 @@ def test_values_must_be_numbers(model):
     model.write_text(model.read_text() + '[effects.range_scale.s]\nvalue = nan\nunit = ""\n')
     with pytest.raises(InputError, match=r"effects.range_scale.s is nan; to fix"):
         trusted_model(model, trust=True)
+
+
+def test_a_file_is_named_while_an_effect_of_it_is_in_use(tmp_path):
+    """Otherwise a model that needs no Python of anybody would ask for consent to run some."""
+    file, folder = tmp_path / "mine.py", tmp_path / "r"
+    file.write_text(
+        EFFECT.replace("of_a_stranger", "of_my_own").replace("return points", "return points * (1 + 1e-3 * k)")
+    )
+    session = load_session(write_labelled(tmp_path / "s", labelled_cell(views=12)[0]))
+    folder.mkdir()
+    try:
+        run_folder.write_run(replace(run(session), effects_file=str(file)), folder)
+        assert read_model(folder).effects_file is None
+        for change, *names in ((add, "of_my_own"), (add, "joint_offset"), (drop, "of_my_own")):
+            run_folder.write_run(change(load_state(folder, file), *names), folder)
+            used = change is add
+            assert read_model(folder).effects_file == (str(file) if used else None)
+    finally:
+        EFFECTS.pop("of_my_own", None)
+    assert load_state(folder).model.effects == ["joint_offset"]

@@ -28,6 +28,7 @@ class RunReview:
     run: Path
     effects_file: Path | None = None  # of the user's own, trusted by naming it
     trust: bool = False  # the file that the model names
+    _allowed: str | None = None  # that file: a model without its effects names it no more, but may have them back
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _last: Snapshot | None = None
     _rows: KnownResiduals | None = None
@@ -130,7 +131,13 @@ class RunReview:
     def _trusted(self) -> list[str]:
         if self.effects_file is not None:
             return ["--effects-file", str(self.effects_file)]
-        return ["--trust"] if self.trust else []
+        if not self.trust:
+            return []
+        named = read_model(self.run).effects_file
+        if named is None:
+            return [] if self._allowed is None else ["--effects-file", self._allowed]
+        self._allowed = named
+        return ["--trust"]
 
     def _asked_for_trust(self) -> dict[str, str] | None:
         """The file of effects that the model names, where nobody has allowed it yet."""

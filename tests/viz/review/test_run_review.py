@@ -100,6 +100,9 @@ def test_python_of_a_run_that_somebody_sent_waits_for_consent(run, tmp_path):
     review.trust = True
     assert review.state()["trust"] is None
     assert review.arguments("diagnose", {}) == ["diagnose", str(run), "--trust"]
+    # When the effects have been taken out, what was allowed can still be put back.
+    model.write_text(model.read_text().partition("\n")[2])
+    assert review.arguments("diagnose", {}) == ["diagnose", str(run), "--effects-file", str(file)]
 
 
 def test_own_effects_stay_in_the_run_folder_and_go_with_every_command(run):
