@@ -140,11 +140,13 @@ def _words(scene: ModelScene, k: int, share: float) -> str:
     """What is seen at a step, or on the way from step k to the next."""
     steps = scene.history.steps
     if 0 < share < 1:
-        return f"## {steps[k].name} → {steps[k + 1].name}\n{share:.0%} of the way: colours, places and bars run evenly."
+        told = "Nothing is fitted in between: colours, places and bars are drawn in proportion."
+        return f"## {steps[k].name} → {steps[k + 1].name}\n{100 * share:.0f} % of the way. {told}"
     now = k + round(share)
     noise = f"noise alone would leave {steps[now].field.noise * scene.um:.2g} µm"
-    shown = f"Displacements: {scene.magnified[now]:g} times larger than they are. Grey bars: "
-    shown += f"{scene.history.models[0].name}."
+    first = scene.history.models[0].name
+    shown = f"Displacements: {scene.magnified[now]:g} times larger than they are. Bars: the views in their order, from 0; "
+    shown += f"behind them in grey those of {first}, darker where a view is farther off than there."
     return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; {noise}.\n\n{shown}"
 
 
