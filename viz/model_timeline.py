@@ -145,7 +145,9 @@ def _words(scene: ModelScene, k: int, share: float) -> str:
     now = k + round(share)
     noise = f"noise alone would leave {steps[now].field.noise * scene.um:.2g} µm"
     first = scene.history.models[0].name
-    shown = f"Displacements: {scene.magnified[now]:g} times larger than they are. Bars: the views in their order, from 0; "
+    shown = (
+        f"Displacements: {scene.magnified[now]:g} times larger than they are. Bars: the views in their order, from 0; "
+    )
     shown += f"behind them in grey those of {first}, darker where a view is farther off than there."
     return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; {noise}.\n\n{shown}"
 

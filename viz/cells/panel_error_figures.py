@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +12,13 @@ from stitch.cells.panel.errors_along import ErrorsAlong
 from stitch.cells.panel.panel_job import Job
 from stitch.cells.panel.panel_solution import JobResult
 from stitch.frames import Array
+from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
+
+# Lines that lie upon one another still tell by their marks; nobody has to tell red from green.
+_STYLES: list[dict[str, Any]] = [
+    {"color": colour, "marker": marker, "ms": 5, "mfc": "none"}
+    for colour, marker in zip((BLUE, ORANGE, GREEN, YELLOW, DARK, "black"), "osD^vx", strict=True)
+]
 
 
 def write_pictures(job: Job, result: JobResult, folder: Path) -> list[str]:
@@ -42,7 +50,7 @@ def _draw_slaves(ax: Axes, steps: Array, sizes: Array, names: Sequence[str], *, 
     """Errors (3, D, N) over D steps, the worst axis of each slave."""
     for i, name in enumerate(names):
         if i != master:
-            ax.plot(steps, sizes[:, :, i].max(axis=0), label=name)
+            ax.plot(steps, sizes[:, :, i].max(axis=0), label=name, **_STYLES[i % len(_STYLES)])
     # An error of zero shall look like zero, not like magnified rounding.
     ax.set_ylim(0, max(0.05, 1.05 * sizes.max()))
     ax.grid(alpha=0.3)
@@ -54,11 +62,11 @@ def shape_figure(names: Sequence[str], steps: Sequence[Array], tolerance: float,
     deviations, bars = figure.subplots(1, 2)
     table = np.array(steps)
     for i, name in enumerate(names):
-        deviations.plot(range(len(table)), table[:, i], marker="o", label=name)
+        deviations.plot(range(len(table)), table[:, i], label=name, **_STYLES[i % len(_STYLES)])
     deviations.axhline(tolerance, color="0.4", linestyle="--", label="tolerance")
-    deviations.set(xlabel="corrections", ylabel="largest deviation at the clamp (mm)", xticks=range(len(table)))
+    deviations.set(xlabel="corrections made", ylabel="largest deviation at the clamp (mm)", xticks=range(len(table)))
     deviations.set_ylim(0, None)
     deviations.legend(fontsize="small", ncols=2)
-    bars.bar(range(len(forces)), forces)
-    bars.set(xlabel="corrections", ylabel="largest change of force (N)", xticks=range(len(forces)))
+    bars.bar(range(len(forces)), forces, color=BLUE)
+    bars.set(xlabel="corrections made", ylabel="largest change of force (N)", xticks=range(len(forces)))
     return figure

@@ -29,7 +29,10 @@ def deviation_map(found: Deviations, unit: str = UNIT) -> Figure:
     colours = {"c": found.distance[order], "cmap": SIGNED, "vmin": -found.tolerance, "vmax": found.tolerance}
     drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
     bad = found.cells.middle[found.outside]
-    ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5)
+    if len(bad):
+        ringed = f"ringed: beyond the tolerance of ±{found.tolerance:g} {unit}"
+        ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5, label=ringed)
+        ax.legend(fontsize="small", loc="lower right")
     figure.colorbar(drawn, label=f"off the CAD, + outside ({unit})", extend="both", shrink=0.8)
     # White means no deviation, so the ground cannot be white.
     ax.set_facecolor("0.78")
