@@ -20,6 +20,10 @@ from stitch.measurement.session import Session
 # A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
 # (`CLOSE_SHARE` of the part's size).
 _CLOSER = 0.2
+_TORN = (
+    "a part of this scan contradicts the other scans wherever it is put: the part or the scanner moved meanwhile, or "
+    "two scans are in one file; scan again or leave the view out"
+)
 _COPY = "this scan is a copy of that of {}: put the right file in its row"
 
 
@@ -106,6 +110,8 @@ def _single(
     fault = _fault(capture, T_mount, found, m)
     if fault is not None:
         return Problem(fault.kind, own, fault.fix)
+    if m.kind == "torn":
+        return Problem("displaced", own, _TORN)
     if m.T is None:
         return Problem(
             "foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out"

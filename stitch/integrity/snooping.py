@@ -13,6 +13,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.blunders import Block, Found, find_blunders, off_anyway
+from stitch.integrity.contradiction import STILL, contradicting
 from stitch.integrity.linkage import Linkage, linkage
 from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
 from stitch.integrity.unlinked_views import needed_closure, placed_views
@@ -29,7 +30,7 @@ class Misplaced:
     """A view that does not belong where its pose puts it."""
 
     view: int
-    kind: str  # displaced | foreign
+    kind: str  # displaced | foreign | torn: in itself, so that it contradicts the others wherever it is put
     rotation: float  # rad; NaN for a foreign scan
     distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
     p_value: float  # family-wise, 0 where it is not even linked
@@ -101,8 +102,9 @@ def snoop(
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
     lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
-    linked = linkage(freed.overlaps, lines)
     tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
+    torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]))
+    linked = linkage(freed.overlaps, {*lines, *torn})
     needed = needed_closure(capture, freed.poses, linked, tolerance)
     placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
     if placed:
@@ -110,6 +112,7 @@ def snoop(
         for v, placement in placed.items():
             poses[v] = placement.T
         freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
+        torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]), STILL) if torn else ()
     model = view_model(capture, T_mount, freed)
     off = off_anyway(model, homeless, list(placed))
     alone = [*homeless, *(b.view for b in off)]
@@ -122,9 +125,10 @@ def snoop(
     if sure and usual is not None:
         again = find_blunders(model.with_usual(usual(freed)), alone)
         sure &= {b.view for b in again.blunders} | set(linked.unlinked)
-    groups = linkage(freed.overlaps, lines).components
+    groups = linkage(freed.overlaps, {*lines, *(v for v in torn if v in homeless)}).components
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
     misplaced = [m for m in standing_out if m.view in sure] + foreign
+    misplaced = [replace(m, kind="torn") if m.view in torn and m.view in placed else m for m in misplaced]
     return Snooping(
         linkage=linked,
         misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),

@@ -39,6 +39,22 @@ def test_a_good_session_leaves_nothing_out(good):
     assert np.isfinite(found.view_rms).all()
 
 
+def test_a_scan_that_is_torn_in_itself_is_named_and_left_out(good):
+    """Half of it 1 mm off: that half has no partners, and the other fits; it used to be fused beside the others."""
+    points = good.views[4].cloud.points
+    half = points[:, 0] > np.median(points[:, 0])
+    found = run(with_view(good, 4, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, 1.0]))))
+    assert [item.view for item in found.left_out] == ["v004"]
+    assert "contradicts the other scans wherever it is put" in found.left_out[0].why
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_scan_that_stands_beside_the_others_is_no_second_surface(good, axis):
+    """However few partners are left within the gate, and however well these fit."""
+    found = run(with_view(good, 4, cloud=Cloud(good.views[4].cloud.points + np.eye(3)[axis])))
+    assert [item.view for item in found.left_out] == ["v004"] and "off by" in found.left_out[0].why
+
+
 def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
     swapped = with_view(with_view(good, 2, cloud=good.views[6].cloud), 6, cloud=good.views[2].cloud)
     found = run(swapped)

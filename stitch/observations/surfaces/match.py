@@ -62,11 +62,11 @@ def overlapping_pairs(
                     return True
         return False
 
-    pairs = _near(scans, poses, gate)
+    pairs = near_pairs(scans, poses, gate)
     return [pair for pair, meets in zip(pairs, parallel(overlap, pairs), strict=True) if meets]
 
 
-def _near(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
+def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
     """Pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
     placed = [frames.transform(T, corners(box_of(scan.points))) for scan, T in zip(scans, poses, strict=True)]
     low, high = np.min(placed, axis=1), np.max(placed, axis=1)

@@ -1,0 +1,83 @@
+"""Which scans show a surface where others show it elsewhere, facing the same way: it cannot be in two places.
+
+Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
+stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the scan or
+two scans are in one file, fits with one half and contradicts with the other.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array
+from stitch.measurement.scan import Scan
+from stitch.observations.surfaces.match import near_pairs, sample
+
+# Points of a scan that are asked, and how far from the surface of the others, as a share of the part's size.
+_PROBES, _REACH = 1000, 0.03
+# The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
+_SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
+# Elsewhere is farther than so many tolerances: what a lens or a slant does to a scan moves it by less.
+_ELSEWHERE = 3.0
+# A scan contradicts the others if this share of what they show of it stands elsewhere; one that was put where it fits
+# best, and still does by the second, is torn.
+CONTRADICTS, STILL = 0.2, 0.05
+
+
+def contradicting(
+    scans: Sequence[Scan], poses: Array, tolerance: float, size: float, share: float = CONTRADICTS
+) -> tuple[int, ...]:
+    """Views that contradict the others, most of all first; each is asked without those before it.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner at which the views fit best.
+        tolerance: distance along the normal that is the same place, length_unit.
+        size: of the part, length_unit.
+        share: of what others show of a view that stands elsewhere.
+    """
+    said = _pairs(scans, poses, tolerance, _REACH * size)
+    out = list[int]()
+    while True:
+        shares = [0.0 if v in out else _share(own, out) for v, own in enumerate(said)]
+        worst = int(np.argmax(shares))
+        if shares[worst] < share:
+            return tuple(out)
+        out.append(worst)
+
+
+def _share(own: dict[int, Array], without: Sequence[int]) -> float:
+    """Of the points that other views show too, the share that all of these show elsewhere."""
+    others = [shown for w, shown in own.items() if w not in without]
+    if not others:
+        return 0.0
+    best = np.max(others, axis=0)
+    return float(np.sum(best == 1) / max(np.sum(best > 0), 1))
+
+
+def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) -> list[dict[int, Array]]:
+    """Per view and other view what that shows of each asked point (n,): 2 in its place, 1 elsewhere, 0 nothing."""
+    asked = [sample(scan, _PROBES) for scan in scans]
+    out: list[dict[int, Array]] = [{} for _ in scans]
+    for pair in near_pairs(scans, poses, reach):
+        for v, w in (pair, pair[::-1]):
+            T_w_v = frames.inverse(poses[w]) @ poses[v]
+            points = frames.transform(T_w_v, scans[v].points[asked[v]])
+            normals = frames.rotate(T_w_v, scans[v].normals[asked[v]])
+            out[v][w] = _shown(scans[w], points, normals, (tolerance, reach))
+    return out
+
+
+def _shown(scan: Scan, points: Array, normals: Array, limits: tuple[float, float]) -> Array:
+    """(n,) 2, 1 or 0 of points with normals in the frame of a scan; 0 too for what is neither here nor elsewhere."""
+    tolerance, reach = limits
+    distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
+    found = np.isfinite(distance)
+    partner = np.where(found, partner, 0).astype(np.int64)
+    own, apart = scan.normals[partner], points - scan.points[partner]
+    along = np.einsum("ni,ni->n", apart, own)
+    beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=found, out=np.full(len(points), np.inf))
+    found &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, own) > _SAME_SIDE)
+    found &= beside < _SPACINGS * scan.spacing
+    away = np.abs(along) / tolerance
+    return np.where(found & (away < 1), 2, np.where(found & (away > _ELSEWHERE), 1, 0))
