@@ -1,9 +1,9 @@
 """Pictures of `stitch review`, click by click, and what it needs: python -m bench.review_pictures [--session FOLDER].
 
 Writes docs/pictures/review-*.png: the demo's cell with joint compliance hidden (seed 3), from opening to the error that
-fell, a note, an effect of one's own, undo; in dark and on a phone. Prints start-up time, memory and the time of every
-click. Needs playwright and a Chromium on the path. With --session the same clicks on a session of one's own, without
-pictures.
+fell, a note, an effect of one's own, undo; in dark and on a phone; a session of labelled points. Prints start-up time,
+memory and the time of every click. Needs playwright and a Chromium on the path. With --session the same clicks on a
+session of one's own, without pictures.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, expect, sync_playwright
 
+from bench.page_folders import tracked_arm
 from bench.report_pictures import call
 from bench.review_clicks import LONG, Camera, after, story
 from bench.review_server import choices, memory, served
@@ -50,6 +51,23 @@ def looks(browser: Browser, address: str) -> None:
         page.close()
 
 
+def targets(browser: Browser, folder: Path) -> None:
+    """An arm of which two joints are off, seen by labelled points: one end of a joint's range chosen."""
+    tracked_arm(folder)
+    call(["run", folder / "arm", "-o", folder / "arm-run", "--no-recording"])
+    with served(folder / "arm-run") as (address, _):
+        page = browser.new_page(viewport=WIDE)
+        page.goto(address)
+        camera = Camera(page, keep=True)
+        expect(page.locator("#scene.live")).to_be_visible(timeout=LONG)
+        camera.says("#doing", "Done: stitch compare")
+        bars = page.locator("#plots [data-key^='j3 ']")
+        camera.press(bars.nth(0))
+        camera.says("#chosen", "residuals: rms")
+        camera.shoot("targets")
+        page.close()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--session", type=Path, help="a session, instead of the demo's cell; no pictures")
@@ -74,6 +92,8 @@ def main() -> None:
                 looks(browser, address)
                 after(camera)
             print(f"memory of the server: {memory(process)}; errors on the console: {camera.wrong or 'none'}")
+        if given.session is None:
+            targets(browser, folder)
         browser.close()
 
 

@@ -1,5 +1,5 @@
 // What is missing: candidate effects with what they should leave, and the button that adds one.
-import { at, element, um } from "./elements.js";
+import { at, element, signed, um } from "./elements.js";
 import { predict } from "./scene.js";
 
 const FIRST = 4;
@@ -23,7 +23,7 @@ export function showCandidates(state, ask, busy) {
       all ? "Fewer candidate effects" : `${found.candidates.length - FIRST} further candidate effects`)].filter(Boolean);
   const open = all || root.querySelector("#tried[open]") !== null;
   root.replaceChildren(element("h3", {}, found.plain),
-    ...(found.sentence ? [element("p", { class: "soft" }, found.sentence)] : []),
+    ...(found.sentence ? [element("p", { class: "soft" }, signed(found.sentence))] : []),
     ...(found.verdict === "adequate" ? [element("details", { id: "tried", open }, element("summary", {}, "Candidate effects that were tried"), ...table)] : table),
     ...[limits(found)].filter(Boolean));
 }
@@ -59,13 +59,13 @@ function candidate(c, found, state, most, ask, busy) {
         c.rms_if_added == null ? "–" : bars(c.rms_if_added, c.heldout_if_added, most, state.floor)),
       element("td", {}, c.posterior.toFixed(2)), element("td", {}, look || "", " ", add)),
     element("tr", {}, element("td", { class: "wide", colspan: "4" },
-      [numbers(c.rms_if_added, c.heldout_if_added), c.amounts, `p = ${c.p}`, c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
+      [numbers(c.rms_if_added, c.heldout_if_added), signed(c.amounts), signed(`p = ${c.p}`), c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
   ];
 }
 
 function limits(found) {
   const told = [];
-  if (found.follows.length) told.push(`What is left follows ${found.follows.slice(0, 3).map(f => `${f.covariate} (p = ${f.p})`).join(", ")}.`);
+  if (found.follows.length) told.push(`What is left follows ${found.follows.slice(0, 3).map(f => `${f.covariate} (p = ${signed(f.p)})`).join(", ")}.`);
   if (found.unseen.length) told.push(`These views cannot show: ${found.unseen.join(", ")}.`);
   for (const u of found.untested) told.push(`Not tested without ${u.needs.join(", ")}: ${u.effect}.`);
   for (const n of found.next) told.push(`To measure next: ${n.do} (separates ${n.separates.join(" and ")}).`);

@@ -13,6 +13,9 @@ export function element(tag, attributes = {}, ...children) {
   return made;
 }
 
+// Signs of numbers as signs, which no line breaks after: −2e−07, not -2e- 07.
+export const signed = text => text.replace(/(^|[\s=(±])-(?=\d)/g, "$1−").replace(/(\d)e-(?=\d)/g, "$1e−");
+
 export const at = id => document.getElementById(id);
 
 // Three digits, as the page of a run has them.

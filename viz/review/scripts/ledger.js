@@ -1,6 +1,6 @@
 // How the error fell: a step for every change of the model, its remarks, undo and redo.
 import { bars, legend } from "./candidates.js";
-import { at, element, um } from "./elements.js";
+import { at, element, signed, um } from "./elements.js";
 
 let drawn = 0;
 
@@ -36,5 +36,5 @@ function fall(track, before, step, most) {
 function parameters(rows) {
   if (!rows.length) return;
   at("ledger").append(element("details", {}, element("summary", {}, "Effects in the model"),
-    ...rows.map(r => element("p", {}, `${r.effect}.${r.parameter} = ${r.value} ± ${r.sigma} ${r.unit}`))));
+    ...rows.map(r => element("p", {}, signed(`${r.effect}.${r.parameter} = ${r.value} ± ${r.sigma} ${r.unit}`)))));
 }

@@ -10,9 +10,11 @@ def humidity_bias(points, view, k):
     """x = x* + u·k·(humidity − first humidity)"""
     return points + view.along(points) * (k * view.since_first("humidity_percent"))
 `;
-let filled = false, mine = null;
+let filled = false, mine = null, model = null;
 
 export function showOwn(state) {
+  if (model && model !== state.model && !mine) at("own-told").textContent = "";  // it spoke of the model before
+  model = state.model;
   if (!filled) { at("own").value = state.own || EXAMPLE; filled = true; }
   const box = at("consent");
   box.hidden = !state.trust;

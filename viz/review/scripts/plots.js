@@ -75,7 +75,8 @@ function plot(table, follows) {
   const spread = table.mean_sigma.map(x => 2 * (x ?? 0));
   const most = Math.max(...table.mean.map((x, i) => Math.abs(x ?? 0) + spread[i]), 1e-9);
   const unit = table.unit ? ` ${table.unit}` : "", chosen = choice.bins[table.name];
-  const told = follows.includes(table.name) ? "what is unexplained follows it; " : "";
+  const told = (follows.includes(table.name) ? "what is unexplained follows it; " : "")
+    + (table.name.startsWith("approach of ") ? "−1: it last turned down, +1: up; " : "");
   return card(`${table.name}${table.unit ? ` (${table.unit})` : ""}`, `${told}signed mean ± 2σ, within ±${um(most)}`, "", table.mean.map((mean, i) => bar({
     key: `${table.name} ${i}`, height: (mean ?? 0) / most / 2, from: 0.5, spread: spread[i] / most / 2,
     pressed: Boolean(chosen && chosen[0] <= i && i <= chosen[1]),

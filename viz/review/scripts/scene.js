@@ -39,7 +39,7 @@ function words(state) {
   at("scene-title").textContent = state.labelled ? "The targets" : "The part";
   if (!state.labelled) return;
   const click = state.carried ? "A click on a ball chooses its view." : "A click on a ball chooses its target, on a pyramid its view.";
-  at("fails-hint").textContent = `Choose bars, with Shift a range of them: colours and numbers follow. ${click}`;
+  at("fails-hint").textContent = `Choose bars, with Shift a range of them: colours and numbers follow, the rest is grey. ${click}`;
 }
 
 export const predict = name => viewer !== null && viewer.predict(name);
