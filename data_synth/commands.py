@@ -62,5 +62,15 @@ def reveal(
         return
     table = Table("", "", show_header=False, box=None)
     for key, value in judged.items():
-        table.add_row(key.replace("_", " "), value if isinstance(value, str) else json.dumps(value))
+        # Names of effects stay as they are.
+        table.add_row(key if "." in key else key.replace("_", " "), _told(value))
     console().print(table)
+
+
+def _told(value: object) -> str:
+    """Plain data for people."""
+    if isinstance(value, dict):
+        return "; ".join(f"{name} {_told(own)}" for name, own in value.items()) or "nothing"
+    if isinstance(value, list):
+        return ", ".join(_told(own) for own in value) or "nothing"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -24,8 +24,9 @@ def show_ledger(result: Run) -> None:
     terminal.print(run_verdict(result, model_history(result)), soft_wrap=True, style="bold")
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
-            known_to = f"± {p.sigma:.1g}" if p.fitted else "(explains most)"
-            terminal.print(f"  {name}.{p.name} = {rounded(p.value, p.sigma)} {known_to} {p.unit}")
+            counted = "" if p.unit in ("", "1") else f" {p.unit}"
+            known_to = f" ± {p.sigma:.1g}{counted}" if p.fitted else f"{counted} (of those tried, this explains most)"
+            terminal.print(f"  {name}.{p.name} = {rounded(p.value, p.sigma)}{known_to}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
 
