@@ -76,6 +76,12 @@ def turned(change: Callable[[Rotation], Rotation]) -> Callable[[Session], Sessio
     return apply
 
 
+def _torn(points: Array, shift: Array) -> Array:
+    """Half of a scan moved: the part was knocked while it was scanned."""
+    later = points[:, 0] > np.median(points[:, 0])
+    return points + later[:, None] * shift
+
+
 def _rows(order: Callable[[Array], Array]) -> Callable[[Session], Session]:
     return lambda session: with_poses(session, order(poses_of(session)))
 
@@ -164,6 +170,8 @@ def faults(views: int, rng: np.random.Generator) -> dict[str, Fault]:
         "other part": Fault(_clouds(lambda p: wavy, [a]), ("foreign",), (a,)),
         "three points": Fault(_clouds(lambda p: p[:: len(p) // 2][:3], [a]), ("foreign",), (a,)),
         "a line": Fault(_clouds(lambda p: np.linspace(p[0], p[-1], 400), [a]), ("foreign",), (a,)),
+        "one torn 1 mm": Fault(_clouds(lambda p: _torn(p, u), [a]), one, (a,)),
+        "one torn 5 mm": Fault(_clouds(lambda p: _torn(p, 5 * u), [a]), one, (a,)),
         "copy of a scan": Fault(moved_clouds({a: b}), ("duplicate_scan",), (a,)),
         "copy of a pose": Fault(
             _rows(lambda T: np.concatenate([T[:a], T[b : b + 1], T[a + 1 :]])), ("duplicate_pose", "joint_row"), (a,)

@@ -49,8 +49,10 @@ def diagnose_state(state: State) -> Diagnosis:
         curves = joint_curves([law for kind in unnamed for law in kind.laws])
         beyond = implausible(linear, limit)
         # Where it is said what repeats, scatter is the rest; else all of it.
-        rest = linear if unnamed and (curves or not beyond) else linear.scatter_only
-        rotation, translation = np.sqrt(rest.null.variances[:2])
+        rest = linear.scatter_only.null
+        if unnamed and (curves or not beyond):
+            rest = unnamed[0].rest or linear.null
+        rotation, translation = np.sqrt(rest.variances[:2])
         found = Diagnosis(
             verdict=selection.verdict,
             effects=tuple(r.name for r in selection.named),

@@ -33,6 +33,19 @@ def test_what_no_library_has_gets_no_name(which):
     session, *_ = labelled_cell(SEED, views=VIEWS, errors=errors, targets=TARGETS[:2])
     found = diagnose(run(session))
     assert found.verdict == "unknown_effect", found.sentence
+    if which == "memory":
+        assert [u.words for u in found.unnamed] == ["wander in time"]
+    else:
+        joint = 1 + int(np.abs(errors[0]).sum(axis=0).argmax())
+        assert [u.words for u in found.unnamed] == [f"follow the joints, joint {joint} above all"]
+
+
+def test_beside_a_law_scatter_is_what_the_arm_scatters():
+    """20 µm are drawn, and the law does not take them for itself; of what it turns most is no scatter any more."""
+    session, *_ = labelled_cell(SEED, views=VIEWS, errors=(law("coupling"), np.zeros((VIEWS, 6))))
+    found = diagnose(run(session))
+    assert found.unnamed and found.translation == pytest.approx(0.02, rel=0.25), found.sentence
+    assert found.rotation**2 < 0.5 * found.linear.null.variances[0]
 
 
 def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle():

@@ -9,7 +9,7 @@ from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
 from stitch.diagnosis.unknown.unnamed_courses import clear_course
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.variance_components import VarianceFit, fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
@@ -25,6 +25,7 @@ class Unnamed:
     log_bayes_factor: float  # over the same errors without it
     joints: bool  # follows the pose rather than time
     laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
+    rest: VarianceFit | None = None  # of the views beside it, where the null counts it as scatter
 
 
 def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
@@ -72,7 +73,7 @@ def _course(linear: LinearModel) -> tuple[Unnamed, ...]:
     if course is None:
         return ()
     words = _TIME if course.joint is None else f"{_JOINTS}, joint {course.joint} above all"
-    return (Unnamed(words, course.log_bayes_factor, course.joint is not None),)
+    return (Unnamed(words, course.log_bayes_factor, course.joint is not None, rest=course.fit),)
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:
