@@ -14,8 +14,9 @@ from stitch.frames import Array
 from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.match import near_pairs, sample
 
-# Points of a scan that are asked, and how far from the surface of the others, as a share of the part's size.
-_PROBES, _REACH = 1000, 0.03
+# Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
+# surface, as a share of the part's size.
+_PROBES, _ASKED, _REACH = 500, 20, 0.03
 # The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
 _SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
 # Elsewhere is farther than so many tolerances: what a lens or a slant does to a scan moves it by less.
@@ -57,14 +58,20 @@ def _share(own: dict[int, Array], without: Sequence[int]) -> float:
 
 def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) -> list[dict[int, Array]]:
     """Per view and other view what that shows of each asked point (n,): 2 in its place, 1 elsewhere, 0 nothing."""
-    asked = [sample(scan, _PROBES) for scan in scans]
-    out: list[dict[int, Array]] = [{} for _ in scans]
-    for pair in near_pairs(scans, poses, reach):
-        for v, w in (pair, pair[::-1]):
-            T_w_v = frames.inverse(poses[w]) @ poses[v]
-            points = frames.transform(T_w_v, scans[v].points[asked[v]])
-            normals = frames.rotate(T_w_v, scans[v].normals[asked[v]])
-            out[v][w] = _shown(scans[w], points, normals, (tolerance, reach))
+    near: list[list[int]] = [[] for _ in scans]
+    for v, w in near_pairs(scans, poses, reach):
+        near[v].append(w)
+        near[w].append(v)
+    out = []
+    for v, scan in enumerate(scans):
+        index, turns = sample(scan, _PROBES), -(-len(near[v]) // _ASKED)
+        shown = {w: np.zeros(len(index), np.int8) for w in near[v]}
+        for k, w in enumerate(near[v]):
+            asked, T_w_v = slice(k % turns, None, turns), frames.inverse(poses[w]) @ poses[v]
+            points = frames.transform(T_w_v, scan.points[index[asked]])
+            normals = frames.rotate(T_w_v, scan.normals[index[asked]])
+            shown[w][asked] = _shown(scans[w], points, normals, (tolerance, reach))
+        out.append(shown)
     return out
 
 
