@@ -30,6 +30,12 @@ def main() -> None:
     merged.astype("<f4").tofile(Path(out).with_suffix(".xyz"))
 
 
+def of_one_side(clouds, poses):
+    """Pairs that look at the part from within 60° of each other: on a thin part the other side lies within reach."""
+    looks = [T[:3, :3] @ c.mean(axis=0) / np.linalg.norm(c.mean(axis=0)) for c, T in zip(clouds, poses, strict=True)]
+    return [(i, j) for i, j in combinations(range(len(clouds)), 2) if looks[i] @ looks[j] > 0.5]
+
+
 def open3d_edges(clouds, poses):
     """(i, j, T_i_j, information) of all pairs that meet: robust point-to-plane ICP."""
     import open3d as o3d
@@ -42,7 +48,7 @@ def open3d_edges(clouds, poses):
         shown.append(cloud)
     plane = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=ROBUST))
     wide = registration.TransformationEstimationPointToPlane()
-    for i, j in combinations(range(len(clouds)), 2):
+    for i, j in of_one_side(clouds, poses):
         T = np.linalg.inv(poses[i]) @ poses[j]
         if registration.evaluate_registration(shown[j], shown[i], DISTANCES[0], T).fitness < OVERLAP:
             continue
@@ -58,7 +64,7 @@ def small_gicp_edges(clouds, poses):
     import small_gicp
 
     made = [small_gicp.preprocess_points(p, downsampling_resolution=1e-3, num_neighbors=NEIGHBOURS) for p in clouds]
-    for i, j in combinations(range(len(clouds)), 2):
+    for i, j in of_one_side(clouds, poses):
         T = np.linalg.inv(poses[i]) @ poses[j]
         (target, tree), (source, _) = made[i], made[j]
         moved = clouds[j] @ T[:3, :3].T + T[:3, 3]
