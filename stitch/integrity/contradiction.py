@@ -8,6 +8,7 @@ two scans are in one file, fits with one half and contradicts with the other.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.frames import Array
@@ -24,6 +25,9 @@ _ELSEWHERE = 3.0
 # A scan contradicts the others if this share of what they show of it stands elsewhere; one that was put where it fits
 # best, and still does by the second, is torn.
 CONTRADICTS, STILL = 0.2, 0.05
+
+# Per point what another scan shows of it: 2 in its place, 1 elsewhere, 0 nothing, or neither.
+Shown = NDArray[np.int8]
 
 
 def contradicting(
@@ -47,7 +51,7 @@ def contradicting(
         out.append(worst)
 
 
-def _share(own: dict[int, Array], without: Sequence[int]) -> float:
+def _share(own: dict[int, Shown], without: Sequence[int]) -> float:
     """Of the points that other views show too, the share that all of these show elsewhere."""
     others = [shown for w, shown in own.items() if w not in without]
     if not others:
@@ -56,8 +60,8 @@ def _share(own: dict[int, Array], without: Sequence[int]) -> float:
     return float(np.sum(best == 1) / max(np.sum(best > 0), 1))
 
 
-def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) -> list[dict[int, Array]]:
-    """Per view and other view what that shows of each asked point (n,): 2 in its place, 1 elsewhere, 0 nothing."""
+def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) -> list[dict[int, Shown]]:
+    """Per view and other view what that shows of each asked point (n,)."""
     near: list[list[int]] = [[] for _ in scans]
     for v, w in near_pairs(scans, poses, reach):
         near[v].append(w)
@@ -75,8 +79,8 @@ def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) 
     return out
 
 
-def _shown(scan: Scan, points: Array, normals: Array, limits: tuple[float, float]) -> Array:
-    """(n,) 2, 1 or 0 of points with normals in the frame of a scan; 0 too for what is neither here nor elsewhere."""
+def _shown(scan: Scan, points: Array, normals: Array, limits: tuple[float, float]) -> Shown:
+    """(n,) what a scan shows of points with normals in its frame."""
     tolerance, reach = limits
     distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
     found = np.isfinite(distance)
@@ -87,4 +91,4 @@ def _shown(scan: Scan, points: Array, normals: Array, limits: tuple[float, float
     found &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, own) > _SAME_SIDE)
     found &= beside < _SPACINGS * scan.spacing
     away = np.abs(along) / tolerance
-    return np.where(found & (away < 1), 2, np.where(found & (away > _ELSEWHERE), 1, 0))
+    return np.asarray(2 * (found & (away < 1)) + (found & (away > _ELSEWHERE)), np.int8)

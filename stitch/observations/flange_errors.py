@@ -41,9 +41,14 @@ def near_in_time(measurements: Sequence[Measurement], memory: float) -> Array:
     counts = [m.views.count for m in measurements]
     out, at = np.zeros((sum(counts), sum(counts))), 0
     for m, count in zip(measurements, counts, strict=True):
-        steps = np.diff(m.views.time)
-        usual = float(np.median(steps)) if m.views.has("time") and (steps > 0).any() else 0.0
-        time = m.views.time / usual if usual > 0 else np.arange(count, dtype=float)
-        out[at : at + count, at : at + count] = alike_in_time(time, memory)
+        out[at : at + count, at : at + count] = alike_in_time(in_steps(m), memory)
         at += count
     return out
+
+
+def in_steps(measurement: Measurement) -> Array:
+    """(V,) times of the views in usual steps from one to the next; their numbers where no time is stated."""
+    views = measurement.views
+    steps = np.diff(views.time)
+    usual = float(np.median(steps)) if views.has("time") and (steps > 0).any() else 0.0
+    return np.asarray(views.time / usual if usual > 0 else np.arange(views.count, dtype=float))

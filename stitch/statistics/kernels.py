@@ -9,29 +9,32 @@ from stitch.frames import Array, Mask
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
 # How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike.
-_REACH = 1.0
+REACH = 1.0
 
 
-def alike_in_joints(joints: Array, reach: float = _REACH) -> Array:
+def alike_in_joints(joints: Array) -> Array:
     """(V, V) of a smooth function of all joints (V, n) rad: of each alone, of pairs, …, of all, equally likely.
-
-    It stays alike as far as `reach`, rad.
 
     The product over joints of (1 + k)/2, with k a Gaussian on the circle (analysis-of-variance kernel; Durrande et
     al. 2013, J. Multivariate Analysis 115:57; periodic: MacKay 1998).
     """
-    return np.asarray(np.prod(alike_joint_by_joint(joints, joints, reach), axis=2))
+    return np.asarray(np.prod(alike_joint_by_joint(joints, joints), axis=2))
 
 
-def alike_joint_by_joint(some: Array, others: Array, reach: float = _REACH) -> Array:
-    """(S, O, n) factors of that product between joints (S, n) and (O, n), rad."""
+def alike_joint_by_joint(some: Array, others: Array, reach: float = REACH) -> Array:
+    """(S, O, n) factors of that product between joints (S, n) and (O, n), rad; alike as far as `reach`, rad."""
     apart = some[:, None, :] - others[None, :, :]
     return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
 
 
-def alike_in_time(time: Array, memory: float) -> Array:
-    """(V, V) of a process that forgets (Ornstein–Uhlenbeck); time (V,) and memory in steps from view to view."""
-    return np.asarray(np.exp(-np.abs(time[:, None] - time[None, :]) / memory))
+def alike_in_time(time: Array, memory: float, others: Array | None = None) -> Array:
+    """(V, V) of a process that forgets (Ornstein–Uhlenbeck), or (V, O) with other times (O,).
+
+    Args:
+        time: (V,) and memory in steps from view to view.
+    """
+    apart = time[:, None] - (time if others is None else others)[None, :]
+    return np.asarray(np.exp(-np.abs(apart) / memory))
 
 
 def same_stop(T_base_flange: Array) -> Mask:

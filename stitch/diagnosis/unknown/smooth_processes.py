@@ -2,16 +2,17 @@
 leading eigenvectors of their covariance between views."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from stitch.effects.contract import EFFECTS
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.model.jacobian import twists
 from stitch.model.term import term_of
-from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
+from stitch.observations.flange_errors import WANDERING, flange_twists, in_steps
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import alike_in_joints
+from stitch.statistics.kernels import REACH, alike_in_time, alike_joint_by_joint
 
 # Columns of a process, and the share of its largest variance that the last of them has at least.
 _MOST, _LEAST = 96, 1e-3
@@ -21,55 +22,69 @@ _KNOTS = 400
 _SHORT = 0.2
 
 
+@dataclass(frozen=True)
+class SmoothProcess:
+    """Motions of the views that follow courses with unit coefficients; far smaller than its columns."""
+
+    joint: int | None  # that errs, counted from 1; None: the flange
+    motions: Array  # (V, 6, p) twists
+    shapes: Array  # (V, R) courses
+
+    def columns(self, linear: LinearModel) -> Array:
+        """(n, p·R) of the channel: each motion in each course."""
+        moved = self.motions[:, :, :, None] * self.shapes[:, None, None, :]
+        return linear.observation.by_twists(moved.reshape(6 * len(moved), -1))
+
+
 def of_joints(linear: LinearModel) -> Array:
-    """(n, V, 6) twists of the views by a radian of each joint."""
+    """(n, V, 6, 1) twists of the views by a radian of each joint."""
     offset = term_of(linear.measurement, EFFECTS["joint_offset"])
-    return twists(linear.measurement, linear.model, [offset], linear.observation.centre)[0]
+    return twists(linear.measurement, linear.model, [offset], linear.observation.centre)[0][..., None]
 
 
-def alone(linear: LinearModel, motions: Array, k: int) -> Iterator[Array]:
-    """(n, R) of joint k that follows all joints, its own angle closely, or its own and the one that it comes from."""
+def alone(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
+    """Per joint: that it follows all joints, its own angle closely, or its own and the one that it comes from."""
     views = linear.measurement.views
-    own, came = views.joints[:, [k]], views.previous[:, [k]]
-    for alike in (
-        alike_in_joints(views.joints),
-        alike_in_joints(own, _SHORT),
-        alike_in_joints(np.hstack([own, came])),
-    ):
-        yield _by_courses(linear, motions[k], alike)
+    every = _following(views.joints)
+    out = []
+    for k, motion in enumerate(motions):
+        own, came = views.joints[:, [k]], views.previous[:, [k]]
+        courses = (every, _following(own, _SHORT), _following(np.hstack([own, came])))
+        out.append([SmoothProcess(k + 1, motion, shapes) for shapes in courses])
+    return out
 
 
-def in_pairs(linear: LinearModel, motions: Array, k: int) -> Iterator[Array]:
-    """(n, R) of joint k that follows its own angle and that of one other."""
+def in_pairs(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
+    """Joint k, counted from 0, that follows its own angle and that of one other."""
     joints = linear.measurement.views.joints
     for other in range(joints.shape[1]):
         if other != k:
-            yield _by_courses(linear, motions[k], alike_in_joints(joints[:, [k, other]]))
+            yield SmoothProcess(k + 1, motions[k], _following(joints[:, [k, other]]))
 
 
-def _by_courses(linear: LinearModel, motion: Array, alike: Array) -> Array:
-    """(n, R) of one motion (V, 6) in each course of a process, without what is alike in all views: that has a name."""
-    shapes = _shapes(alike, _MOST)
-    return linear.observation.by_twists(_spread(motion[:, :, None], shapes - shapes.mean(axis=0)))
+def wandering(linear: LinearModel) -> SmoothProcess:
+    """A flange that wanders."""
+    measurement, time = linear.measurement, in_steps(linear.measurement)
+    knots = _knots(len(time))
+    alike = alike_in_time(time, WANDERING["slowly wandering"], time[knots])
+    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
+    return SmoothProcess(None, carried, _shapes(alike, knots, _MOST // 6))
 
 
-def wandering(linear: LinearModel) -> Array:
-    """(n, R) of a flange that wanders."""
-    measurement = linear.measurement
-    shapes = _shapes(near_in_time([measurement], WANDERING["slowly wandering"]), _MOST // 6)
-    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(shapes), 6, 6)
-    return linear.observation.by_twists(_spread(carried, shapes))
+def _following(angles: Array, reach: float = REACH) -> Array:
+    """(V, R) smooth courses over some angles (V, a), without what is alike in all views: that has a name."""
+    knots = _knots(len(angles))
+    shapes = _shapes(alike_joint_by_joint(angles, angles[knots], reach).prod(axis=2), knots, _MOST)
+    return np.asarray(shapes - shapes.mean(axis=0))
 
 
-def _spread(moved: Array, shapes: Array) -> Array:
-    """(6V, p·R) twists of the views by each of p motions (V, 6, p) in each of the courses (V, R)."""
-    return (moved[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(moved), -1)
+def _knots(views: int) -> Indices:
+    return np.unique(np.linspace(0, views - 1, min(views, _KNOTS)).astype(np.int64))
 
 
-def _shapes(alike: Array, most: int) -> Array:
-    """(V, R) courses with unit coefficients of which the covariance of a process (V, V) is made."""
-    knots = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _KNOTS)).astype(np.int64))
-    values, vectors = np.linalg.eigh(alike[np.ix_(knots, knots)])
+def _shapes(alike: Array, knots: Indices, most: int) -> Array:
+    """(V, R) courses with unit coefficients of which a process is made, from its covariance with the knots (V, K)."""
+    values, vectors = np.linalg.eigh(alike[knots])
     values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
     keep = values > _LEAST * values[0]
-    return np.asarray(alike[:, knots] @ (vectors[:, keep] / np.sqrt(values[keep])))
+    return np.asarray(alike @ (vectors[:, keep] / np.sqrt(values[keep])))

@@ -13,7 +13,7 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Form
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.smooth_processes import alone, in_pairs, of_joints, wandering
+from stitch.diagnosis.unknown.smooth_processes import SmoothProcess, alone, in_pairs, of_joints, wandering
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import VarianceFit, fit_variances
@@ -41,14 +41,13 @@ def unnamed_courses(linear: LinearModel) -> tuple[UnnamedCourse, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
     if linear.pose_errors is not None:
         return ()
-    found = [_likeliest(linear, None, wandering(linear))]
+    found = [_likeliest(linear, wandering(linear))]
     if linear.measurement.views.has("joints"):
         motions = of_joints(linear)
-        joints = range(len(motions))
-        by_joint = [[_likeliest(linear, k + 1, own) for own in alone(linear, motions, k)] for k in joints]
+        by_joint = [[_likeliest(linear, process) for process in own] for own in alone(linear, motions)]
         found += [course for own in by_joint for course in own]
-        first = sorted(joints, key=lambda k: -max(course.gain for course in by_joint[k]))[:_JOINTS]
-        found += [_likeliest(linear, k + 1, own) for k in first for own in in_pairs(linear, motions, k)]
+        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[:_JOINTS]
+        found += [_likeliest(linear, process) for k in first for process in in_pairs(linear, motions, k)]
     tried = float(np.log(len(found)))
     likeliest = sorted(found, key=lambda course: -course.gain)[:_FITTED]
     return tuple(sorted((_fitted(linear, c, tried) for c in likeliest), key=lambda c: -c.log_bayes_factor))
@@ -81,40 +80,36 @@ def _deviance(linear: LinearModel, G: Array, prior: Array) -> float:
 class _Likeliest:
     """A process at the size that is likeliest at the null's variances, and its log Bayes factor there."""
 
-    joint: int | None
-    columns: Array  # (n, R)
+    process: SmoothProcess
     size: float
     gain: float
-
-    def sizes(self, size: float) -> Array:
-        """(R,) of the prior of its coefficients."""
-        return np.full(self.columns.shape[1], size)
 
 
 def _fitted(linear: LinearModel, found: _Likeliest, tried: float) -> UnnamedCourse:
     """With all variances sought anew: what a process explains is no scatter, and where the scatter is less it is
     likelier of another size."""
-    G = linear.in_blocks(found.columns)
-    fit = fit_variances(linear.mixed, G, found.sizes(found.size), start=linear.null.variances)
-    size = _likeliest(replace(linear, null=fit), found.joint, found.columns).size
-    again = fit_variances(linear.mixed, G, found.sizes(size), start=fit.variances)
+    columns = found.process.columns(linear)
+    G, unit = linear.in_blocks(columns), np.ones(columns.shape[1])
+    fit = fit_variances(linear.mixed, G, found.size * unit, start=linear.null.variances)
+    size = _likeliest(replace(linear, null=fit), found.process).size
+    again = fit_variances(linear.mixed, G, size * unit, start=fit.variances)
     size, fit = (size, again) if again.deviance < fit.deviance else (found.size, fit)
     gained = 0.5 * (linear.null.deviance - fit.deviance)
-    return UnnamedCourse(found.joint, found.columns, size, fit, gained - tried)
+    return UnnamedCourse(found.process.joint, columns, size, fit, gained - tried)
 
 
-def _likeliest(linear: LinearModel, joint: int | None, columns: Array) -> _Likeliest:
+def _likeliest(linear: LinearModel, process: SmoothProcess) -> _Likeliest:
     """Its size at the null's variances.
 
     Over the eigenvalues k of the columns' information and the shares g of what was seen: log BF(s) =
     ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
     """
-    white = linear.residual(columns)
+    white = linear.residual(process.columns(linear))
     k, vectors = np.linalg.eigh(white.T @ white)
     k, g = np.maximum(k, 0.0), vectors.T @ (white.T @ linear.white_residual)
     if not k[-1] > 0:
-        return _Likeliest(joint, columns, 1.0, -np.inf)
+        return _Likeliest(process, 1.0, -np.inf)
     sizes = _SIZES / np.sqrt(k[-1])
     gains = g**2 / (k + 1 / sizes[:, None] ** 2) - np.log1p(sizes[:, None] ** 2 * k)
     found = 0.5 * gains.sum(axis=1)
-    return _Likeliest(joint, columns, float(sizes[found.argmax()]), float(found.max()))
+    return _Likeliest(process, float(sizes[found.argmax()]), float(found.max()))
