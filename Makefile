@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml constraints.txt
 ifdef UV
 	@$(PYTHON) $(SERVES) || uv venv --quiet --clear --python "$(or $(BASE),$(RANGE))" $(VENV) || \
 		{ echo "stitch needs Python 3.11, 3.12 or 3.13: none was found" >&2; exit 2; }
-	uv pip install --quiet --python $(PYTHON) --require-hashes -r constraints.txt
+	uv pip install --quiet --compile-bytecode --python $(PYTHON) --require-hashes -r constraints.txt
 	uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
 else
 	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path; on Debian 12 or \

@@ -60,21 +60,24 @@ def part_picture(
 
 def visible(surface: PartSurface, camera: Camera) -> Seen:
     """Which place of the surface each pixel shows: of dense samples the one nearest to the eye."""
-    corner, weight = _samples(surface)
     flat = surface.vertices @ camera.axes.T
     low, size = flat.min(axis=0)[:2], np.ptp(flat, axis=0)[:2]
     scale = (_PIXELS - 1) / float(size.max())
     wide, high = (int(x) + 1 for x in size * scale)
-    place = np.einsum("sc,sci->si", weight, flat[corner])
-    column, row = ((place[:, :2] - low) * scale + 0.5).astype(np.int64).T
-    pixel = (high - 1 - np.clip(row, 0, high - 1)) * wide + np.clip(column, 0, wide - 1)
-    # Painted from the back to the front: the last one that falls on a pixel stays.
-    order = np.argsort(place[:, 2])
-    front = np.full(high * wide, -1)
-    front[pixel[order]] = order
-    shown = np.flatnonzero(front >= 0)
-    best = front[shown]
-    return Seen((high, wide), shown, corner[best], weight[best])
+    corners, weights = _samples(surface)
+    # From the back to the front: of the samples with the same weights the last one that falls on a pixel stays.
+    corners = corners[np.argsort(flat[corners, 2].sum(axis=1))]
+    depth = np.full(high * wide, -np.inf)
+    corner, weight = np.zeros((high * wide, 3), np.int64), np.zeros((high * wide, 3))
+    at = [flat[corners[:, i]] for i in range(3)]
+    for own in weights:
+        place = sum(w * x for w, x in zip(own, at, strict=True))
+        column, row = ((place[:, :2] - low) * scale + 0.5).astype(np.int64).T
+        pixel = (high - 1 - np.clip(row, 0, high - 1)) * wide + np.clip(column, 0, wide - 1)
+        nearer = np.flatnonzero(place[:, 2] > depth[pixel])
+        depth[pixel[nearer]], corner[pixel[nearer]], weight[pixel[nearer]] = place[nearer, 2], corners[nearer], own
+    shown = np.flatnonzero(depth > -np.inf)
+    return Seen((high, wide), shown, corner[shown], weight[shown])
 
 
 def painted(surface: PartSurface, camera: Camera, seen: Seen, colours: Array) -> Array:
@@ -88,15 +91,13 @@ def painted(surface: PartSurface, camera: Camera, seen: Seen, colours: Array) ->
 
 
 def _samples(surface: PartSurface) -> tuple[Indices, Array]:
-    """Corners (S, 3) and weights (S, 3) of samples over all triangles, so dense that no pixel is left out."""
+    """Corners (T, 3) of the triangles and weights (S, 3) of samples in each, so dense that no pixel is left out."""
     if not len(surface.triangles):
         index = np.arange(len(surface.vertices))
-        return np.stack([index] * 3, axis=1), np.full((len(index), 3), 1 / 3)
+        return np.stack([index] * 3, axis=1), np.array([[1.0, 0.0, 0.0]])
     edges = surface.vertices[surface.triangles] - surface.vertices[np.roll(surface.triangles, 1, axis=1)]
     longest = float(np.quantile(np.linalg.norm(edges, axis=2).max(axis=1), 0.9))
     fine = int(np.ceil(longest * _PIXELS / float(np.ptp(surface.vertices, axis=0).max()))) + 1
     i, j = np.meshgrid(np.arange(fine + 1), np.arange(fine + 1))
     inside = i + j <= fine
-    weights = np.column_stack([i[inside], j[inside], fine - i[inside] - j[inside]]) / fine
-    count = len(surface.triangles)
-    return np.repeat(surface.triangles, len(weights), axis=0), np.tile(weights, (count, 1))
+    return surface.triangles, np.column_stack([i[inside], j[inside], fine - i[inside] - j[inside]]) / fine

@@ -1,9 +1,11 @@
 """The run folder on disk: written whole or not at all."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from importlib.metadata import entry_points
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from stitch.errors import InputError
@@ -63,20 +65,43 @@ def extend(group: str, *arguments: Any) -> None:
         entry.load()(*arguments)
 
 
+def load_early(group: str) -> None:
+    """Load beside the fit what `extend` calls after it: it leaves a core idle, and drawing takes a second to load."""
+
+    def load() -> None:
+        # What fails here fails again where it is called, and is said there.
+        with suppress(Exception):
+            for entry in entry_points(group=group):
+                entry.load()
+
+    Thread(target=load, daemon=True).start()
+
+
 def write_run(run: Run, folder: Path) -> None:
     """Write model.toml, result.json, ledger.json, stitched.ply and residuals.parquet into `folder`."""
-    write_model(model_of(run), folder / "model.toml")
-    write_json(result_document(run), folder / "result.json")
-    write_json(ledger(run), folder / "ledger.json")
-    write_cloud(run.fused, folder / "stitched.ply")
-    write_residuals(run, folder / "residuals.parquet")
+    _write_documents(run, folder)
+    _write_points(run, folder)
 
 
 def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> None:
-    """The same and report.html.
+    """The same and report.html, drawn while the points are written.
 
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    write_run(run, folder)
-    extend("stitch.reports", run, folder / "report.html", tolerance)
+    _write_documents(run, folder)
+    with ThreadPoolExecutor(1) as beside:
+        written = beside.submit(_write_points, run, folder)
+        extend("stitch.reports", run, folder / "report.html", tolerance)
+        written.result()
+
+
+def _write_documents(run: Run, folder: Path) -> None:
+    write_model(model_of(run), folder / "model.toml")
+    write_json(result_document(run), folder / "result.json")
+    write_json(ledger(run), folder / "ledger.json")
+
+
+def _write_points(run: Run, folder: Path) -> None:
+    write_cloud(run.fused, folder / "stitched.ply")
+    write_residuals(run, folder / "residuals.parquet")

@@ -51,6 +51,7 @@ def add_chosen(
     """
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
+        run_folder.load_early("stitch.reports")
         chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
         _suggested(run, state, chosen, recording, as_json)
 
@@ -100,6 +101,7 @@ def drop_named(
 
 def _change(run: Path, state: State, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it."""
+    run_folder.load_early("stitch.reports")
     with run_folder.changed(run) as scratch:
         result = change(state, effects, recorder_for(scratch, recording))
         run_folder.write_with_page(result, scratch)

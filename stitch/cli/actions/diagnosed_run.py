@@ -17,7 +17,7 @@ from stitch.units import length_text
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
 from stitch.writing.plain_finding import next_step, plain_finding
-from stitch.writing.run_folder import extend, held
+from stitch.writing.run_folder import extend, held, load_early
 
 _SHOWN = 6
 
@@ -64,6 +64,7 @@ def _nothing_next(found: Diagnosis) -> str:
 def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
     with held(run):
         state = load_state(run, effects_file, trust=trust)
+        load_early("stitch.diagnosis_reports")
         found = diagnose(state)
         return found, write_diagnosis(found, state, run), state.session.length_unit
 

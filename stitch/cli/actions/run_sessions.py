@@ -40,6 +40,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     names = _names(loaded)
     target = asked.output or Path("../runs" if here else "runs") / "+".join(names)
     model, kept, own_effects = _given(asked)
+    run_folder.load_early("stitch.reports")
     with run_folder.new_folder(target, sessions, asked.force) as scratch:
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, asked.recording) for folder in folders]
