@@ -16,6 +16,7 @@ from stitch.diagnosis.form_trial import FormTrial, gain_at_null, residuals, try_
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
+from stitch.system.threads import parallel
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 SEEN = 0.5
@@ -121,12 +122,11 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
     Returns:
         With what they gain there (nats), best first.
     """
-    gains = np.array(
-        [
-            max(gain_at_null(linear, f, w) for f, w in zip(c.forms, residuals(linear, c), strict=True))
-            for c in candidates
-        ]
-    )
+
+    def gain(c: Candidate) -> float:
+        return max(gain_at_null(linear, f, w) for f, w in zip(c.forms, residuals(linear, c), strict=True))
+
+    gains = np.array(list(parallel(gain, candidates)))
     return [(candidates[k], float(gains[k])) for k in np.argsort(-gains, kind="stable")[:count]]
 
 

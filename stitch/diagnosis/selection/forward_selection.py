@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from stitch.diagnosis.selection.ranking import Ranked, certain, rank, ranked_one
 from stitch.diagnosis.thresholds import AT_ONCE, TRIED
 from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
 from stitch.observations.linear_model import LinearModel
+from stitch.system.threads import parallel
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ def _following(beside: LinearModel, others: Sequence[Candidate]) -> Ranked | Non
     near = [c for c, gain in likely if gain >= 0.5 * likely[0][1]]
     for tried in (near, [c for c, _ in likely if c not in near]):
         # Preselected by what they gain: all that were looked at count as tests.
-        ranked, _ = rank([score(beside, c) for c in tried], tests=len(others))
+        ranked, _ = rank(list(parallel(partial(score, beside), tried)), tests=len(others))
         following = next((r for r in ranked if certain(r)), None)
         if following is not None:
             return following
@@ -78,20 +80,34 @@ def _eliminated_back(
     linear: LinearModel, chosen: Sequence[Ranked], tests: int
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
     """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
-    chosen, beyond = list(chosen), dict[str, Extrapolation | None]()
-    for r in list(chosen):
-        beside = _without(linear, chosen, r)
+
+    def asked(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
+        beside = _without(linear, among, r)
         own = ranked_one(beside, r.score.candidate, tests)
-        others = [other for other in chosen if other.name != r.name]
-        if not certain(own) or own.score.form is not r.score.form:
-            beyond = {}  # what was asked of the others was asked beside this one
-        chosen = [*others, own] if certain(own) else others
-        if certain(own):
-            beyond[own.name] = extrapolate(beside, own.score)
+        return own, extrapolate(beside, own.score) if certain(own) else None
+
+    # Mostly all hold their place: then none was asked beside one that goes, and the order is of no account.
+    at_once = list(parallel(asked, chosen))
+    if all(_as_before(r, own) for r, (own, _) in zip(chosen, at_once, strict=True)):
+        return [own for own, _ in at_once], {own.name: found for own, found in at_once}
+    kept, beyond = list(chosen), dict[str, Extrapolation | None]()
     for r in chosen:
+        own, found = asked(r, kept)
+        others = [other for other in kept if other.name != r.name]
+        if not _as_before(r, own):
+            beyond = {}  # what was asked of the others was asked beside this one
+        kept = [*others, own] if certain(own) else others
+        if certain(own):
+            beyond[own.name] = found
+    for r in kept:
         if r.name not in beyond:
-            beyond[r.name] = extrapolate(_without(linear, chosen, r), r.score)
-    return chosen, {r.name: beyond[r.name] for r in chosen}
+            beyond[r.name] = extrapolate(_without(linear, kept, r), r.score)
+    return kept, {r.name: beyond[r.name] for r in kept}
+
+
+def _as_before(r: Ranked, again: Ranked) -> bool:
+    """True if an effect is certain again, in the same form."""
+    return certain(again) and again.score.form is r.score.form
 
 
 def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:

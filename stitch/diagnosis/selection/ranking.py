@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import logsumexp
@@ -16,7 +17,7 @@ from stitch.diagnosis.thresholds import (
     PRIOR_UNKNOWN,
 )
 from stitch.observations.linear_model import LinearModel
-from stitch.system.steps import steps
+from stitch.system.threads import parallel
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
 
 def ranked_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
-    scores = [score(linear, c) for c in steps("candidate effects", candidates)]
+    scores = list(parallel(partial(score, linear), candidates, "candidate effects"))
     return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
 
 

@@ -17,6 +17,7 @@ from stitch.diagnosis.unknown.smooth_processes import SmoothProcess, alone, in_p
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import VarianceFit, fit_variances
+from stitch.system.threads import parallel
 
 # Sizes that are tried, as multiples of the one at which the clearest column is as large as its own sigma.
 _SIZES = np.geomspace(0.1, 1e5, 49)
@@ -50,7 +51,8 @@ def unnamed_courses(linear: LinearModel) -> tuple[UnnamedCourse, ...]:
         found += [_likeliest(linear, process) for k in first for process in in_pairs(linear, motions, k)]
     tried = float(np.log(len(found)))
     likeliest = sorted(found, key=lambda course: -course.gain)[:_FITTED]
-    return tuple(sorted((_fitted(linear, c, tried) for c in likeliest), key=lambda c: -c.log_bayes_factor))
+    fitted = parallel(lambda c: _fitted(linear, c, tried), likeliest)
+    return tuple(sorted(fitted, key=lambda c: -c.log_bayes_factor))
 
 
 def clear_course(linear: LinearModel) -> UnnamedCourse | None:
@@ -60,7 +62,8 @@ def clear_course(linear: LinearModel) -> UnnamedCourse | None:
 
 def least_wanted(linear: LinearModel, form: Form) -> float:
     """Log Bayes factor of an effect beside that process which leaves least of it; ∞ where pose errors have a prior."""
-    return min((_wanted_beside(linear, course, form) for course in unnamed_courses(linear)), default=np.inf)
+    wanted = parallel(lambda course: _wanted_beside(linear, course, form), unnamed_courses(linear))
+    return min(wanted, default=np.inf)
 
 
 def _wanted_beside(linear: LinearModel, course: UnnamedCourse, form: Form) -> float:
