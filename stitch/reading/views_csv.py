@@ -7,24 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number, number
 from stitch.reading.names import require_name
+from stitch.reading.reported_pose import POSE, flange_pose
 from stitch.reading.text_file import require_file
 
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _JOINT = re.compile(r"j([1-9]\d*)_deg$")
 _APPROACH = re.compile(r"j([1-9]\d*)_approach$")
-# A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
-_UNIT_TOLERANCE = 1e-3
-# Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
-# degrees and percents of the reach are another convention.
-_ANGLE_TOLERANCE = np.radians(2.0)
-_REACH_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -73,7 +66,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
             latest = time_s
         values = {c: number(file, line, c, row[c]) for c in covariates if row[c]}
         cloud = row.get("cloud", "")
-        T_base_flange = _flange(file, line, name, row, joints[i], robot)
+        T_base_flange = flange_pose(file, line, name, row, joints[i], robot)
         approach = _approach(file, line, row, joints, i)
         rows.append(Row(line, name, cloud, T_base_flange, joints[i], approach, time_s=time_s, covariates=values))
     return rows
@@ -113,13 +106,13 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
     if double:
         raise InputError(f"{file} line 1: column {double[0]!r} stands twice; rename one")
     numbers = sorted(int(m.group(1)) for name in header if (m := _JOINT.match(name)))
-    pose = [name for name in _POSE if name in header]
-    if pose and len(pose) < len(_POSE):
-        missing = ", ".join(name for name in _POSE if name not in header)
-        raise InputError(f"{file} line 1: a pose needs {', '.join(_POSE)}; missing {missing}")
+    pose = [name for name in POSE if name in header]
+    if pose and len(pose) < len(POSE):
+        missing = ", ".join(name for name in POSE if name not in header)
+        raise InputError(f"{file} line 1: a pose needs {', '.join(POSE)}; missing {missing}")
     if not pose and not numbers:
         raise InputError(
-            f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(_POSE)}); one of them is needed"
+            f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(POSE)}); one of them is needed"
         )
     if numbers and numbers != list(range(1, len(numbers) + 1)):
         raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
@@ -137,7 +130,7 @@ def _row_cells(header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
 
 def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
     """Columns of numbers that are neither poses nor joints: what errors may follow."""
-    known = {"view", "cloud", "time_s", *_POSE}
+    known = {"view", "cloud", "time_s", *POSE}
     rest = [n for n in header if n not in known and not _JOINT.match(n) and not _APPROACH.match(n)]
     return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
 
@@ -162,36 +155,3 @@ def _approach(file: Path, line: int, row: dict[str, str], joints: Sequence[Array
             if out[k] not in (-1, 0, 1):
                 raise InputError(f"{file} line {line}: j{k + 1}_approach is {cell}; use -1, 0 or 1")
     return out
-
-
-def _flange(file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None) -> Array:
-    from_joints = forward(robot, joints) if robot and joints is not None else None
-    given = [row.get(column, "") for column in _POSE]
-    if not any(given):
-        if from_joints is None:
-            raise InputError(
-                f"{file} line {line}: view {name} has no pose; fill {','.join(_POSE)} or the joints, or remove the row"
-            )
-        return from_joints
-    values = np.array([number(file, line, c, cell) for c, cell in zip(_POSE, given, strict=True)])
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1) > _UNIT_TOLERANCE:
-        raise InputError(
-            f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
-            "write a unit quaternion, w last"
-        )
-    reported = frames.from_quaternion(values[:3], values[3:] / norm)
-    if robot is not None and from_joints is not None:
-        _agree(file, line, name, reported, from_joints, robot.metres_per_unit)
-    return reported
-
-
-def _agree(file: Path, line: int, name: str, reported: Array, from_joints: Array, metres: float) -> None:
-    angle = float(frames.angle_between(reported, from_joints))
-    distance = float(np.linalg.norm(reported[:3, 3] - from_joints[:3, 3]))
-    reach = float(np.linalg.norm(from_joints[:3, 3]))
-    if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
-        raise InputError(
-            f"{file} line {line}: view {name}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
-            f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
-        )

@@ -1,0 +1,129 @@
+"""One step of the fit to overlapping surfaces: generalised least squares over freed views about a model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.frames import Array, Mask
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.model.effects_covariance import kept_root
+from stitch.model.model import Model
+from stitch.model.term import split, stacked
+from stitch.observations.pose_errors import PoseErrors, pose_errors
+from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.gram import pair_squares
+from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
+from stitch.observations.surfaces.pose_channel import whitened
+from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.stages.fit import WEAK, fitted_parameters
+from stitch.statistics.parameter_selection import Whitened, omitted_rms
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which parameters of effects are fitted, and what errs beside them."""
+
+    fitted: Mask  # (P,)
+    omitted: Array  # (P,) rms that parameters at zero may well have
+    repeating: list[Array]  # per session (6V, K) of errors that all views have in common
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where a step ended, and from where it came."""
+
+    model: Model
+    moved: float  # of the parameters, sigmas
+    rms: float  # what the model leaves between the surfaces, length_unit
+    hand_eye: HandEye
+    fitted: Mask
+    freed: list[FreePoses]
+    linearised: "Linearised"
+    choice: Choice
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Freed views of all sessions about a model; P parameters of effects."""
+
+    measurements: Sequence[Measurement]
+    model: Model
+    captures: tuple[Capture, ...]
+    freed: list[FreePoses]
+    columns: list[Array]  # per session (6V, P)
+
+    @property
+    def values(self) -> Array:
+        """(P,) of the effects at which the views were freed."""
+        return np.array([p.value for p in stacked(self.model.terms)], float)
+
+    @property
+    def sizes(self) -> Array:
+        """(P,) plausible ones."""
+        return np.array([p.typical for p in stacked(self.model.terms)], float)
+
+    def choose(self, before: Choice | None) -> Choice:
+        """The parameters that the views ask for, those of before first."""
+        # What the scanner repeats hardly changes with the last micrometres.
+        repeating = field_scatters(self.measurements, self.freed)
+        fitted = np.zeros(len(self.values), bool) if before is None else before.fitted
+        fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
+        omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted)
+        return Choice(fitted, np.where(self._held, 0.0, omitted), repeating)
+
+    def solve(self, choice: Choice) -> Step:
+        """The step, as the iteration of the fit asks for it."""
+        return self.step(choice)
+
+    def step(self, choice: Choice, errors: PoseErrors | None = None) -> Step:
+        """The step, with a covariance that counts how poses may err; without, one of scatter alone."""
+        fitted, before = choice.fitted, self.values
+        # A parameter at zero that is not zero errs alike in every view, as the scanner does; so does another run's arm.
+        kept = kept_root(self.model.terms, self.model.effects_covariance)
+        repeating = [
+            np.hstack([r, c * choice.omitted, c @ kept]) for r, c in zip(choice.repeating, self.columns, strict=True)
+        ]
+        columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
+        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating, errors)
+        values = before.copy()
+        # What the views cannot see stays at zero; the time of an event stays where it was found.
+        values[~self._held] = 0.0
+        values[fitted] = found.values
+        moved = float(np.max(np.abs(values - before)[fitted] / found.values_sigma, initial=0.0))
+        return Step(
+            model=replace(
+                self.model, T_mount=found.T_mount, terms=split(self.model.terms, values), covariance=found.covariance
+            ),
+            moved=moved,
+            rms=_model_rms(self.freed),
+            hand_eye=found,
+            fitted=fitted,
+            freed=self.freed,
+            linearised=self,
+            choice=choice,
+        )
+
+    def with_errors(self, choice: Choice) -> Step:
+        """The step again, with all that the arm may do wrong in its covariance."""
+        centres = [f.overlaps.gram.centre for f in self.freed]
+        return self.step(choice, pose_errors(self.measurements, self.model, centres))
+
+    @property
+    def _held(self) -> Mask:
+        return np.array([p.held for p in stacked(self.model.terms)], bool)
+
+    def _whitened(self, free: Mask) -> Whitened:
+        channels = [(c, f, extra) for c, f, extra in zip(self.captures, self.freed, self.columns, strict=True)]
+        return whitened(channels, self.model.T_mount, self.values, free)
+
+
+def _model_rms(freed: Sequence[FreePoses]) -> float:
+    """What a model leaves between the surfaces, from the correspondences of the freed views."""
+    squares, weights = np.zeros(2)
+    for f in freed:
+        g = f.overlaps.gram
+        squares += pair_squares(g, -f.twists)[~g.labelled].sum()
+        weights += g.weight.sum()
+    return float(np.sqrt(squares / max(weights, 1e-300)))
