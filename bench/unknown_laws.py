@@ -32,7 +32,7 @@ SCENES = ("blade", "drill-plate", "blade-table")
 DEVELOPMENT, HELD_OUT = (0, 1), (820, 821, 822, 823)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
-AGAIN, ASKED_AGAIN = ("beside", "two"), 4
+AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
 
 

@@ -45,11 +45,12 @@ def beside(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
 
 def two(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """Two effects at four times that size."""
-    first = _possible(a, rng, k)
-    second = first
-    while second == first:
-        second = _possible(a, rng, int(rng.integers(len(LIBRARY))))
-    return _at(a, [first, second], 4.0, rng)
+    return _several(a, 2, rng, k)
+
+
+def three(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """Three effects at four times that size."""
+    return _several(a, 3, rng, k)
 
 
 Part = Callable[[Asked, np.random.Generator, int], tuple[World, tuple[str, ...]]]
@@ -60,6 +61,7 @@ PARTS: dict[str, tuple[Part, int]] = {
     "effect": (effect, 126),
     "beside": (beside, 42),
     "two": (two, 42),
+    "three": (three, 42),
 }
 
 
@@ -76,6 +78,16 @@ def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:
 def _in_turn(names: Sequence[str], k: int) -> str:
     """All names in turn, each turn one place on, so that every cell gets every name."""
     return names[(k + k // len(names)) % len(names)]
+
+
+def _several(a: Asked, count: int, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """So many different effects, the first of them in turn."""
+    chosen = [_possible(a, rng, k)]
+    while len(chosen) < count:
+        further = _possible(a, rng, int(rng.integers(len(LIBRARY))))
+        if further not in chosen:
+            chosen.append(further)
+    return _at(a, chosen, 4.0, rng)
 
 
 def _at(a: Asked, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> tuple[World, tuple[str, ...]]:
