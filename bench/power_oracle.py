@@ -1,4 +1,4 @@
-"""How much larger must an effect be for the diagnosis than for an oracle that knows which effect it is and all variances?
+"""How much larger must an effect be for the diagnosis than for an oracle that knows which it is, and all variances?
 
 Usage: python bench/power_oracle.py [--held-out] [--draws N] [--effects A,B]
 
@@ -46,7 +46,7 @@ def known(a: Asked) -> LinearModel:
 
 
 def least(a: Asked, effect: str, true: dict[str, float]) -> float | None:
-    """Factor on the parameters `true` that the oracle detects in eight draws of ten; None where a cell shows nothing."""
+    """Factor on the parameters `true` that the oracle detects in eight draws of ten; None where a cell cannot."""
     if lacking(a.cell.measurement, EFFECTS[effect]) or (candidate := candidate_of(a.linear, EFFECTS[effect])) is None:
         return None
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
@@ -92,7 +92,8 @@ def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, float]:
     rising = np.asarray(isotonic_regression(np.array(shares)).x) if min(counts) else np.zeros(len(MULTIPLES))
     ratio = float(np.interp(POWER, rising, MULTIPLES)) if rising[0] < POWER <= rising[-1] else np.inf
     ratio = MULTIPLES[0] if rising[0] >= POWER else ratio
-    told = "at most 1.0" if ratio == MULTIPLES[0] else f"{ratio:.1f}" if np.isfinite(ratio) else f"above {MULTIPLES[-1]}"
+    above, below = np.isinf(ratio), ratio == MULTIPLES[0]
+    told = f"above {MULTIPLES[-1]:g}" if above else f"at most {ratio:g}" if below else f"{ratio:.1f}"
     return f"| {effect} | {min(counts)} | {' | '.join(f'{s:.2f}' for s in shares)} | {told} |", ratio
 
 
