@@ -61,7 +61,7 @@ def daniilidis(A: Array, B: Array, weights: Array | None = None) -> Array:
         real = root * np.hstack([(a - s * b)[:, None], skew(a + s * b)])
         dual = root * np.hstack([(a_dual - s * b_dual)[:, None], skew(a_dual + s * b_dual)])
         rows += [np.hstack([real, np.zeros((3, 4))]), np.hstack([dual, real])]
-    Vt = np.linalg.svd(np.vstack(rows))[2]
+    Vt = np.linalg.svd(np.vstack(rows), full_matrices=False)[2]
     q, q_dual = _combine(Vt[6], Vt[7])
     R = frames.from_quaternion(np.zeros(3), np.append(q[1:], q[0]))[:3, :3]
     t = 2 * (-q_dual[0] * q[1:] + q[0] * q_dual[1:] - np.cross(q_dual[1:], q[1:]))

@@ -43,7 +43,7 @@ def require_motion(A: Array) -> None:
             "to fix: turn the flange both ways"
         )
     if spread[1] < _PARALLEL:
-        _U, _s, Vt = np.linalg.svd(frames.log(np.asarray(A))[:, :3])
+        Vt = np.linalg.svd(frames.log(np.asarray(A))[:, :3], full_matrices=False)[2]
         axis = ", ".join(f"{x:+.2f}" for x in Vt[0])
         raise NoResultError(
             f"all motions turn about one axis ({axis}): translation along it and rotation about it cannot "
@@ -96,9 +96,9 @@ def matched_rotations(A: Array, B: Array) -> tuple[Array, Array, Array]:
 
 
 def _branch(A: Array, B: Array, alpha: Array, beta: Array, open_sign: Array) -> Array:
-    """A crude rotation from the two most independent axes; the open signs by the fit of all motions."""
-    area = np.linalg.norm(np.cross(alpha[:, None], alpha[None]), axis=2)
-    i, j = np.unravel_index(int(area.argmax()), area.shape)
+    """A crude rotation from the widest turn and the one most across it; the open signs by the fit of all motions."""
+    i = int(np.linalg.norm(alpha, axis=1).argmax())
+    j = int(np.linalg.norm(np.cross(alpha, alpha[i]), axis=1).argmax())
     signs = [(1.0, -1.0) if open_sign[k] else (1.0,) for k in (i, j)]
     candidates = [_triad(alpha[i], alpha[j], s * beta[i], u * beta[j]) for s, u in product(*signs)]
     scores = np.array([_misfit(A, B, R) for R in candidates])

@@ -88,7 +88,7 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
         moving = np.ptp(joints, axis=0) > np.radians(0.5)
         axes = {name: axis for i, (name, axis) in enumerate(axes.items()) if moving[int(name.split()[-1]) - 1]}
     motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
-    _U, s, Vt = np.linalg.svd(motions)
+    _, s, Vt = np.linalg.svd(motions, full_matrices=False)
     if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):
         axes["the axis about which all views were turned"] = Vt[0]
     return axes

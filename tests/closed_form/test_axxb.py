@@ -1,5 +1,7 @@
 """Closed-form hand-eye solvers against truth and against OpenCV."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -29,6 +31,17 @@ def test_exact_without_noise(name):
         error = frames.log(frames.inverse(X) @ SOLVERS[name](A, B))
         assert np.abs(error[:3]).max() < 1e-8
         assert np.abs(error[3:]).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_memory_grows_with_the_motions_and_not_with_their_square(name):
+    *_, A, B = motions(0, count=2_001)
+    tracemalloc.start()
+    try:
+        SOLVERS[name](A, B)
+        assert tracemalloc.get_traced_memory()[1] < 10e3 * len(A)
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.slow

@@ -1,5 +1,8 @@
 """The stages on scans of cells of known truth."""
 
+import tracemalloc
+from dataclasses import replace
+
 import igl
 import numpy as np
 import pytest
@@ -122,8 +125,6 @@ def test_turning_the_last_joint_alone_hides_two_directions():
 
 def turning_only(capture: Capture, T_mount: np.ndarray) -> Capture:
     """The same scans on a flange that only turns about its z axis."""
-    from dataclasses import replace
-
     turns = frames.exp(np.array([[0, 0, np.radians(20 * i), 0, 0, 0] for i in range(len(capture.scans))]))
     flange = capture.T_reference_mount[0]
     return replace(capture, T_reference_mount=turns @ flange)
@@ -132,6 +133,18 @@ def turning_only(capture: Capture, T_mount: np.ndarray) -> Capture:
 def test_all_directions_are_seen_by_a_tilting_set():
     measured, capture = captured_blade(7, views=8)
     assert unobservable([capture], measured.T_mount) == ()
+
+
+def test_what_motions_cannot_show_takes_memory_with_their_number_and_not_with_its_square():
+    measured, capture = captured_blade(7, views=8)
+    again = 500
+    many = replace(capture, T_reference_mount=np.tile(capture.T_reference_mount, (again, 1, 1)))
+    tracemalloc.start()
+    try:
+        assert unobservable([many], measured.T_mount) == ()
+        assert tracemalloc.get_traced_memory()[1] < 10e3 * again * 8
+    finally:
+        tracemalloc.stop()
 
 
 def test_fused_cloud_lies_on_the_part():

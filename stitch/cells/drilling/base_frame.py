@@ -31,7 +31,7 @@ def fit_circle(points: Array) -> Circle:
     """
     points = np.asarray(points, float)
     middle = points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(points - middle)
+    _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 4 or spread[1] < 1e-6 * spread[0]:
         raise NoResultError(
             "a circle needs four or more marker positions that do not lie on a line; turn the joint further"
