@@ -22,9 +22,22 @@ class Form:
 
     term: Term  # at zero, gridded parameters at their value
     keep: Mask  # (P,) parameters that are free in this form
-    response: Array  # (·, p) of the observation to the free ones
-    columns: Array  # (n, p) of the free ones in the channel
+    whole: Array  # (·, P) response of the observation to all; held once for all forms of a term
+    reduced: Array  # (n, P) the same in the channel
     sizes: Array  # (p,) plausible sizes
+
+    @property
+    def response(self) -> Array:
+        """(·, p) of the observation to the free ones."""
+        return self._of_free(self.whole)
+
+    @property
+    def columns(self) -> Array:
+        """(n, p) of the free ones in the channel."""
+        return self._of_free(self.reduced)
+
+    def _of_free(self, columns: Array) -> Array:
+        return columns if self.keep.all() else columns[:, self.keep]
 
     @property
     def free(self) -> list[Parameter]:
@@ -86,7 +99,7 @@ def as_fitted(linear: LinearModel, term: Term) -> Candidate:
     """An effect with those of its parameters that a fit left in use, as the one form it may have."""
     zero, keep = term.at(np.where(term.gridded, term.values, 0.0)), ~term.gridded & (term.values != 0)
     response = linear.responses([zero])[0].columns
-    form = Form(zero, keep, response[:, keep], linear.reduce(response)[:, keep], term.typical[keep])
+    form = Form(zero, keep, response, linear.reduce(response), term.typical[keep])
     return Candidate(term.effect, (form,), response, None)
 
 
@@ -105,7 +118,7 @@ def _candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[R
 
 def _forms(linear: LinearModel, term: Term, response: Array) -> list[Form]:
     columns = linear.reduce(response)
-    return [Form(term, keep, response[:, keep], columns[:, keep], term.typical[keep]) for keep in free_masks(term)]
+    return [Form(term, keep, response, columns, term.typical[keep]) for keep in free_masks(term)]
 
 
 def free_masks(term: Term) -> list[Mask]:

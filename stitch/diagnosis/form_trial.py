@@ -1,5 +1,6 @@
 """One form of a candidate beside a model: what it gains, and its free amplitudes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,15 +42,14 @@ def try_form(linear: LinearModel, form: Form, start: Array) -> FormTrial:
     return FormTrial(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance, integrated.variances)
 
 
-def residuals(linear: LinearModel, candidate: Candidate) -> list[Array]:
+def residuals(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
     """(n, p) per form what its columns say beside the model; those of one joint are among those of all."""
-    out, whole = [], candidate.forms[0]
+    whole = candidate.forms[0]
     white = linear.residual(whole.columns)
     for form in candidate.forms:
         if form.term is not whole.term:
             whole, white = form, linear.residual(form.columns)
-        out.append(white[:, form.keep[whole.keep]])
-    return out
+        yield white[:, form.keep[whole.keep]]
 
 
 def gain_at_null(linear: LinearModel, form: Form, white: Array) -> float:

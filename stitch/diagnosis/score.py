@@ -69,12 +69,9 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     whatever size the views give them.
     """
     base = linear.without([candidate.name])
-    full = candidate.forms[0]
     starts = (base, *base.elsewhere)
-    whites = [residuals(at, candidate) for at in starts]
-    seen = any(bool((np.linalg.norm(own[0] * full.sizes, axis=0) > SEEN).any()) for own in whites if own[0].size)
-    found = list(zip(starts, whites, strict=True))
-    quick = np.array([[_quick(base, at, f, own[i]) for at, own in found] for i, f in enumerate(candidate.forms)])
+    gained, shown = zip(*(_quick(base, at, candidate) for at in starts), strict=True)
+    quick, seen = np.array(gained).T, any(shown)
     likely = quick.max(axis=1)
     least = _HOPELESS if base.pose_errors is None else max(_HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
@@ -111,9 +108,15 @@ def _beside(base: LinearModel, best: FormTrial) -> LinearModel | None:
     return replace(base, null=at_variances(base.mixed, best.variances))
 
 
-def _quick(base: LinearModel, at: LinearModel, form: Form, white: Array) -> float:
-    """Log Bayes factor over the base at given variances: what refitted variances can only raise."""
-    return gain_at_null(at, form, white) + 0.5 * (base.null.deviance - at.null.deviance)
+def _quick(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[float], bool]:
+    """Log Bayes factors (F,) of its forms over the base at given variances, which refitted variances can only raise;
+    and whether the first form, of all its parameters, is seen."""
+    gains, seen = list[float](), False
+    for form, white in zip(candidate.forms, residuals(at, candidate), strict=True):
+        if not gains:
+            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN).any())
+        gains.append(gain_at_null(at, form, white) + 0.5 * (base.null.deviance - at.null.deviance))
+    return gains, seen
 
 
 def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[tuple[Candidate, float]]:

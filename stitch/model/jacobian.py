@@ -1,6 +1,6 @@
 """How poses and points answer to the parameters of a term, by central differences about a model."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,21 +19,20 @@ from stitch.model.term import Term
 _STEP, _STEP_GRIDDED = 0.1, 0.005
 
 
-def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> list[Array]:
+def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
     """Per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
 
     About the model with the term in place of its own, or added at its values. Differences are taken of what an effect
     does to joints, links, mount and part alone; from there the chain of frames carries them.
     """
-    out, chain = [], None
+    chain = None
     for term in terms:
         about = model.with_term(term)
         errors = chain_errors(measurement, about.terms)
         if chain is None or not chain.is_about(errors):
             chain = _Chain(measurement, about, errors, centre)
         moved = [_slope(measurement, about, term, i, chain) for i in range(len(term.parameters))]
-        out.append(np.array(moved).reshape(len(moved), measurement.views.count, 6))
-    return out
+        yield np.array(moved).reshape(len(moved), measurement.views.count, 6)
 
 
 def _slope(measurement: Measurement, about: Model, term: Term, i: int, chain: "_Chain") -> Array:

@@ -12,13 +12,19 @@ _SAME = 1e-4
 REACH = 1.0
 
 
-def alike_in_joints(joints: Array) -> Array:
-    """(V, V) of a smooth function of all joints (V, n) rad: of each alone, of pairs, …, of all, equally likely.
+def alike_in_joints(joints: Array, others: Array | None = None, reach: float = REACH) -> Array:
+    """(V, V) of a smooth function of all joints (V, n) rad: of each alone, of pairs, …, of all, equally likely; or
+    (V, O) with other views (O, n). Alike as far as `reach`, rad.
 
     The product over joints of (1 + k)/2, with k a Gaussian on the circle (analysis-of-variance kernel; Durrande et
     al. 2013, J. Multivariate Analysis 115:57; periodic: MacKay 1998).
     """
-    return np.asarray(np.prod(alike_joint_by_joint(joints, joints), axis=2))
+    others = joints if others is None else others
+    out = np.ones((len(joints), len(others)))
+    # One joint after the other: of thousands of views all factors at once would take a gigabyte.
+    for joint in range(joints.shape[1]):
+        out *= alike_joint_by_joint(joints[:, [joint]], others[:, [joint]], reach)[..., 0]
+    return out
 
 
 def alike_joint_by_joint(some: Array, others: Array, reach: float = REACH) -> Array:

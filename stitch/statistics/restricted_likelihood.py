@@ -91,8 +91,10 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     mean = half @ (half.T @ (white.T @ white_z))
     rest = white_z - white @ mean
     # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
-    taken = np.column_stack([white @ half, rest]).reshape(*mixed.z.shape, -1)
-    unwhitened = inverse.half.transpose(0, 2, 1) @ taken
+    taken = np.empty((len(white), half.shape[1] + 1))
+    np.matmul(white, half, out=taken[:, :-1])
+    taken[:, -1] = rest
+    unwhitened = inverse.half.transpose(0, 2, 1) @ taken.reshape(*mixed.z.shape, -1)
     against = inverse.matrix - unwhitened @ unwhitened.transpose(0, 2, 1)
     slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.

@@ -12,7 +12,7 @@ from stitch.model.jacobian import twists
 from stitch.model.term import term_of
 from stitch.observations.flange_errors import WANDERING, flange_twists, in_steps
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import REACH, alike_in_time, alike_joint_by_joint
+from stitch.statistics.kernels import REACH, alike_in_joints, alike_in_time
 
 # Columns of a process, and the share of its largest variance that the last of them has at least.
 _MOST, _LEAST = 96, 1e-3
@@ -39,7 +39,7 @@ class SmoothProcess:
 def of_joints(linear: LinearModel) -> Array:
     """(n, V, 6, 1) twists of the views by a radian of each joint."""
     offset = term_of(linear.measurement, EFFECTS["joint_offset"])
-    return twists(linear.measurement, linear.model, [offset], linear.observation.centre)[0][..., None]
+    return next(twists(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
 
 
 def alone(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
@@ -74,7 +74,7 @@ def wandering(linear: LinearModel) -> SmoothProcess:
 def _following(angles: Array, reach: float = REACH) -> Array:
     """(V, R) smooth courses over some angles (V, a), without what is alike in all views: that has a name."""
     knots = _knots(len(angles))
-    shapes = _shapes(alike_joint_by_joint(angles, angles[knots], reach).prod(axis=2), knots, _MOST)
+    shapes = _shapes(alike_in_joints(angles, angles[knots], reach), knots, _MOST)
     return np.asarray(shapes - shapes.mean(axis=0))
 
 

@@ -25,7 +25,7 @@ def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term]
     sums = _point_gram(measurement, model, of_points, freed) if of_points else None
     seen = seen_twists(sums, freed) if sums else None
     of_views = [term for term in terms if not moves_points([term])]
-    moved = iter(twists(measurement, model, of_views, freed.overlaps.gram.centre))
+    moved = twists(measurement, model, of_views, freed.overlaps.gram.centre)
     out, at = [], 0
     for term in terms:
         if sums is not None and seen is not None and moves_points([term]):

@@ -16,7 +16,7 @@ from stitch.observations.targets.rows import Rows
 
 def effect_rows(rows: Rows, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
     """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
-    of_views = iter(twists(measurement, model, [t for t in terms if not moves_points([t])], rows.centre))
+    of_views = twists(measurement, model, [t for t in terms if not moves_points([t])], rows.centre)
     out = []
     for term in terms:
         if moves_points([term]):
