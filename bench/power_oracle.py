@@ -81,8 +81,9 @@ def found(a: Asked, effect: str, multiple: float, k: int) -> bool | None:
     return concluded(linear, a.candidates, ScatterLimit(*IMPLAUSIBLE)).verdict != "adequate"
 
 
-def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, float]:
-    """Shares found at every multiple, and the multiple at which eight of ten are; ∞ beyond the largest."""
+def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, int, float]:
+    """Shares found at every multiple, of how many draws, and the multiple at which eight of ten are; ∞ beyond the
+    largest."""
     shares, counts = [], []
     for multiple in MULTIPLES:
         told = [found(cells[k % len(cells)], effect, multiple, k) for k in range(draws)]
@@ -94,7 +95,7 @@ def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, float]:
     ratio = MULTIPLES[0] if rising[0] >= POWER else ratio
     above, below = np.isinf(ratio), ratio == MULTIPLES[0]
     told = f"above {MULTIPLES[-1]:g}" if above else f"at most {ratio:g}" if below else f"{ratio:.1f}"
-    return f"| {effect} | {min(counts)} | {' | '.join(f'{s:.2f}' for s in shares)} | {told} |", ratio
+    return f"| {effect} | {min(counts)} | {' | '.join(f'{s:.2f}' for s in shares)} | {told} |", min(counts), ratio
 
 
 def main() -> None:
@@ -111,9 +112,10 @@ def main() -> None:
         print("|---" * (len(MULTIPLES) + 3) + "|")
         ratios = []
         for effect in options.effects.split(","):
-            line, ratio = row(effect, cells, options.draws)
-            print(line, flush=True)
-            ratios.append(ratio)
+            line, count, ratio = row(effect, cells, options.draws)
+            if count:
+                print(line, flush=True)
+                ratios.append(ratio)
     print(f"\nmedian ratio {np.median(ratios):.2f}; {time.process_time():.0f} s of processor time")
 
 
