@@ -9,7 +9,8 @@ import rerun.blueprint as rrb
 from stitch.comparison.model_history import change_of
 from stitch.frames import Array
 from stitch.runs.run import Run
-from viz.model_timeline import FRAMES, ModelScene, shown_steps
+from viz.model_scene import ModelScene, shown_steps
+from viz.model_timeline import FRAMES
 from viz.part_camera import Camera
 
 # Of the longest side of the part, from its middle: all of it is in the picture.
@@ -50,7 +51,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
             rrb.TextDocumentView(origin="now", name="Step of the model"),
             _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[5, 10, 3],
+            row_shares=[6, 10, 3],
         ),
         column_shares=[3, 3, 2],
         name="The model, step by step",

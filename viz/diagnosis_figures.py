@@ -25,19 +25,21 @@ def candidates(found: Diagnosis) -> Figure:
     return plain(figure)
 
 
-def added_variable(found: Diagnosis, at_most: int = 3) -> Figure:
+def added_variable(found: Diagnosis, at_most: int = 3) -> Figure | None:
     """What the views show against what each candidate effect predicts, hand-eye and model taken out of both.
 
     Points are numbers of the pose channel in units of their scatter; a straight line through zero of slope 1
-    is an effect that is there as fitted.
+    is an effect that is there as fitted. None where no candidate effect explains anything.
     """
     # Of candidates that gain nothing no amplitude was fitted.
     shown = [s for s in found.candidates if s.ranked.score.observable and s.ranked.score.p_value < 1.0][:at_most]
+    if not shown:
+        return None
     figure = Figure(figsize=(7, 3.0), layout="constrained")
-    axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
-    for ax, candidate in zip(axes, shown, strict=False):
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for ax, candidate in zip(axes, shown, strict=True):
         _added(ax, found, candidate)
-    reach = 1.08 * max((float(np.abs(ax.dataLim.get_points()).max()) for ax in axes if shown), default=1.0)
+    reach = 1.08 * max(float(np.abs(ax.dataLim.get_points()).max()) for ax in axes)
     for ax in axes:
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1)
     axes[0].set_ylabel("seen (sigma)")

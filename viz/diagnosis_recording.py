@@ -10,6 +10,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import amounts_of
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
+from stitch.writing.plain_effects import in_words, what_it_is
 from stitch.writing.plain_finding import next_step, plain_finding
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
@@ -63,9 +64,10 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     ]
     lines += [
         f"| {i} | {c.name} | {c.ranked.adjusted:.1g} | {c.ranked.posterior:.2f} | {on_part.get(c.name, '–')} "
-        f"| {amounts_of(c.ranked)} |"
+        f"| {amounts_of(c.ranked).replace('-', '−')} |"
         for i, c in enumerate(shown)
     ]
+    lines += ["", *(f"- {in_words(c.name)}" for c in shown if what_it_is(c.name))]
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     text = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     rec.log("diagnosis/verdict", text, static=True)

@@ -58,8 +58,8 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
         {
             "effect": term.name,
             "name": p.name,
-            "value": rounded(p.value, p.sigma),
-            "sigma": f"{p.sigma:.1g}" if p.fitted else "–",
+            "value": rounded(p.value, p.sigma).replace("-", "−"),
+            "sigma": f"{p.sigma:.1g}".replace("-", "−") if p.fitted else "–",
             "unit": p.unit,
         }
         for term in run.terms

@@ -14,7 +14,8 @@ from viz.blueprint import model_blueprint, target_blueprint
 from viz.colour_bar import log_colour_bar
 from viz.colours import COLOURS_OF_FEW, FIELD, GREY, robust_limit, unsigned_colours
 from viz.diagnosis_recording import NOT_YET
-from viz.model_timeline import log_model, model_scene
+from viz.model_scene import model_scene
+from viz.model_timeline import log_model
 from viz.part_camera import camera_for
 from viz.part_surface import part_surface
 from viz.robot_scene import log_robot
@@ -72,7 +73,7 @@ class RerunRecorder:
             surface = part_surface(run.fused, history.patches)
             camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
             scene = model_scene(run, history, surface, cell)
-            log_model(rec, run, scene)
+            log_model(rec, run, scene, camera.up)
             full = scene.limit * um
             fell = tuple(stage for stage, rms in self.rms.items() if rms[-1] < _FELL * rms[0])
             log_colour_bar(rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"])

@@ -43,7 +43,28 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
     if not in_hand:
         points = frames.transform(flange[0], points)
     recording.log("robot/part", rr.Points3D(points.astype(np.float32), colors=[_PART]), static=True)
+    first = "" if in_hand else f" at {names[0]}"
+    _log_names(
+        recording,
+        {
+            "robot's base": np.zeros(3),
+            f"scanner at {names[0]}" if in_hand else "scanner": T_base_scanner[0, :3, 3],
+            f"part{first}": points.mean(axis=0),
+        },
+    )
     return np.concatenate(seen)
+
+
+def _log_names(recording: rr.RecordingStream, places: dict[str, Array]) -> None:
+    """What stands where, in words."""
+    named = rr.Points3D(
+        np.array(list(places.values())),
+        labels=list(places),
+        colors=[_PART],
+        radii=rr.Radius.ui_points(2.5),
+        show_labels=True,
+    )
+    recording.log("robot/names", named, static=True)
 
 
 def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:

@@ -4,6 +4,7 @@ from stitch.comparison.model_history import ModelHistory
 from stitch.comparison.run_verdict import run_verdict
 from stitch.runs.run import Run
 from stitch.units import length_text
+from stitch.writing.plain_effects import in_words
 
 _COLOURS = "Pale: the views agree. Dark red: they disagree. Grey: seen by one view only."
 
@@ -15,6 +16,7 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]
         lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
         lines += ["", _COLOURS, ""]
+    lines += [f"- In the model: {in_words(effect)}" for effect in run.effects]
     lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
     lines += [f"- {note}" for note in run.notes]
     return "\n".join(lines)

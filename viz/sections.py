@@ -1,6 +1,7 @@
 """What comparison and diagnosis add to a run folder: sections of the page, pictures, a tab of the recording."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from stitch.diagnosis.sentences import amounts_of
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
+from stitch.writing.plain_effects import what_it_is
 from stitch.writing.plain_finding import next_step, plain_finding
 from viz import captions
 from viz import diagnosis_figures as draw
@@ -41,7 +43,7 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         field=None if fields is None else script_json(packed_candidates(fields, unit)),
         lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
         unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
-        pictures=[(picture.title, addresses[name], picture.caption) for name, picture in pictures.items()],
+        pictures=[(pictures[name].title, address, pictures[name].caption) for name, address in addresses.items()],
     )
     _insert(folder / "report.html", "diagnosis", html)
     why, command = next_step(found, "RUN").rsplit(": ", 1)
@@ -52,15 +54,16 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
 
 class _Picture(NamedTuple):
     title: str
-    figure: Figure
+    figure: Figure | None  # where there is nothing to draw
     caption: str
 
 
 def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     """File name → picture, in the order of the page."""
     predicted = "What the views show against what the first candidate effects predict"
-    courses = _Picture("Where in its range a joint errs without a name", draw.joint_courses(found), captions.COURSES)
-    return ({"joint_courses": courses} if found.curves else {}) | {
+    curves = draw.joint_courses(found) if found.curves else None
+    return {
+        "joint_courses": _Picture("Where in its range a joint errs without a name", curves, captions.COURSES),
         "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
         "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
         "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),
@@ -77,9 +80,9 @@ def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[d
     return [
         {
             "name": s.name,
-            "p": f"{s.ranked.adjusted:.1g}",
+            "p": f"{s.ranked.adjusted:.1g}".replace("-", "−"),
             "posterior": f"{s.ranked.posterior:.2f}",
-            "amounts": amounts_of(s.ranked),
+            "told": "; ".join(filter(None, [what_it_is(s.name), amounts_of(s.ranked).replace("-", "−")])),
             "rms_if_added": _rms(found, s, "inside", um),
             "heldout": _rms(found, s, "heldout", um),
             "on_part": on_part.get(s.name, "–"),
@@ -118,11 +121,15 @@ def _insert(page: Path, name: str, html: str) -> None:
         file.write_text(new, encoding="utf-8")
 
 
-def _save(folder: Path, figures: dict[str, Figure]) -> dict[str, str]:
-    """Each figure as SVG and PNG; the SVG's data address by name."""
+def _save(folder: Path, figures: Mapping[str, Figure | None]) -> dict[str, str]:
+    """Each figure as SVG and PNG, none that an earlier one left where there is none; the SVG's data address by name."""
     folder.mkdir(exist_ok=True)
     addresses = {}
     for name, figure in figures.items():
+        if figure is None:
+            for ending in ("png", "svg"):
+                (folder / f"{name}.{ending}").unlink(missing_ok=True)
+            continue
         text = svg_text(figure)
         figure.set_layout_engine("none")  # found once; it takes half of the time of a drawing
         with whole(folder / f"{name}.png") as file:

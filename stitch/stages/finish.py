@@ -96,7 +96,7 @@ def finish_surfaces(
         noise_floor=floor,
         fused=fused,
         repeatability=scatter,
-        verdict=surface_sentence(g.rms, final.rms, floor, scatter, session.length_unit),
+        verdict=surface_sentence(g.rms, final.rms, floor, scatter, session.length_unit, correction.model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
         overlaps=overlaps,
         registered=registration.overlaps,

@@ -22,13 +22,25 @@ _CLOSE = 1.1
 _LISTED = 12
 
 
-def surface_sentence(residual: float, registered: float, floor: float, scatter: Repeatability, length_unit: str) -> str:
-    """What one hand-eye leaves between the surfaces, what the noise would leave, and where the difference sits."""
+def surface_sentence(
+    residual: float,
+    registered: float,
+    floor: float,
+    scatter: Repeatability,
+    length_unit: str,
+    effects: Sequence[str] = (),
+) -> str:
+    """What one hand-eye leaves between the surfaces, what the noise would leave, and where the difference sits.
+
+    Args:
+        effects: names of those that are in the model beside the hand-eye.
+    """
     left, noise = (length_text(x, length_unit) for x in (residual, floor))
+    model = f"One hand-eye with {' and '.join(effects)}" if effects else "One hand-eye"
     if residual < _NEAR_FLOOR * floor:
-        return f"One hand-eye closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."
+        return f"{model} closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."
     return (
-        f"One hand-eye leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
+        f"{model} leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
         f"{_scatter(scatter, registered, length_unit)}."
     )
 

@@ -26,6 +26,11 @@ _WORDS = {
 }
 
 
+def what_it_is(name: str) -> str:
+    """An effect in a few words; nothing of one of one's own."""
+    return _WORDS.get(name, "")
+
+
 def in_words(name: str) -> str:
     """An effect's name with what it is; of an effect of one's own the name alone."""
-    return f"{name} ({_WORDS[name]})" if name in _WORDS else name
+    return f"{name} ({what_it_is(name)})" if what_it_is(name) else name

@@ -28,7 +28,17 @@ FILES = {
     "robot.urdf",
 }
 # "suspects" is what "candidates" was called once.
-_PICTURES = {"budget", "candidates", "suspects", "added_variable", "shape", "aliases", "views", "compare"}
+_PICTURES = {
+    "budget",
+    "candidates",
+    "suspects",
+    "added_variable",
+    "shape",
+    "aliases",
+    "views",
+    "joint_courses",
+    "compare",
+}
 
 
 def ours(path: Path) -> Ours:

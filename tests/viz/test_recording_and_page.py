@@ -18,6 +18,7 @@ from stitch.runs.run import Note
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
+from viz.model_timeline import one_above_the_other
 from viz.run_page import write_report
 
 
@@ -66,9 +67,17 @@ def test_the_recording_is_whole_and_small_and_shows_everything(recorded):
     farthest = [result.session.views[v].name for v in np.argsort(-off)[:4]]
     shown = {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
     parts = {f"/part/{name}" for name in ("now", "before", "after")} | {f"/scans/{name}" for name in farthest}
-    cell = {"/robot/arm", "/robot/flanges", "/robot/part", "/robot/scanner/scanner"}
+    cell = {"/robot/arm", "/robot/flanges", "/robot/part", "/robot/scanner/scanner", "/robot/names"}
     bars = {"/bars/views", "/bars/moved", "/iterations/correct", "/iterations/register", "/colours/field/ticks"}
     assert parts | cell | bars | {"/stitched", "/displacements", "/now", "/verdict", "/diagnosis/verdict"} <= shown
+
+
+def test_no_name_of_a_view_covers_another():
+    up = np.array([0.0, 0.6, 0.8])
+    views = [np.random.default_rng(seed).uniform(-100, 100, (5000, 3)) for seed in range(4)]
+    heights = np.sort(one_above_the_other(views, up) @ up)
+    low, high = (f(np.concatenate(views) @ up) for f in (np.min, np.max))
+    assert np.allclose(np.diff(heights), (high - low) / 4, rtol=0.2)
 
 
 def test_titles_and_words_say_what_the_result_says(recorded):

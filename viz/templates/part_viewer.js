@@ -56,6 +56,8 @@ function showPart(root, data, more, eye) {
     slider.max = steps.length - 1;
     slider.value = Math.min("cs".includes(choice.value[0]) ? 1 : data.end, steps.length - 1);
     shown = -1; label(); draw();
+    const told = { kind: choice.value[0], text: choice.selectedOptions[0].text, means: steps.map(s => s.mean) };
+    root.dispatchEvent(new CustomEvent("shown", { detail: told }));  // "a"ll, a "v"iew, a "c"andidate effect, what was "s"elected
   }
   function label() {
     const k = Math.round(Number(slider.value)), s = steps[k], signed = isSigned();
@@ -186,6 +188,7 @@ function showPart(root, data, more, eye) {
   choose(); names(); label();
   return {
     names: () => data.steps.map(s => s.name),
+    at: () => Number(slider.value),
     glide,
     learn,
     eye: () => ({ yaw, pitch, zoom, panX, panY }),
@@ -205,13 +208,24 @@ function showPart(root, data, more, eye) {
       [...choice.options].filter(o => o.value === "s").forEach(o => o.remove());
       selection = states;
       if (states) choice.add(new Option(`chosen: ${name}`, "s"), 1);
-      this.show(states ? "s" : "all");
+      this.back();
     },
+    back() { this.show(selection ? "s" : "all"); },  // from a view or a candidate effect to what was chosen
   };
 }
 
 (() => {  // on a page of its own
   const root = document.getElementById("part"), source = document.getElementById("part-data");
   const extra = document.getElementById("candidate-data");
-  if (root && source) showPart(root, JSON.parse(source.textContent), extra && JSON.parse(extra.textContent));
+  if (!root || !source) return;
+  const data = JSON.parse(source.textContent), part = showPart(root, data, extra && JSON.parse(extra.textContent));
+  if (!part || data.end <= data.begin || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+  // What was added is seen at work once: from the first model to the present one, as soon as the part is in sight.
+  part.jump(data.begin);
+  const seen = new IntersectionObserver(entries => {
+    if (!entries.some(e => e.isIntersecting)) return;
+    seen.disconnect();
+    setTimeout(() => { if (part.at() === data.begin) part.glide(data.end); }, 900);
+  }, { threshold: 0.6 });
+  seen.observe(root.querySelector("canvas"));
 })();
