@@ -75,7 +75,10 @@ def read_rows(run: Path, result: dict[str, Any]) -> ResidualRows | None:
         )
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
-    return _both_sides(table, result, 1 / step)
+    rows = _both_sides(table, result, 1 / step)
+    del parts, batch, table
+    pa.default_memory_pool().release_unused()  # three times what the rows take
+    return rows
 
 
 def read_sightings(run: Path, result: dict[str, Any]) -> ResidualRows:

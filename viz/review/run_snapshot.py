@@ -13,6 +13,7 @@ from stitch.reading.text_file import shortened
 from stitch.runs.run import LedgerStep
 from stitch.stored.run_documents import read_documents
 from stitch.units import MICROMETRES, rounded
+from stitch.writing.plain_effects import in_words
 from viz.review.told_candidates import told_diagnosis
 from viz.review.undo_history import undo_history
 
@@ -94,6 +95,7 @@ def _read(run: Path, version: str) -> Snapshot:
         "steps": [{"step": s["step"], "mean": s["mean"] * um, "noise": s["of_noise"] * um} for s in steps],
         "ledger": [_step(ledger, i, um) for i in range(len(ledger))],
         "effects": _effects(result),
+        "in_words": [in_words(effect) for effect in result["effects"]],
         "diagnosis": diagnosis,
         "comparison": None if comparison is None else comparison[1],
         "history": undo_history([step.effects for step in ledger]),

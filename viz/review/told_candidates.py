@@ -3,6 +3,7 @@
 from typing import Any
 
 from stitch.units import rounded
+from stitch.writing.plain_effects import what_it_is
 
 # The clearest parameters of an effect that are told.
 _TOLD = 3
@@ -43,6 +44,7 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
 
     return {
         "effect": row["effect"],
+        "is": what_it_is(row["effect"]),
         "p": "–" if row["p_value"] is None else f"{row['p_value']:.1g}",
         "posterior": row["posterior"],
         "rms_if_added": in_um(row["rms_if_added"]),

@@ -96,6 +96,9 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story.says("#missing", "joint_compliance is missing")
     story.click("Show the part as joint_compliance should leave it")
     playwright.expect(title).to_contain_text("if joint_compliance were added")
+    # The numbers below speak of what is seen, and the choice is one click away.
+    story.says("#chosen", "Predicted: joint_compliance")
+    story.says("#chosen", "Back to ")
     story.click("Add joint_compliance")
     story.says("#ledger", "+ joint_compliance")
     story.says("#sentence", "Adding joint_compliance brought the views from")
@@ -126,6 +129,7 @@ def test_the_story_of_labelled_points(browser, kind, tmp_path, stitch_command):
             re.compile(f"hand-eye alone: the views see the targets {1e3 * rms:.3g} µm off their place, rms")
         )
         story.says("#plots", "signed mean")
+        playwright.expect(story.page.locator("#plots")).not_to_contain_text("false")
         assert barriers(story.page) == []
         # The mark in the middle of the picture may be any: some click near it meets one.
         canvas = story.page.locator("#scene canvas").bounding_box()

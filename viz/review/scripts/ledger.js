@@ -21,7 +21,7 @@ export function showLedger(state, ask, busy) {
     button.textContent = change ? `${word}: ${change.command} ${change.effects.join(", ")}` : word;
     button.onclick = () => ask({ kind });
   }
-  parameters(state.effects);
+  parameters(state.effects, state.in_words);
 }
 
 // A new step's bars begin where those of the step before ended.
@@ -33,8 +33,8 @@ function fall(track, before, step, most) {
   });
 }
 
-function parameters(rows) {
+function parameters(rows, names) {
   if (!rows.length) return;
-  at("ledger").append(element("details", {}, element("summary", {}, "Effects in the model"),
+  at("ledger").append(element("details", {}, element("summary", {}, `Effects in the model: ${names.join(", ")}`),
     ...rows.map(r => element("p", {}, signed(`${r.effect}.${r.parameter} = ${r.value} ± ${r.sigma} ${r.unit}`)))));
 }

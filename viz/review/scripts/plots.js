@@ -1,6 +1,6 @@
 // Where it fails: a small plot for each property. What is chosen in one changes part and numbers.
 import { at, digits, element, um } from "./elements.js";
-import { showChoice } from "./scene.js";
+import { back, onShown, showChoice } from "./scene.js";
 import { send } from "./server.js";
 
 // More bars than this are thinner than a finger, and slow.
@@ -45,10 +45,11 @@ function draw() {
   const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));
   const shown = all ? properties : properties.slice(0, FIRST);
   const focus = document.activeElement && document.activeElement.dataset.key;
-  root.replaceChildren(named(VIEWS, "Views", "views", state.labelled ? "rms of the labelled points of each" : "rms of each against the others"),
+  const parts = [named(VIEWS, "Views", "views", state.labelled ? "rms of the labelled points of each" : "rms of each against the others"),
     named(TARGETS, "Targets", "targets", "rms of each over the views"), ...shown.map(table => plot(table, follows)), places(),
     properties.length > FIRST && element("button", { type: "button", onclick: () => { all = !all; draw(); }, "aria-expanded": String(all) },
-      all ? "Fewer properties" : `${properties.length - FIRST} further properties`));
+      all ? "Fewer properties" : `${properties.length - FIRST} further properties`)];
+  root.replaceChildren(...parts.filter(Boolean));
   if (focus) root.querySelector(`[data-key="${CSS.escape(focus)}"]`)?.focus();
 }
 
@@ -149,8 +150,19 @@ async function ask() {
   }
 }
 
+// The numbers speak of what the picture shows: of a view or a candidate effect too, until one goes back to the choice.
+let chosenNumbers = () => numbers(null);
+onShown(({ kind, text, means }) => {
+  if (kind !== "v" && kind !== "c") { chosenNumbers(); return; }
+  const name = words(), button = element("button", { type: "button", onclick: back }, name ? `Back to ${name}` : "Show all again");
+  const told = kind === "v" ? "This view alone; choose its bar for its numbers."
+    : `${um(means[0])} on average over the part as it is, ${um(means[1])} if it were added, in the linear approximation: all views, all places.`;
+  at("chosen").replaceChildren(button, element("p", {}, element("b", {}, kind === "v" ? `Shown: ${text}` : `P${text.slice(1)}`)), element("p", {}, told));
+});
+
 function numbers(name, told, problem) {
   const root = at("chosen");
+  chosenNumbers = () => numbers(name, told, problem);
   root.removeAttribute("aria-busy");
   if (!name) { root.replaceChildren(element("p", { class: "soft" }, "Nothing is chosen: all views and all places count.")); return; }
   const clear = element("button", { type: "button", onclick: () => { choice = empty(); draw(); ask(); } }, "Show all again");
@@ -161,7 +173,7 @@ function numbers(name, told, problem) {
   const { chosen, all } = told;
   root.replaceChildren(clear, element("p", {}, element("b", {}, `Chosen: ${name}`)),
     element("p", {}, `${chosen.views} of ${all.views} views, ${chosen.correspondences.toLocaleString("en")} residuals: rms ${um(chosen.rms)} (all: ${um(all.rms)})`
-      + (chosen.mean == null ? "" : `, on average over the part ${um(chosen.mean)} (all: ${um(all.mean)})`)
+      + (chosen.mean == null ? "" : `, on average over the part ${um(chosen.mean)} (all, by the same patches: ${um(all.mean)})`)
       // Both sides of every correspondence count: without a choice among them the mean is zero.
       + (Math.abs(chosen.signed ?? 0) < 1e-6 ? "." : `, signed mean ${um(chosen.signed)}.`)));
 }

@@ -45,6 +45,8 @@ function words(state) {
 export const predict = name => viewer !== null && viewer.predict(name);
 // View and target of a mark among labelled points, each null where it stands for all; null on a surface.
 export const markOf = patch => marks && { view: marks[patch][0], target: marks[patch][1] };
+export const back = () => viewer && viewer.back();
+export const onShown = heard => root.addEventListener("shown", event => heard(event.detail));
 export const onPick = heard => root.addEventListener("pick", event => heard(event.detail.place, event.detail.patch));
 
 // The field of a choice beside that of everything; null takes it away.
@@ -69,5 +71,5 @@ export function showNumbers(state) {
 
 function fell(value, old) {
   const share = Math.round(100 * (value / old - 1));
-  return element("span", { class: share < 0 ? "fell" : "soft" }, `${share < 0 ? "−" : "+"}${Math.abs(share)} % from ${um(old)}`);
+  return element("span", { class: share < 0 ? "fell" : share > 0 ? "rose" : "soft" }, `${share < 0 ? "−" : "+"}${Math.abs(share)} % from ${um(old)}`);
 }
