@@ -24,7 +24,7 @@ from viz.review.run_review import RunReview
 _SCRIPTS = Path(__file__).parent / "scripts"
 # Scripts that the page of a run holds too.
 _TEMPLATES = Path(__file__).parents[1] / "templates"
-_SHARED = ("part_numbers.js", "part_drawing.js", "part_viewer.js")
+_SHARED = ("part_numbers.js", "part_drawing.js", "part_eye.js", "part_viewer.js")
 _RECORDING = "recording.rrd"
 
 

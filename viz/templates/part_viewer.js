@@ -9,7 +9,7 @@ function showPart(root, data, more, eye) {
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
   const play = root.querySelector("button[data-play]");
-  let { yaw, pitch, zoom, panX, panY } = eye || { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
+  const look = partEye(canvas, data.box, eye, () => { draw(); root.dispatchEvent(new CustomEvent("eye")); }, pick);
   if (data.words) canvas.setAttribute("aria-label", `${data.words.picture} ${canvas.getAttribute("aria-label").split(". ").slice(1).join(". ")}`);
   let steps = [], shown = -1, wanted = false, selection = null;
 
@@ -101,7 +101,7 @@ function showPart(root, data, more, eye) {
         drawing.write(steps[k].on, steps[k + 1].on);
         shown = k;
       }
-      drawing.paint({ turn: turned(), scale: scales(), shift: [panX, panY], zoom, blend: t - k, full: full(), signed: isSigned() });
+      drawing.paint({ turn: look.turn(), scale: look.scales(), shift: look.shift(), zoom: look.now().zoom, blend: t - k, full: full(), signed: isSigned() });
     });
   }
   let gliding = 0;
@@ -120,55 +120,8 @@ function showPart(root, data, more, eye) {
   choice.onchange = () => { choose(); names(); label(); };
   play.onclick = () => { const last = steps.length - 1; slider.value = Math.min(data.begin, last - 1); glide(last); };
 
-  const fingers = new Map();
-  let pressed = null;
-  canvas.addEventListener("pointerdown", e => {
-    fingers.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId);
-    pressed = fingers.size === 1 ? e : null;
-  });
-  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, e => {
-    fingers.delete(e.pointerId);
-    const still = pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 4;
-    if (still && name === "pointerup" && e.button === 0) pick(e);
-    pressed = null;
-  });
-  canvas.addEventListener("pointermove", e => {
-    const before = fingers.get(e.pointerId);
-    if (!before) return;
-    const x = (e.clientX - before.clientX) / canvas.clientWidth, y = (e.clientY - before.clientY) / canvas.clientHeight;
-    if (fingers.size > 1) {
-      const other = [...fingers.values()].find(f => f.pointerId !== e.pointerId);
-      const far = f => Math.hypot(f.clientX - other.clientX, f.clientY - other.clientY);
-      zoom = Math.min(12, Math.max(0.5, zoom * far(e) / Math.max(far(before), 1)));
-      panX += x; panY -= y;
-    } else if (e.shiftKey || e.buttons === 4 || e.buttons === 2) { panX += 2 * x; panY -= 2 * y; }
-    else { yaw += 4 * x; pitch = Math.min(1.6, Math.max(-1.6, pitch + 3 * y)); }
-    fingers.set(e.pointerId, e); turnedTo();
-  });
-  canvas.addEventListener("contextmenu", e => e.preventDefault());
-  canvas.addEventListener("wheel", e => {
-    if (document.activeElement !== canvas && !e.ctrlKey) return;  // the page scrolls until the part is clicked
-    e.preventDefault(); zoom = Math.min(12, Math.max(0.5, zoom * Math.exp(-e.deltaY / 500))); turnedTo();
-  }, { passive: false });
-  canvas.addEventListener("keydown", e => {
-    const step = 0.12;
-    if (e.key === "ArrowLeft") yaw -= step; else if (e.key === "ArrowRight") yaw += step;
-    else if (e.key === "ArrowUp") pitch -= step; else if (e.key === "ArrowDown") pitch += step;
-    else if (e.key === "+") zoom *= 1.15; else if (e.key === "-") zoom /= 1.15;
-    else if (e.key === "Home") { yaw = pitch = panX = panY = 0; zoom = 1; } else return;
-    e.preventDefault(); turnedTo();
-  });
-  function turnedTo() { draw(); root.dispatchEvent(new CustomEvent("eye")); }  // somebody turned the part
-  const turned = () => {
-    const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
-    return [a, b * d, -b * c, 0, c, d, b, -a * d, a * c];
-  };
-  function scales() {
-    const w = canvas.clientWidth, h = canvas.clientHeight, fit = Math.min(w / data.box[0], h / data.box[1]);
-    return [1.9 * zoom * fit / w, 1.9 * zoom * fit / h];
-  }
   function pick(e) {  // the vertex nearest to the eye within a few pixels of the pointer tells which place was meant
-    const box = canvas.getBoundingClientRect(), m = turned(), [sx, sy] = scales();
+    const box = canvas.getBoundingClientRect(), m = look.turn(), [sx, sy] = look.scales(), [panX, panY] = look.shift();
     const x = 2 * (e.clientX - box.left) / box.width - 1, y = 1 - 2 * (e.clientY - box.top) / box.height;
     const near2 = (14 / Math.min(box.width, box.height)) ** 2;
     let best = -1, depth = -Infinity;
@@ -191,8 +144,8 @@ function showPart(root, data, more, eye) {
     at: () => Number(slider.value),
     glide,
     learn,
-    eye: () => ({ yaw, pitch, zoom, panX, panY }),
-    look(eye) { ({ yaw, pitch, zoom, panX, panY } = eye); draw(); },
+    eye: look.now,
+    look(eye) { look.set(eye); draw(); },
     jump(to) { cancelAnimationFrame(gliding); slider.value = to; label(); draw(); },
     stop() { cancelAnimationFrame(gliding); },
     show(value) {  // "all", "v3", "c0", "s"
@@ -213,19 +166,3 @@ function showPart(root, data, more, eye) {
     back() { this.show(selection ? "s" : "all"); },  // from a view or a candidate effect to what was chosen
   };
 }
-
-(() => {  // on a page of its own
-  const root = document.getElementById("part"), source = document.getElementById("part-data");
-  const extra = document.getElementById("candidate-data");
-  if (!root || !source) return;
-  const data = JSON.parse(source.textContent), part = showPart(root, data, extra && JSON.parse(extra.textContent));
-  if (!part || data.end <= data.begin || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
-  // What was added is seen at work once: from the first model to the present one, as soon as the part is in sight.
-  part.jump(data.begin);
-  const seen = new IntersectionObserver(entries => {
-    if (!entries.some(e => e.isIntersecting)) return;
-    seen.disconnect();
-    setTimeout(() => { if (part.at() === data.begin) part.glide(data.end); }, 900);
-  }, { threshold: 0.6 });
-  seen.observe(root.querySelector("canvas"));
-})();
