@@ -80,7 +80,8 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
         origins=places,
         vectors=ends - from_centre,
         labels=[scene.names[v] for v in few],
-        colors=list(COLOURS_OF_FEW[: len(few)]),
+        # Lighter than the points on which name and arrow stand.
+        colors=[tuple((c + 255) // 2 for c in colour) for colour in COLOURS_OF_FEW[: len(few)]],
         radii=_THICK,
         show_labels=True,
     )

@@ -6,17 +6,19 @@ from stitch.runs.run import Run
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
 
-_COLOURS = "Pale: the views agree. Dark red: they disagree. Grey: seen by one view only."
+_UNSEEN = "Grey: seen by one view only."
 
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
     """Verdict, how the error fell, what could not be seen."""
-    lines = [f"# {run.session.name}", "", f"**{run_verdict(run, history)}**", "", run.verdict, ""]
+    lines = [f"# {run.session.name}", "", f"**{run_verdict(run, history)}**", ""]
+    if run.effects:
+        lines += [f"In the model: {', '.join(map(in_words, run.effects))}.", ""]
+    lines += [run.verdict, ""]
     if history is not None:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]
         lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
-        lines += ["", _COLOURS, ""]
-    lines += [f"- In the model: {in_words(effect)}" for effect in run.effects]
+        lines += ["", _UNSEEN, ""]
     lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
     lines += [f"- {note}" for note in run.notes]
     return "\n".join(lines)
