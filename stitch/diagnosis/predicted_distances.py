@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.diagnosis.score import Score
+from stitch.diagnosis.score import Score, score
 from stitch.frames import Array
 from stitch.model.forward import moves_points, shift
 from stitch.observations.linear_model import LinearModel
@@ -15,12 +15,17 @@ from stitch.observations.surfaces.surface_model import Surfaces
 def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
     """(M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
 
-    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate; in the order of the
-    matches to which the views were freed. None without clouds.
+    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
+    scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
+    no prediction. In the order of the matches to which the views were freed. None without clouds.
     """
     surfaces = linear.observation
     if not isinstance(surfaces, Surfaces):
         return None
+    fitted = linear.scatter_only
+    if scored is not None and fitted is not linear:
+        scored = score(fitted, scored.candidate)
+    linear = fitted
     freed = surfaces.freed
     poses = surfaces.capture.poses(linear.model.T_mount)
     points = [scan.points for scan in surfaces.capture.scans]

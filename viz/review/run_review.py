@@ -2,6 +2,7 @@
 
 import re
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,8 @@ class RunReview:
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _last: Snapshot | None = None
     _rows: KnownResiduals | None = None
+    # One thread computes: what it gives back is its own again, where each of many would keep a share.
+    _computing: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
 
     @property
     def version(self) -> str:
@@ -91,13 +94,15 @@ class RunReview:
         Raises:
             InputError: the run has no such view, property or bin, or no field.
         """
+        return self._computing.submit(self._chosen, choice).result()
+
+    def _chosen(self, choice: Choice) -> dict[str, Any]:
         found = self.snapshot()
         um = MICROMETRES[found.result["length_unit"]]
-        with self._lock:
-            if self._rows is None or self._rows.model != found.model:
-                self._rows = None  # two at once would take twice the memory
-                self._rows = known_residuals(self.run, found, um)
-            known = self._rows
+        if self._rows is None or self._rows.model != found.model:
+            self._rows = None  # two at once would take twice the memory
+            self._rows = known_residuals(self.run, found, um)
+        known = self._rows
         return {"model": found.model, "all": known.all, "chosen": known.chosen(choice, found.comparison, um)}
 
     def arguments(self, kind: str, asked: dict[str, Any]) -> list[str]:

@@ -58,6 +58,12 @@ def soft_joint(tmp_path_factory, stitch_command):
     return folder / "r"
 
 
+def mean_on_part(run, step):
+    """How far the views disagree at a step of the model, mm."""
+    steps = json.loads((run / "result.json").read_text())["disagreement"]["steps"]
+    return next(row["mean"] for row in steps if row["step"] == step)
+
+
 @pytest.fixture(scope="module")
 def address(soft_joint):
     with served(soft_joint) as server:
@@ -96,6 +102,10 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story.says("#missing", "joint_compliance is missing")
     story.click("Show the part as joint_compliance should leave it")
     playwright.expect(title).to_contain_text("if joint_compliance were added")
+    told = json.loads(
+        re.search(r'id="candidate-data">(.*?)</script>', (soft_joint / "report.html").read_text(), re.S)[1]
+    )
+    assert told["mean"] == pytest.approx(1e3 * mean_on_part(soft_joint, "hand-eye alone"), rel=0.05)
     # The numbers below speak of what is seen, and the choice is one click away.
     story.says("#chosen", "Predicted: joint_compliance")
     story.says("#chosen", "Back to ")
@@ -103,6 +113,9 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story.says("#ledger", "+ joint_compliance")
     story.says("#sentence", "Adding joint_compliance brought the views from")
     assert story.clicks <= 6
+    # What was predicted has come.
+    predicted = next(c["mean"] for c in told["candidates"] if c["name"] == "joint_compliance")
+    assert predicted == pytest.approx(1e3 * mean_on_part(soft_joint, "+ joint_compliance"), rel=0.2)
     ledger = json.loads((soft_joint / "ledger.json").read_text())
     before, after = (step["heldout_rms"] for step in ledger)
     assert after < 0.8 * before
