@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -10,6 +11,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import NoResultError
@@ -56,7 +58,11 @@ def _fetched() -> Path:
     quiet = os.environ | {"RERUN_ANALYTICS": "off"}
     try:
         served = subprocess.Popen(
-            [rerun_program(), *words], env=quiet, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [rerun_program(), *words],
+            env=quiet,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
     except OSError as error:
         raise NoResultError(f"the Rerun viewer could not be started ({error}); use `stitch view`") from None
@@ -70,9 +76,18 @@ def _fetched() -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         raise
     finally:
-        served.kill()
-        served.wait()
+        _end(served)
     return folder
+
+
+def _end(served: subprocess.Popen[bytes]) -> None:
+    """With the launcher the program itself, which would outlive it."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(served.pid, signal.SIGKILL)
+    else:
+        served.kill()
+    served.wait()
 
 
 def _asked(address: str) -> bytes:
