@@ -1,5 +1,7 @@
 """Numbers as people read them: mm, µm below one, mrad; with the digits that are known."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 METRES = {"mm": 1e-3, "m": 1.0}  # in one length_unit
@@ -55,4 +57,38 @@ def rounded(value: float, sigma: float) -> str:
         return f"{value:.4g}"
     place = int(np.floor(np.log10(sigma)))
     value = round(value, -place)
-    return f"{value:.{max(int(np.floor(np.log10(abs(value)))) - place + 1, 1)}g}" if value else "0"
+    return _short(value, max(int(np.floor(np.log10(abs(value)))) - place + 1, 1)) if value else "0"
+
+
+class Amount(NamedTuple):
+    """A parameter of an effect as people read it."""
+
+    value: str
+    sigma: str  # – where nothing is known of it
+    unit: str
+
+    def __str__(self) -> str:
+        known = "" if self.sigma == "–" else f" ± {self.sigma}"
+        return f"{self.value}{known}{'' if self.unit in ('', '1') else f' {self.unit}'}"
+
+
+def amount(value: float, sigma: float | None, unit: str) -> Amount:
+    """A value to the first digit of its sigma, angles in mrad and angles per something in µrad: 0.63 ± 0.04 µrad/(N m).
+
+    Args:
+        unit: that of value and sigma, with angles in rad.
+    """
+    factor, told = 1.0, unit
+    if unit.startswith("rad/"):
+        factor, told = 1e6, f"µ{unit}"
+    elif "rad" in unit:
+        factor, told = 1e3, unit.replace("rad", "mrad")
+    known = sigma is not None and np.isfinite(sigma) and sigma > 0
+    size = factor * sigma if sigma is not None and known else np.nan
+    return Amount(rounded(factor * value, size), _short(size, 1) if known else "–", told)
+
+
+def _short(value: float, digits: int) -> str:
+    """So many digits; an exponent for the very small alone."""
+    text = f"{value:.{digits}g}"
+    return _plain(float(text), digits) if abs(value) >= 1 else text

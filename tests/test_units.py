@@ -2,7 +2,7 @@
 
 import pytest
 
-from stitch.units import angle_text, known_text, length_text, rounded
+from stitch.units import amount, angle_text, known_text, length_text, rounded
 
 
 def test_numbers_end_where_their_sigma_begins():
@@ -10,6 +10,23 @@ def test_numbers_end_where_their_sigma_begins():
     assert rounded(-2e-10, 0.03) == "0"
     assert rounded(0.1342, 0.0312) == "0.13"
     assert rounded(1.23456, float("nan")) == "1.235"
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "unit", "told"),
+    [
+        (9.7e-4, 2.1e-5, "rad", "0.97 ± 0.02 mrad"),
+        (6.3e-7, 4e-8, "rad/(N m)", "0.63 ± 0.04 µrad/(N m)"),
+        (1.1e-3, 2e-4, "kg rad/(N m)", "1.1 ± 0.2 kg mrad/(N m)"),
+        (1e-3, 0.03, "rad", "0 ± 30 mrad"),
+        (0.231, 0.02, "mm", "0.23 ± 0.02 mm"),
+        (1.2e-5, 3e-6, "1", "1.2e-05 ± 3e-06"),
+        (600.0, None, "s", "600 s"),
+        (12.0, float("nan"), "view", "12 view"),
+    ],
+)
+def test_parameters_of_effects_are_in_mrad(value, sigma, unit, told):
+    assert str(amount(value, sigma, unit)) == told
 
 
 @pytest.mark.parametrize(

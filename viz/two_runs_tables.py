@@ -7,7 +7,7 @@ import numpy as np
 from stitch.comparison.two_runs import Side, TwoRuns
 from stitch.frames import Array
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, known_text, length_text, rounded
+from stitch.units import MICROMETRES, amount, known_text, length_text
 
 
 class Fact(NamedTuple):
@@ -108,10 +108,11 @@ def parameter_rows(both: TwoRuns) -> list[dict[str, str]]:
 
 def _parameters(run: Run) -> dict[tuple[str, str, str], str]:
     return {
-        (term.name, p.name, p.unit): f"{rounded(p.value, p.sigma)} ± {p.sigma:.1g}" if p.fitted else f"{p.value:.4g}"
+        (term.name, p.name, told.unit): str(told._replace(unit=""))
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
+        for told in [amount(p.value, p.sigma if p.fitted else None, p.unit)]
     }
 
 

@@ -6,7 +6,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.variance_budget import NOT_REPEATING
-from stitch.units import angle_text, length_text, rounded
+from stitch.units import amount, angle_text, length_text, rounded
 
 
 def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
@@ -115,12 +115,12 @@ def curve_text(curve: JointCurve) -> str:
 
 
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
-    """The clearest parameters: c2 = 4.4e-07 ± 4e-08 rad/(N m)."""
+    """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
     s = ranked.score
     if not s.fitted:
         return "too small to be worth a fit"
     order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
     clearest = [(s.form.free[i], s.values[i], s.sigmas[i]) for i in sorted(order)]
-    fitted = [f"{p.name} = {rounded(v, sigma)} ± {sigma:.1g} {p.unit}".removesuffix(" 1") for p, v, sigma in clearest]
-    tried = [f"{p.name} = {p.value:g} {p.unit}" for p in s.form.term.parameters if p.grid]
+    fitted = [f"{p.name} = {amount(v, sigma, p.unit)}" for p, v, sigma in clearest]
+    tried = [f"{p.name} = {amount(p.value, None, p.unit)}" for p in s.form.term.parameters if p.grid]
     return ", ".join(tried + fitted)

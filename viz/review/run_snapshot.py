@@ -12,7 +12,7 @@ from stitch.errors import InputError
 from stitch.reading.text_file import shortened
 from stitch.runs.run import LedgerStep
 from stitch.stored.run_documents import read_documents
-from stitch.units import MICROMETRES, rounded
+from stitch.units import MICROMETRES, amount
 from stitch.writing.plain_effects import in_words
 from viz.review.told_candidates import told_diagnosis
 from viz.review.undo_history import undo_history
@@ -129,13 +129,14 @@ def _effects(result: dict[str, Any]) -> list[dict[str, str]]:
         {
             "effect": effect,
             "parameter": name,
-            "value": rounded(p["value"], p["sigma"]),
-            "sigma": f"{p['sigma']:.1g}",
-            "unit": p.get("unit", ""),
+            "value": told.value,
+            "sigma": told.sigma,
+            "unit": told.unit,
         }
         for effect, own in result["effects"].items()
         for name, p in own.items()
         if p.get("sigma") is not None
+        for told in [amount(p["value"], p["sigma"], p.get("unit", ""))]
     ]
 
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stitch.units import rounded
+from stitch.units import amount
 from stitch.writing.plain_effects import what_it_is
 
 # The clearest parameters of an effect that are told.
@@ -56,13 +56,9 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
 
 
 def _amounts(parameters: dict[str, dict[str, Any]]) -> str:
-    """The clearest parameters: c2 = 4.4e-07 ± 4e-08 rad/(N m)."""
-    tried = [f"{name} = {p['value']:g} {p['unit']}" for name, p in parameters.items() if p["sigma"] is None]
+    """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
+    tried = [f"{name} = {amount(p['value'], None, p['unit'])}" for name, p in parameters.items() if p["sigma"] is None]
     fitted = {name: p for name, p in parameters.items() if p["sigma"]}
     clearest = sorted(fitted, key=lambda name: -abs(fitted[name]["value"]) / fitted[name]["sigma"])[:_TOLD]
-    told = [
-        f"{name} = {rounded(p['value'], p['sigma'])} ± {p['sigma']:.1g} {p['unit']}".removesuffix(" 1")
-        for name, p in fitted.items()
-        if name in clearest
-    ]
+    told = [f"{name} = {amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest]
     return ", ".join(tried + told)

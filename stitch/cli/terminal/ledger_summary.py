@@ -8,7 +8,7 @@ from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
 from stitch.model.term import Term
 from stitch.runs.run import Run
 from stitch.system.console import console
-from stitch.units import length_text, rounded
+from stitch.units import amount, length_text
 
 
 def show_ledger(result: Run) -> None:
@@ -24,9 +24,8 @@ def show_ledger(result: Run) -> None:
     terminal.print(run_verdict(result, model_history(result)), soft_wrap=True, style="bold")
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
-            counted = "" if p.unit in ("", "1") else f" {p.unit}"
-            known_to = f" ± {p.sigma:.1g}{counted}" if p.fitted else f"{counted} (of those tried, this explains most)"
-            terminal.print(f"  {name}.{p.name} = {rounded(p.value, p.sigma)}{known_to}")
+            how = "" if p.fitted else " (of those tried, this explains most)"
+            terminal.print(f"  {name}.{p.name} = {amount(p.value, p.sigma, p.unit)}{how}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
 

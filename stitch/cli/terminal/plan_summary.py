@@ -13,7 +13,7 @@ from stitch.planning.outlook import EffectOutlook, Outlook
 from stitch.planning.plan import Plan
 from stitch.planning.rivals import Pair
 from stitch.system.console import console
-from stitch.units import METRES, length_text, rounded, uncertainty_text
+from stitch.units import METRES, amount, length_text, uncertainty_text
 
 # Pairs that are shown, and the share of wrong names from which they are told.
 _PAIRS, _MISTAKEN = 3, 0.05
@@ -85,8 +85,8 @@ def _least(e: EffectOutlook) -> str:
     if not e.detectable:
         return "–"
     name = min(e.detectable, key=lambda name: e.detectable[name] / e.usual[name])
-    unit = "" if e.units[name] == "1" else f" {e.units[name]}"
-    return f"{name} {rounded(e.detectable[name], e.detectable[name] / 10)}{unit}"
+    told = amount(e.detectable[name], e.detectable[name] / 10, e.units[name])
+    return f"{name} {told._replace(sigma='–')}"
 
 
 def _show_pairs(terminal: Console, o: Outlook) -> None:
