@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from stitch.integrity.arm_limits import judged_by_size
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.reliability import blunder_sizes, normal_blocks
 from stitch.integrity.snooping import Snooping, snoop
-from stitch.integrity.usual_effects import usual_twists
+from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture, capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
@@ -61,7 +60,7 @@ def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray,
     own = capture(session)
     T_mount, overlaps, _ = close_in([own], T_mount, [_START_GATE])
     freed = free_poses(own, own.poses(T_mount), overlaps[0].gate)
-    usual = partial(usual_twists, measurement_of(session, own), Model(T_mount))
+    usual = UsualEffects(measurement_of(session, own), Model(T_mount))
     return own, T_mount, judged_by_size(session, snoop(own, T_mount, overlaps[0].gate, freed, usual))
 
 
@@ -72,11 +71,11 @@ def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
     start = time.perf_counter()
     session = session_of(m)
     _, _, found = snooped(session, m.T_mount)
-    block = None if found.block is None else found.block.start
+    steps = [step.start for step in found.steps]
     # A step that an effect may be is left to the diagnosis: what a run leaves out is what costs anybody anything.
     out = [item.view for item in run(session).left_out] if found.left_out else []
     yield {
-        "case": f"good {'+'.join(hidden)}", "tested_out": list(found.left_out), "left_out": out, "block": block,
+        "case": f"good {'+'.join(hidden)}", "tested_out": list(found.left_out), "left_out": out, "steps": steps,
         "suspected": [m.view for m in found.suspected],
         "groups": len(found.disconnected), "seconds": time.perf_counter() - start,
     }  # fmt: skip

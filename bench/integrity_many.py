@@ -51,7 +51,7 @@ def _judged(session: Session, wrong: list[int]) -> dict[str, Any]:
     out = {item.view for item in found.left_out}
     # Of two groups that each fit, one is left out: which is right nobody can say from half of the views.
     rest = {view.name for view in session.views} - names
-    doubted = any(note.startswith("No arm scatters") for note in found.notes)
+    doubted = any(doubt.startswith("No arm scatters") for doubt in found.doubts)
     mixed = [] if rest <= out else sorted(names - out)
     return {
         "ended": "doubted" if doubted else "fused", "said": sorted(out), "mixed": mixed, "lost": len(out - names),

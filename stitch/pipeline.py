@@ -8,6 +8,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
+from stitch.integrity.admission import doubts
 from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
@@ -135,6 +136,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = kind.refit([session], [measurement], model, [state.gate], recorder)
+        own, correction = fitted.sessions[0].measurement, fitted.correction
         end = End(
             begun=begun,
             fitted=fitted,
@@ -143,6 +145,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
             ledger=state.ledger,
             left_out=state.left_out,
             links=state.links,
+            doubts=() if correction is None else doubts(session, own, correction, 0),
         )
         return collected(session, 0, end, before, recorder)
 

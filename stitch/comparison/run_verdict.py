@@ -9,11 +9,15 @@ from stitch.units import length_text
 
 
 def run_verdict(run: Run, history: ModelHistory | None) -> str:
-    """One sentence for everybody: how far the views disagree, and what the effects in use brought.
+    """For everybody: what is wrong with the session, how far its views disagree, and what the effects in use brought.
 
     Args:
         history: of this run; None without clouds.
     """
+    return " ".join([*run.doubts, _agreement(run, history)])
+
+
+def _agreement(run: Run, history: ModelHistory | None) -> str:
     unit = run.session.length_unit
     if history is not None:
         return plain_verdict(history, unit)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, u
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
-from stitch.integrity.usual_effects import usual_twists
+from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session, View
@@ -71,9 +70,7 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
         require_own_model(session, correction, index)
-    usual = partial(usual_twists, measurement, correction.model)
-    found = snoop(own, T_mount, correction.overlaps[index].gate, correction.freed[index], usual)
-    found = judged_by_size(session, found)
+    found = _examined(session, measurement, correction, index)
     if contradicts(session, found):
         refuse(session, deep_check(session))
         raise unexplained(session, found)
@@ -82,10 +79,13 @@ def admission(session: Session, measurement: Measurement, correction: Correction
         # Other mistakes look like a factor on lengths too.
         refuse(session, deep_check(session))
         refuse(session, [size])
-    doubts = _doubts(session, own, found, T_mount)
-    if found.block is not None and not _beyond_any_slip(session, found):
-        # A slip of the part, or a knock of the mount, within what a model can hold: the diagnosis names it.
-        found = replace(found, block=None)
+    if doubtful(session, found):
+        # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
+        refuse_whole(session)
+    told = _doubts(session, own, found, T_mount)
+    if not any(beyond_any_arm(session, step.rotation, step.distance) for step in found.steps):
+        # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
+        found = replace(found, steps=())
     problems = explain(session, own, T_mount, found) if found.left_out else []
     apart = next((p for p in problems if p.kind == "disconnected"), None)
     if apart is not None:
@@ -95,25 +95,39 @@ def admission(session: Session, measurement: Measurement, correction: Correction
         left_out=out,
         suspected=tuple(_suspect(session, own, m, T_mount) for m in found.suspected),
         links=_links(session, found),
-        doubts=doubts,
+        doubts=told,
     )
 
 
+def doubts(session: Session, measurement: Measurement, correction: Correction, index: int) -> tuple[str, ...]:
+    """What to say of a session as a whole under a model, whose views were admitted before."""
+    found = _examined(session, measurement, correction, index)
+    return _doubts(session, correction.captures[index], found, correction.model.T_mount)
+
+
+def _examined(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
+    usual, gate = UsualEffects(measurement, correction.model), correction.overlaps[index].gate
+    found = snoop(correction.captures[index], correction.model.T_mount, gate, correction.freed[index], usual)
+    return judged_by_size(session, found)
+
+
 def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """What to say of poses that contradict the scans as no arm of use does; a mistake of all of them is refused."""
+    """Steps between two views, and poses that contradict the scans as no arm of use does."""
+    names = [view.name for view in session.views]
+    steps = tuple(step.said(names, session.length_unit) for step in found.steps)
     if not doubtful(session, found):
-        return ()
-    refuse_whole(session)
+        return steps
     twists = frames.log(found.freed.poses @ frames.inverse(own.poses(T_mount)))
     middles = np.array([points.mean(axis=0) for points in own.shown])
     moved = np.linalg.norm(
         twists[:, 3:] + np.cross(twists[:, :3], frames.transform(own.poses(T_mount), middles[:, None])[:, 0]), axis=1
     )
     worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
-    names = ", ".join(f"{session.views[v].name} ({moved[v]:.3g} {session.length_unit})" for v in worst)
+    farthest = ", ".join(f"{names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
     return (
         f"No arm scatters by {contradicted_by(session, found)}: several rows or scans are wrong, and the views hold "
-        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {names}.",
+        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {farthest}.",
+        *steps,
     )
 
 
@@ -133,14 +147,6 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
 def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
     view = session.views[found.view]
     return LeftOut(view.name, stands_off(session, found), own.poses(T_mount)[found.view], _scanned(view))
-
-
-def _beyond_any_slip(session: Session, found: Snooping) -> bool:
-    """True if a block of views is displaced by more than an effect of the model may be."""
-    assert found.block is not None
-    lever = found.freed.overlaps.gram.lever if found.block.what == "part" else 1.0
-    turn, shift = (float(np.linalg.norm(x)) for x in (found.block.estimate[:3] / lever, found.block.estimate[3:]))
-    return beyond_any_arm(session, turn, shift)
 
 
 def _not_belonging(

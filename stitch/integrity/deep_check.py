@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from stitch.errors import NoResultError
 from stitch.frames import Array
@@ -18,7 +17,7 @@ from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.surface_verdict import surface_verdict
 from stitch.integrity.targets import check_targets
-from stitch.integrity.usual_effects import usual_twists
+from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
@@ -96,7 +95,7 @@ def examined(session: Session, capture: Capture, start: tuple[Array, float]) -> 
     """The hand-eye closed in on from a start (hand-eye, gate), and what snooping says under it."""
     T_mount, overlaps, _ = close_in([capture], start[0], [start[1]])
     freed = free_poses(capture, capture.poses(T_mount), overlaps[0].gate)
-    usual = partial(usual_twists, measurement_of(session, capture), Model(T_mount))
+    usual = UsualEffects(measurement_of(session, capture), Model(T_mount))
     return T_mount, judged_by_size(session, snoop(capture, T_mount, overlaps[0].gate, freed, usual))
 
 

@@ -48,7 +48,7 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
     for cycle in cycles:
         told |= set(cycle)
         out.append(Problem("exchanged", tuple(only(cycle, names)), _exchange(cycle, rows, names)))
-    step = common_step(capture, poses, [m for m in misplaced if m.view not in told]) if found.block is None else None
+    step = common_step(capture, poses, [m for m in misplaced if m.view not in told]) if not found.steps else None
     if step is not None:
         told |= set(step[0])
         out.append(_reclamped(step[0].start or step[0].stop, step[1], names))
@@ -56,8 +56,7 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
     for m in misplaced:
         if m.view not in told:
             out.append(_single(session, capture, T_mount, found, m, same))
-    if found.block is not None:
-        out.append(_reclamped(found.block.start, found.block.what, names))
+    out += [_reclamped(s.start, s.moved if s.told else "either", names) for s in found.steps]
     if len(found.disconnected) > 1:
         shown = " | ".join(", ".join(only(group, names)) for group in found.disconnected)
         views = tuple(n for group in found.disconnected[1:] for n in only(group, names))
@@ -146,5 +145,7 @@ def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> S
 
 def _reclamped(start: int, moved: str, names: Sequence[str]) -> Problem:
     views = tuple(names[start:]) if start >= len(names) / 2 else tuple(names[:start])
-    what = "the part was clamped anew" if moved == "part" else "the scanner moved on its mount"
+    what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
+        moved, "the part or the scanner moved"
+    )
     return Problem("reclamped", views, f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it")

@@ -7,16 +7,19 @@ view in its place, each one's own displacement is tested under the scatter of th
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.blunders import Block, Found, find_blunders, off_anyway
+from stitch.integrity.blunders import FAMILY_WISE, Found, find_blunders, off_anyway
 from stitch.integrity.contradiction import STILL, contradicting
 from stitch.integrity.linkage import Linkage, linkage
 from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
+from stitch.integrity.steps import Step, find_steps
 from stitch.integrity.unlinked_views import needed_closure, placed_views
+from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
@@ -44,7 +47,7 @@ class Snooping:
     linkage: Linkage  # at the poses that overlaps alone give, from the model's
     misplaced: tuple[Misplaced, ...]
     suspected: tuple[Misplaced, ...]  # stand out, but usual effects of the arm would do that too
-    block: Block | None
+    steps: tuple[Step, ...]  # from some view on the part or the scanner sits elsewhere
     disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
     model: ViewModel
     found: Found
@@ -54,12 +57,11 @@ class Snooping:
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Views that are not to be fused: misplaced, not linked, or on the smaller side of a re-clamping."""
+        """Views that are not to be fused: misplaced, not linked, or not between the same steps as most are."""
         out = {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
-        if self.block is not None:
-            before, after = range(self.block.start), range(self.block.start, self.linkage.views)
-            out |= set(before if len(before) < len(after) else after)
-        return tuple(sorted(out))
+        ends = [0, *(step.start for step in self.steps), self.linkage.views]
+        most = max((range(a, b) for a, b in pairwise(ends)), key=len)
+        return tuple(sorted(out | (set(range(self.linkage.views)) - set(most))))
 
     def settled(self, sure: Callable[[Misplaced], bool]) -> "Snooping":
         """The same with those suspected views misplaced of which one is sure."""
@@ -86,7 +88,7 @@ def snoop(
     T_mount: Array,
     gate: float,
     freed: FreePoses | None = None,
-    usual: Callable[[FreePoses], Array] | None = None,
+    usual: UsualEffects | None = None,
 ) -> Snooping:
     """Examine the views of a capture under a hand-eye.
 
@@ -94,7 +96,7 @@ def snoop(
         T_mount: (4, 4) corrected hand-eye.
         gate: distance between partners at which the correction ended, length_unit.
         freed: the views freed from there, if that is at hand.
-        usual: the twists (6V, P) that effects of the library may make; asked only where a view stands out.
+        usual: what may happen to views beside white scatter; asked only where one stands out, or all from one on.
 
     Raises:
         NoResultError: no two views overlap.
@@ -117,13 +119,17 @@ def snoop(
     off = off_anyway(model, homeless, list(placed))
     alone = [*homeless, *(b.view for b in off)]
     found = find_blunders(model, alone)
+    erring = model if usual is None else model.with_errors(usual.errors(freed))
+    steps = find_steps(erring, model.columns(alone), (found.further, len(found.blunders)), FAMILY_WISE)
+    if steps:
+        found = find_blunders(model, alone, steps)
     standing_out = [
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
         for b in sorted((*off, *found.blunders), key=lambda b: b.view)
     ]
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
-        again = find_blunders(model.with_usual(usual(freed)), alone)
+        again = find_blunders(model.with_usual(usual.twists(freed)), alone, steps)
         sure &= {b.view for b in again.blunders} | set(linked.unlinked)
     groups = linkage(freed.overlaps, {*lines, *(v for v in torn if v in homeless)}).components
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
@@ -133,7 +139,7 @@ def snoop(
         linkage=linked,
         misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),
         suspected=tuple(m for m in standing_out if m.view not in sure),
-        block=found.block,
+        steps=steps,
         disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
         found=found,

@@ -5,8 +5,11 @@ random effect (Searle, Casella and McCulloch 1992): every parameter of every eff
 the views scatter accordingly, together and not one by one.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
+from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
 from stitch.effects.specs import EVERY_VIEW
@@ -14,27 +17,81 @@ from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import term_of
+from stitch.observations.flange_errors import WANDERING, near_in_time, usual_twist
+from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.view_responses import view_responses
+from stitch.statistics.kernels import spread_over
 
 # Standard deviation of a parameter, in usual sizes: effects of up to four times the usual size are not rare then.
 _TIMES_USUAL = 2.0
+# Correspondences that tell what an effect does to the views where its size is free.
+_ENOUGH = 20_000
 
 
-def usual_twists(measurement: Measurement, model: Model, freed: FreePoses) -> Array:
-    """Left twists of the views about the centre of the correspondences, one column a parameter, at its deviation.
+@dataclass(frozen=True)
+class UsualEffects:
+    """What may happen to the views of a good session."""
 
-    Returns:
-        (6V, P) twists, reference frame, rad and length_unit.
-    """
-    effects = [e for e in EFFECTS.values() if e.tier == "physical" and not _event(e) and not lacking(measurement, e)]
-    terms = [term_of(measurement, effect) for effect in effects]
-    found = view_responses(measurement, model, terms, freed)
-    columns = [
-        response.columns[:, ~term.gridded] * term.typical[~term.gridded]
-        for term, response in zip(terms, found, strict=True)
+    measurement: Measurement
+    model: Model
+
+    def twists(self, freed: FreePoses) -> Array:
+        """Left twists of the views about the centre of the correspondences, one column a parameter, at its deviation.
+
+        Returns:
+            (6V, P) twists, reference frame, rad and length_unit.
+        """
+        return _TIMES_USUAL * np.hstack(list(self._by_place(freed).values()))
+
+    def errors(self, freed: FreePoses) -> PoseErrors:
+        """The same in sizes that the views show, one for every place of the chain, beside all that arms do.
+
+        Mount and part also wander as slowly as a session is long: they warm up, creep or settle by no law.
+        """
+        own, centre = self.measurement.capture, freed.overlaps.gram.centre
+        errors = pose_errors([self.measurement], self.model, [centre])
+        alike = near_in_time([self.measurement], max(WANDERING.values()))
+        unit = usual_twist(self.measurement.length_unit)
+        of_mount = frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(self.model.T_mount))
+        of_part = np.tile(np.eye(6), (len(freed.poses), 1, 1))
+        for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
+            errors = errors.beside(name, spread_over((moved * unit).reshape(-1, 6), alike), 1.0)
+        for place, columns in self._by_place(_fewer(freed)).items():
+            errors = errors.beside(place, columns @ columns.T, 1.0)
+        return errors
+
+    def _by_place(self, freed: FreePoses) -> dict[str, Array]:
+        """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size."""
+        physical = [e for e in EFFECTS.values() if e.tier == "physical" and not _event(e)]
+        terms = [term_of(self.measurement, e) for e in physical if not lacking(self.measurement, e)]
+        columns = [
+            response.columns[:, ~term.gridded] * term.typical[~term.gridded]
+            for term, response in zip(terms, view_responses(self.measurement, self.model, terms, freed), strict=True)
+        ]
+        places = dict.fromkeys(term.effect.place for term in terms)
+        return {
+            place: np.hstack([c for term, c in zip(terms, columns, strict=True) if term.effect.place == place])
+            for place in places
+        }
+
+
+def _fewer(freed: FreePoses) -> FreePoses:
+    """The same with fewer correspondences, each of more weight: what an effect roughly does to poses needs no more."""
+    every = -(-sum(len(m.residual) for m in freed.overlaps.matches) // _ENOUGH) or 1
+    thinned = [
+        replace(
+            m,
+            middle=m.middle[::every],
+            normal=m.normal[::every],
+            residual=m.residual[::every],
+            weight=every * m.weight[::every],
+            index_v=m.index_v[::every],
+            index_w=m.index_w[::every],
+        )
+        for m in freed.overlaps.matches
     ]
-    return _TIMES_USUAL * np.hstack([np.zeros((6 * len(freed.poses), 0)), *columns])
+    return replace(freed, overlaps=replace(freed.overlaps, matches=thinned))
 
 
 def _event(effect: Effect) -> bool:

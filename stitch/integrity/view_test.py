@@ -15,6 +15,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
+from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
 from stitch.statistics.least_squares import column_space, summed_squares
 from stitch.statistics.restricted_likelihood import MixedModel
@@ -39,12 +40,18 @@ class ViewModel:
     centre: Array  # (3,) reference frame
     lever: float  # length_unit: rotations about `centre` count as displacements at this distance
     usual: Array | None = None  # (n, n) covariance of what effects of the library may do
+    errors: PoseErrors | None = None  # of the n numbers, beside white scatter, in sizes that the views show
 
     def with_usual(self, twists: Array) -> "ViewModel":
         """The model of an arm that may have effects: twists (6V, P) of the views about the centre, rad and length."""
         unit = np.array([self.lever] * 3 + [1.0] * 3)
         columns = np.einsum("vni,vip->np", self.views, twists.reshape(self.count, 6, -1) * unit[:, None])
         return replace(self, usual=columns @ columns.T)
+
+    def with_errors(self, errors: PoseErrors) -> "ViewModel":
+        """The model of poses that may err beside white scatter by twists about the centre, in rad and length."""
+        unit = np.array([self.lever] * 3 + [1.0] * 3)
+        return replace(self, errors=errors.reduced((self.views * unit).transpose(1, 0, 2).reshape(len(self.z), -1)))
 
     @property
     def count(self) -> int:
@@ -55,7 +62,11 @@ class ViewModel:
         """The model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
         mean = self.hand_eye if further is None else np.column_stack([self.hand_eye, further])
         usual = None if self.usual is None else self.usual[None]
-        return MixedModel(self.z[None], column_space(mean, _SEEN)[None], self._components, usual)
+        A, components = column_space(mean, _SEEN)[None], self._components
+        if self.errors is None:
+            return MixedModel(self.z[None], A, components, usual)
+        every = np.concatenate([components, self.errors.components[:, None]])
+        return MixedModel(self.z[None], A, every, usual, scales=self.errors.scales)
 
     @cached_property
     def _components(self) -> Array:
@@ -65,7 +76,13 @@ class ViewModel:
 
     def fit(self, further: Array | None = None) -> VarianceFit:
         """Scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""
-        return fit_variances(self.mixed(further))
+        return fit_variances(self.mixed(further), both_starts=self.errors is not None)
+
+    def deviance(self, further: Array | None = None) -> float:
+        """−2 log of the full likelihood of z with further columns in the mean, comparable between means."""
+        fit = self.fit(further)
+        C = self.mixed(further).covariance(fit.variances)[0]
+        return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).pushed)
 
     def columns(self, freed: Sequence[int]) -> Array | None:
         """(n, 6k) that let some views stand anywhere."""

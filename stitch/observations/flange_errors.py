@@ -18,13 +18,18 @@ _PER_MM = {"mm": 1.0, "m": 1e-3}
 WANDERING = {"quickly wandering": 2.0, "slowly wandering": 20.0}
 
 
+def usual_twist(length_unit: str) -> Array:
+    """(6,) how much a flange usually turns (rad) and moves."""
+    return np.repeat([_ROTATION, _TRANSLATION * _PER_MM[length_unit]], 3)
+
+
 def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
     """(6V, 6) twists of all views of a rig by a flange that turns and moves by its usual sizes, in its own frame.
 
     Args:
         centres: per session the point (3,) about which twists count, reference frame.
     """
-    unit = np.repeat([_ROTATION, _TRANSLATION * _PER_MM[measurements[0].length_unit]], 3)
+    unit = usual_twist(measurements[0].length_unit)
     own = [
         frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
         for m, centre in zip(measurements, centres, strict=True)

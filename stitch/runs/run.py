@@ -101,6 +101,7 @@ class Run:
     effects_file: str | None = None
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
     targets: TargetFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
     left_out: tuple[LeftOut, ...] = ()  # views of the session that are not fused; all other fields are without them

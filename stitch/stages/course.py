@@ -79,10 +79,10 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         effects_file=end.effects_file,
         convergence=finished.convergence,
         notes=(
-            *end.doubts,
             *view_notes(end.left_out, end.kept, end.suspected),
             *course.notes(session, fitted, index, end.begun),
         ),
+        doubts=end.doubts,
         left_out=end.left_out,
         links=end.links,
         targets=own.targets,

@@ -76,6 +76,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "disagreement": _disagreement(run),
         "plain": run_verdict(run, model_history(run)),
         "verdict": run.verdict,
+        "doubts": list(run.doubts),
         "notes": list(run.notes),
         "versions": _versions(),
     }

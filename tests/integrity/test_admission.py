@@ -102,7 +102,7 @@ def test_many_wrong_rows_that_no_test_tells_apart_are_refused_or_said(good):
         assert "contradict" in str(error) or "do not belong" in str(error)
     else:
         wrong = {view.name for view in views[1::2]}
-        assert wrong <= {item.view for item in found.left_out} or found.notes[0].startswith("No arm scatters by")
+        assert wrong <= {item.view for item in found.left_out} or found.doubts[0].startswith("No arm scatters by")
 
 
 def test_poses_that_contradict_all_scans_are_refused(good):

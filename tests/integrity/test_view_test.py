@@ -109,14 +109,3 @@ def test_few_views_without_blunders_are_left_alone():
         model = direct(1000 + seed, views=6)
         alarms += bool(find_blunders(replace(model, z=model.z * (quiet if seed % 2 else 1))).blunders)
     assert alarms <= stats.binom.isf(1e-3, 200, 0.01)
-
-
-@pytest.mark.parametrize("start", [4, *(pytest.param(k, marks=pytest.mark.slow) for k in (10, 17))])
-def test_a_common_step_is_one_block_and_a_drift_is_none(start):
-    model = direct(5)
-    step = np.zeros((VIEWS, 6))
-    step[start:] = 30 * SIGMA * np.array([0.5, -1, 0.3, 1, 0.2, -0.7])
-    found = find_blunders(replace(model, z=model.z + step.ravel()))
-    assert found.block is not None and found.block.start == start and not found.blunders
-    drift = np.linspace(0, 1, VIEWS)[:, None] * step[-1]
-    assert find_blunders(replace(model, z=model.z + drift.ravel())).block is None

@@ -1,0 +1,117 @@
+"""From which view on the part or the scanner sits elsewhere: clamped anew, knocked, its mount re-seated.
+
+Under one hand-eye for all views every change point in the order of time is tested, for the part and for the scanner,
+as a displacement that all views from there on share: Baarda's test as for single views, an F since the scatter comes
+from the same data, times the number of change points tried (Bonferroni). What drifts, warms up, remembers or follows
+the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that these views show.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.integrity.view_test import ViewModel, beside, projector, test
+from stitch.units import angle_text, length_text
+
+What = Literal["part", "scanner"]
+
+# Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
+_SIDE, _MOST = 2, 3
+# Fewer views than this show no step beside their scatter.
+_FEWEST = 6
+_BOTH: tuple[What, What] = ("part", "scanner")
+# −2 log likelihood of part against scanner at odds of 20 to 1; closer ones these views do not tell apart.
+_TOLD = 2 * np.log(20)
+
+
+@dataclass(frozen=True)
+class Step:
+    """From view `start` on all views share one displacement."""
+
+    start: int
+    moved: What
+    told: bool  # the other one of the two is clearly less likely
+    rotation: float  # rad
+    distance: float  # length_unit, of the middle of the part as it is seen
+    p_value: float  # all change points counted
+
+    def said(self, names: Sequence[str], length_unit: str) -> str:
+        """What happened and what to do, in words."""
+        before, after = names[self.start - 1], names[self.start]
+        off = f"{length_text(self.distance, length_unit)} and {angle_text(self.rotation, 2)}"
+        other = "scanner" if self.moved == "part" else "part"
+        unsure = "" if self.told else f" (or the {other}: these views do not tell which)"
+        further = " or add part_slip" if self.moved == "part" and self.told else ""
+        return (
+            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {off} off at the part: no hand-eye holds "
+            f"before and after. Make two sessions of it, up to {before} and from {after} on{further}."
+        )
+
+    def columns(self, model: ViewModel) -> Array:
+        """(n, 6) of the displacement."""
+        return step_columns(model, self.start, self.moved)
+
+
+def find_steps(
+    model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
+) -> tuple[Step, ...]:
+    """Change points in the order of time.
+
+    Args:
+        model: with all that may happen without a step.
+        first: (n, K) columns of views that are known to be off.
+        singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
+        chance: that a session without a step shows one.
+    """
+    found, columns = list[Step](), first
+    while len(found) < _MOST:
+        step = _next_step(model, columns, chance)
+        if not found and singles[1] and (step is None or _less_likely(model, step, first, singles)):
+            columns = singles[0]
+            step = _next_step(model, columns, chance)
+        if step is None:
+            break
+        found.append(step)
+        columns = beside(columns, step.columns(model))
+    return tuple(sorted(found, key=lambda s: s.start))
+
+
+def step_columns(model: ViewModel, start: int, moved: str) -> Array:
+    """(n, 6) of a displacement that views from `start` on have in common."""
+    return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
+
+
+def _next_step(model: ViewModel, columns: Array | None, chance: float) -> Step | None:
+    """The step that stands out beside some columns; None if none does."""
+    if model.count < _FEWEST:
+        return None
+    under, starts = projector(model, model.fit(columns), columns), range(_SIDE, model.count - _SIDE + 1)
+    best, p = dict[What, int](), 1.0
+    for moved in _BOTH:
+        tests = {k: test(under, step_columns(model, k, moved)) for k in starts}
+        best[moved] = max(starts, key=lambda k: tests[k].statistic)
+        p = min(p, *(found.p_value * len(_BOTH) * len(starts) for found in tests.values()))
+    return _step(model, columns, best, p) if p < chance else None
+
+
+def _step(model: ViewModel, columns: Array | None, best: dict[What, int], p: float) -> Step:
+    """The likelier one of the best step of the part and of the scanner, with its size."""
+    own = {moved: beside(columns, step_columns(model, best[moved], moved)) for moved in _BOTH}
+    deviance = {moved: model.deviance(own[moved]) for moved in _BOTH}
+    likelier = min(_BOTH, key=lambda moved: deviance[moved])
+    told = abs(deviance["part"] - deviance["scanner"]) > _TOLD
+    start = best[likelier]
+    under = projector(model, model.fit(own[likelier]), columns)
+    estimate = test(under, step_columns(model, start, likelier)).estimate
+    moved = (model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]) @ estimate
+    turn, shift = (float(np.median(np.linalg.norm(half, axis=1))) for half in (moved[:, :3], moved[:, 3:]))
+    return Step(start, likelier, told, turn / model.lever, shift, p)
+
+
+def _less_likely(model: ViewModel, step: Step, first: Array | None, singles: tuple[Array | None, int]) -> bool:
+    """True if single blunders explain more: by Akaike's rule each number that they take must earn two."""
+    columns, count = singles
+    return model.deviance(columns) + 12 * (count - 1) < model.deviance(beside(first, step.columns(model)))

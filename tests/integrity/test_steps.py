@@ -1,0 +1,113 @@
+"""Change points in the order of time, against a generator of chance whose every size is known, and in whole runs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch import frames
+from stitch.comparison.model_history import model_history
+from stitch.comparison.run_verdict import run_verdict
+from stitch.integrity.blunders import find_blunders
+from stitch.integrity.steps import find_steps
+from stitch.integrity.view_test import ViewModel
+from stitch.measurement.cloud import Cloud
+from stitch.observations.pose_errors import PoseErrors
+from stitch.pipeline import run
+
+VIEWS, SIGMA, MEMORY = 18, 0.02, 20.0
+STEP = SIGMA * np.array([0.5, -1, 0.3, 1, 0.2, -0.7])
+
+
+def direct(seed, wanders=0.0):
+    """Every pose is observed directly, about one common one; beside white scatter it may wander."""
+    rng = np.random.default_rng(seed)
+    blocks = np.eye(6 * VIEWS).reshape(6 * VIEWS, VIEWS, 6).transpose(1, 0, 2)
+    eye, time = np.tile(np.eye(6), (VIEWS, 1, 1)), np.arange(VIEWS)
+    alike = np.kron(np.exp(-np.abs(time[:, None] - time) / MEMORY), np.eye(6))
+    z = SIGMA * rng.standard_normal(6 * VIEWS) + wanders * np.linalg.cholesky(alike) @ rng.standard_normal(6 * VIEWS)
+    errors = PoseErrors(("wandering",), SIGMA**2 * alike[None], np.ones(1))
+    noise = 1e-8 * np.eye(6 * VIEWS)
+    return ViewModel(z, blocks.sum(axis=0), blocks, eye, blocks, eye, noise, np.zeros(3), 1.0, errors=errors)
+
+
+def steps(model):
+    return find_steps(model, None, (None, 0), 0.01)
+
+
+def stepped(model, *starts, times=30.0):
+    moved = sum(times * (-1) ** i * np.outer(np.arange(VIEWS) >= k, STEP) for i, k in enumerate(starts))
+    return replace(model, z=model.z + moved.ravel())
+
+
+@pytest.mark.parametrize("start", [2, 9, 16])
+def test_a_common_displacement_is_found_where_it_begins_with_its_size(start):
+    (found,) = steps(stepped(direct(5), start))
+    assert found.start == start and found.p_value < 1e-6
+    assert found.distance == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
+    assert found.rotation == pytest.approx(30 * np.linalg.norm(STEP[:3]), rel=0.1)
+
+
+def test_part_and_scanner_that_look_alike_are_not_told_apart():
+    (found,) = steps(stepped(direct(5), 9))
+    assert not found.told and "these views do not tell which" in found.said([f"v{k}" for k in range(VIEWS)], "mm")
+
+
+def test_what_is_moved_there_and_back_is_two_steps():
+    assert [s.start for s in steps(stepped(direct(6), 6, 12))] == [6, 12]
+
+
+def test_what_drifts_is_no_step():
+    model = direct(7)
+    drift = np.linspace(0, 30, VIEWS)[:, None] * STEP
+    assert steps(replace(model, z=model.z + drift.ravel())) == ()
+
+
+def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
+    model = stepped(direct(8), VIEWS - 1, times=100.0)
+    singles = find_blunders(replace(model, errors=None))
+    assert [b.view for b in singles.blunders] == [VIEWS - 1]
+    assert find_steps(model, None, (singles.further, 1), 0.01) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wanders", [0.0, 3 * SIGMA])
+def test_sessions_without_a_step_raise_no_more_alarms_than_stated(wanders):
+    """1 % is stated, and change points are counted as if they were independent: what 999 of 1,000 repetitions stay at."""
+    alarms = sum(bool(steps(direct(100 + seed, wanders))) for seed in range(60))
+    assert alarms <= stats.binom.isf(1e-3, 60, 0.01)
+
+
+@pytest.fixture(scope="module")
+def good():
+    return session_of(measured_blade(21, views=12, pixels=80))
+
+
+def knocked(session, start, xi):
+    """From view `start` on the scanner sits at M·exp(ξ): it reports exp(−ξ)·x."""
+    back = frames.exp(-np.asarray(xi, float))
+    views = [
+        replace(v, cloud=Cloud(frames.transform(back, v.cloud.points))) if k >= start else v
+        for k, v in enumerate(session.views)
+    ]
+    return replace(session, views=tuple(views))
+
+
+def test_a_knock_of_the_scanner_is_said_in_the_first_line(good):
+    """4.5 mm half way: every view fits its neighbours once it is moved, and one hand-eye holds for neither half."""
+    found = run(knocked(good, 6, [0, 0, 0, 2.7, 0, 3.6]))
+    said = run_verdict(found, model_history(found))
+    assert found.left_out == () and len(found.doubts) == 1
+    assert said.startswith("From view v006 on the scanner sits elsewhere, 4.")
+    assert "up to v005 and from v006 on" in said
+
+
+def test_a_part_clamped_anew_within_what_a_model_holds_is_said_as_well(good):
+    T = np.array([v.T_base_flange for v in good.views])
+    T[6:] = T[6:] @ frames.exp(np.array([1e-3, 0, 0, 0, 3.0, 0]))
+    views = [replace(v, T_base_flange=own, joints=None) for v, own in zip(good.views, T, strict=True)]
+    (said,) = run(replace(good, views=tuple(views))).doubts
+    assert said.startswith("From view v006 on the part sits elsewhere") and "add part_slip" in said
