@@ -51,22 +51,28 @@ def find_blunders(model: ViewModel, alone: Sequence[int] = (), steps: Sequence[S
         alone: views that are known to be off: they stay free and are not counted.
         steps: what all views from one on have in common.
     """
-    first = model.columns(list(alone))
-    for step in steps:
-        first = beside(first, step.columns(model))
-    return _rosner(model, first, alone)
+    return _rosner(model, _columns(model, alone, steps), alone)
 
 
-def off_anyway(model: ViewModel, alone: Sequence[int], unlinked: Sequence[int]) -> list[Blunder]:
+def off_anyway(
+    model: ViewModel, alone: Sequence[int], unlinked: Sequence[int], steps: Sequence[Step] = ()
+) -> list[Blunder]:
     """Of views that no surface links where they should stand, those that the scatter of all others does not explain."""
     out = []
     for v in unlinked:
-        beside = model.columns([*alone, *(w for w in unlinked if w != v)])
-        tested, p = left_alone(model, beside, v)
+        tested, p = left_alone(model, _columns(model, [*alone, *(w for w in unlinked if w != v)], steps), v)
         p = min(1.0, model.count * p)
         if p < FAMILY_WISE:
             out.append(Blunder(v, tested, p))
     return out
+
+
+def _columns(model: ViewModel, alone: Sequence[int], steps: Sequence[Step]) -> Array | None:
+    """(n, K) of views that stay free, and of steps."""
+    columns = model.columns(alone)
+    for step in steps:
+        columns = beside(columns, step.columns(model))
+    return columns
 
 
 def _rosner(model: ViewModel, first: Array | None, alone: Sequence[int]) -> Found:

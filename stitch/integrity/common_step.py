@@ -6,6 +6,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.moved_together import ends
 from stitch.integrity.snooping import Misplaced
 from stitch.measurement.capture import Capture
 
@@ -20,18 +21,12 @@ def common_step(capture: Capture, poses: Array, misplaced: Sequence[Misplaced]) 
         poses: (V, 4, 4) T_reference_scanner of the model.
     """
     placed = {m.view: m.T for m in misplaced if m.T is not None}
-    for views in _ends({m.view for m in misplaced}, len(poses)):
+    runs = ends({m.view for m in misplaced}, len(poses))
+    for views in (run for run in runs if len(run) >= _FEWEST):
         for what in ("part", "scanner"):
             if _alike(capture, poses, {v: placed[v] for v in views if v in placed}, what) >= _SHARE * len(views):
                 return views, what
     return None
-
-
-def _ends(misplaced: set[int], count: int) -> list[range]:
-    """The unbroken runs of misplaced views at the end and at the beginning of the list, if they are long enough."""
-    good = [v for v in range(count) if v not in misplaced]
-    runs = [range(good[-1] + 1, count), range(good[0])] if good else []
-    return [run for run in runs if len(run) >= _FEWEST]
 
 
 def _alike(capture: Capture, poses: Array, placed: Mapping[int, Array], what: str) -> int:

@@ -16,6 +16,7 @@ from stitch.frames import Array
 from stitch.integrity.blunders import FAMILY_WISE, Found, find_blunders, off_anyway
 from stitch.integrity.contradiction import STILL, contradicting
 from stitch.integrity.linkage import Linkage, linkage
+from stitch.integrity.moved_together import moved_together
 from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
 from stitch.integrity.steps import Step, find_steps
 from stitch.integrity.unlinked_views import needed_closure, placed_views
@@ -109,6 +110,13 @@ def snoop(
     linked = linkage(freed.overlaps, {*lines, *torn})
     needed = needed_closure(capture, freed.poses, linked, tolerance)
     placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
+    together = None
+    if homeless and placed:
+        apart = linked.unlinked
+        together = moved_together(capture, model_poses, freed, placed, unlinked=apart, tolerance=tolerance)
+    if together is not None:
+        freed, placed, homeless, torn = together, {}, [], ()
+        linked = linkage(freed.overlaps, lines)
     if placed:
         poses = np.array(freed.poses)
         for v, placement in placed.items():
@@ -120,8 +128,12 @@ def snoop(
     alone = [*homeless, *(b.view for b in off)]
     found = find_blunders(model, alone)
     erring = model if usual is None else model.with_errors(usual.errors(freed))
-    steps = find_steps(erring, model.columns(alone), (found.further, len(found.blunders)), FAMILY_WISE)
+    singles = (found.further, len(off) + len(found.blunders))
+    steps = find_steps(erring, model.columns(homeless), singles, FAMILY_WISE)
     if steps:
+        # A view at the step may stand for one of its sides.
+        off = off_anyway(model, homeless, list(placed), steps)
+        alone = [*homeless, *(b.view for b in off)]
         found = find_blunders(model, alone, steps)
     standing_out = [
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)

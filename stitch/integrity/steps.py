@@ -102,7 +102,7 @@ def _step(model: ViewModel, columns: Array | None, best: dict[What, int], p: flo
     own = {moved: beside(columns, step_columns(model, best[moved], moved)) for moved in _BOTH}
     deviance = {moved: model.deviance(own[moved]) for moved in _BOTH}
     likelier = min(_BOTH, key=lambda moved: deviance[moved])
-    told = abs(deviance["part"] - deviance["scanner"]) > _TOLD
+    told = bool(abs(deviance["part"] - deviance["scanner"]) > _TOLD)
     start = best[likelier]
     under = projector(model, model.fit(own[likelier]), columns)
     estimate = test(under, step_columns(model, start, likelier)).estimate

@@ -103,11 +103,3 @@ def test_a_knock_of_the_scanner_is_said_in_the_first_line(good):
     assert found.left_out == () and len(found.doubts) == 1
     assert said.startswith("From view v006 on the scanner sits elsewhere, 4.")
     assert "up to v005 and from v006 on" in said
-
-
-def test_a_part_clamped_anew_within_what_a_model_holds_is_said_as_well(good):
-    T = np.array([v.T_base_flange for v in good.views])
-    T[6:] = T[6:] @ frames.exp(np.array([1e-3, 0, 0, 0, 3.0, 0]))
-    views = [replace(v, T_base_flange=own, joints=None) for v, own in zip(good.views, T, strict=True)]
-    (said,) = run(replace(good, views=tuple(views))).doubts
-    assert said.startswith("From view v006 on the part sits elsewhere") and "add part_slip" in said
