@@ -2,7 +2,7 @@
 
 Under one hand-eye for all views every change point in the order of time is tested, for the part and for the scanner,
 as a displacement that all views from there on share: Baarda's test as for single views, an F since the scatter comes
-from the same data, times the number of change points tried (Bonferroni). What drifts, warms up, remembers or follows
+from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows
 the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that these views show.
 """
 
@@ -66,16 +66,10 @@ def find_steps(
         singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
         chance: that a session without a step shows one.
     """
-    found, columns = list[Step](), first
-    while len(found) < _MOST:
-        step = _next_step(model, columns, chance)
-        if not found and singles[1] and (step is None or _less_likely(model, step, first, singles)):
-            columns = singles[0]
-            step = _next_step(model, columns, chance)
-        if step is None:
-            break
-        found.append(step)
-        columns = beside(columns, step.columns(model))
+    found = _searched(model, first, chance)
+    if singles[1] and (not found or _less_likely(model, found, first, singles)):
+        first = singles[0]
+        found = _searched(model, first, chance)
     return tuple(sorted(found, key=lambda s: s.start))
 
 
@@ -84,17 +78,37 @@ def step_columns(model: ViewModel, start: int, moved: str) -> Array:
     return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
 
 
-def _next_step(model: ViewModel, columns: Array | None, chance: float) -> Step | None:
-    """The step that stands out beside some columns; None if none does."""
+def _searched(model: ViewModel, first: Array | None, chance: float) -> list[Step]:
+    """Steps on top of columns that are in the mean already.
+
+    As with single views (Rosner 1983) the search goes on beside a step that does not stand out yet: what is moved there
+    and back are two, and each hides in the scatter that the other makes.
+    """
     if model.count < _FEWEST:
-        return None
-    under, starts = projector(model, model.fit(columns), columns), range(_SIDE, model.count - _SIDE + 1)
-    best, p = dict[What, int](), 1.0
-    for moved in _BOTH:
-        tests = {k: test(under, step_columns(model, k, moved)) for k in starts}
-        best[moved] = max(starts, key=lambda k: tests[k].statistic)
-        p = min(p, *(found.p_value * len(_BOTH) * len(starts) for found in tests.values()))
-    return _step(model, columns, best, p) if p < chance else None
+        return []
+    picked, significant, columns = list[tuple[dict[What, int], What, float]](), 0, first
+    while len(picked) < _MOST:
+        best, moved, p = _next_step(model, columns, [own[other] for own, other, _ in picked])
+        picked.append((best, moved, p))
+        significant = len(picked) if p < chance else significant
+        columns = beside(columns, step_columns(model, best[moved], moved))
+    out = []
+    for best, _, p in picked[:significant]:
+        others = first
+        for own, other, _ in picked[:significant]:
+            others = others if own is best else beside(others, step_columns(model, own[other], other))
+        out.append(_step(model, others, best, min(p, picked[significant - 1][2])))
+    return out
+
+
+def _next_step(model: ViewModel, columns: Array | None, taken: Sequence[int]) -> tuple[dict[What, int], What, float]:
+    """Where the likeliest step of each begins beside some columns, which of the two is likelier, and its chance."""
+    under = projector(model, model.fit(columns), columns)
+    starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in taken]
+    tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in _BOTH for k in starts}
+    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in _BOTH}
+    likelier = max(_BOTH, key=lambda moved: tests[moved, best[moved]].statistic)
+    return best, likelier, min(found.p_value for found in tests.values()) * len(tests) * _MOST
 
 
 def _step(model: ViewModel, columns: Array | None, best: dict[What, int], p: float) -> Step:
@@ -111,7 +125,11 @@ def _step(model: ViewModel, columns: Array | None, best: dict[What, int], p: flo
     return Step(start, likelier, told, turn / model.lever, shift, p)
 
 
-def _less_likely(model: ViewModel, step: Step, first: Array | None, singles: tuple[Array | None, int]) -> bool:
+def _less_likely(
+    model: ViewModel, found: Sequence[Step], first: Array | None, singles: tuple[Array | None, int]
+) -> bool:
     """True if single blunders explain more: by Akaike's rule each number that they take must earn two."""
     columns, count = singles
-    return model.deviance(columns) + 12 * (count - 1) < model.deviance(beside(first, step.columns(model)))
+    for step in found:
+        first = beside(first, step.columns(model))
+    return model.deviance(columns) + 12 * (count - len(found)) < model.deviance(first)
