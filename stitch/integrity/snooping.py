@@ -13,12 +13,12 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.blunders import FAMILY_WISE, Found, find_blunders, off_anyway
+from stitch.integrity.blunders import Found, find_blunders, off_anyway
 from stitch.integrity.contradiction import STILL, contradicting
 from stitch.integrity.linkage import Linkage, linkage
 from stitch.integrity.moved_together import moved_together
 from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
-from stitch.integrity.steps import Step, find_steps
+from stitch.integrity.steps import CHANCE, Step, find_steps
 from stitch.integrity.unlinked_views import needed_closure, placed_views
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
@@ -129,7 +129,7 @@ def snoop(
     found = find_blunders(model, alone)
     erring = model if usual is None else model.with_errors(usual.errors(freed))
     singles = (found.further, len(off) + len(found.blunders))
-    steps = find_steps(erring, model.columns(homeless), singles, FAMILY_WISE)
+    steps = find_steps(erring, model.columns(homeless), singles, CHANCE)
     if steps:
         # A view at the step may stand for one of its sides.
         off = off_anyway(model, homeless, list(placed), steps)
