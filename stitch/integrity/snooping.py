@@ -14,19 +14,14 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.blunders import Found, find_blunders, off_anyway
-from stitch.integrity.contradiction import STILL, contradicting
-from stitch.integrity.linkage import Linkage, linkage
-from stitch.integrity.moved_together import moved_together
-from stitch.integrity.placing import judge, lies_in_a_line, place, surface_of
+from stitch.integrity.homes import find_homes
+from stitch.integrity.linkage import Linkage
+from stitch.integrity.placing import judge, place, surface_of
 from stitch.integrity.steps import CHANCE, Step, find_steps
-from stitch.integrity.unlinked_views import needed_closure, placed_views
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
-
-# On the surface of the others: four robust sigmas of the overlaps.
-_TOLERANCE_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
@@ -104,51 +99,33 @@ def snoop(
     """
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
-    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
-    tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
-    torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]))
-    linked = linkage(freed.overlaps, {*lines, *torn})
-    needed = needed_closure(capture, freed.poses, linked, tolerance)
-    placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
-    together = None
-    if homeless and placed:
-        apart = linked.unlinked
-        together = moved_together(capture, model_poses, freed, placed, unlinked=apart, tolerance=tolerance)
-    if together is not None:
-        freed, placed, homeless, torn = together, {}, [], ()
-        linked = linkage(freed.overlaps, lines)
-    if placed:
-        poses = np.array(freed.poses)
-        for v, placement in placed.items():
-            poses[v] = placement.T
-        freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
-        torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]), STILL) if torn else ()
+    homes = find_homes(capture, model_poses, freed)
+    freed, homeless, placed = homes.freed, homes.homeless, list(homes.placed)
     model = view_model(capture, T_mount, freed)
-    off = off_anyway(model, homeless, list(placed))
-    alone = [*homeless, *(b.view for b in off)]
-    found = find_blunders(model, alone)
+    off = off_anyway(model, homeless, placed)
+    found = find_blunders(model, [*homeless, *(b.view for b in off)])
     erring = model if usual is None else model.with_errors(usual.errors(freed))
     singles = (found.further, len(off) + len(found.blunders))
     steps = find_steps(erring, model.columns(homeless), singles, CHANCE)
     if steps:
         # A view at the step may stand for one of its sides.
-        off = off_anyway(model, homeless, list(placed), steps)
-        alone = [*homeless, *(b.view for b in off)]
-        found = find_blunders(model, alone, steps)
+        off = off_anyway(model, homeless, placed, steps)
+        found = find_blunders(model, [*homeless, *(b.view for b in off)], steps)
     standing_out = [
-        _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, tolerance), b.view, b.p_value)
+        _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, homes.tolerance), b.view, b.p_value)
         for b in sorted((*off, *found.blunders), key=lambda b: b.view)
     ]
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
+        alone = [*homeless, *(b.view for b in off)]
         again = find_blunders(model.with_usual(usual.twists(freed)), alone, steps)
-        sure &= {b.view for b in again.blunders} | set(linked.unlinked)
-    groups = linkage(freed.overlaps, {*lines, *(v for v in torn if v in homeless)}).components
+        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked)
+    groups = homes.groups
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
     misplaced = [m for m in standing_out if m.view in sure] + foreign
-    misplaced = [replace(m, kind="torn") if m.view in torn and m.view in placed else m for m in misplaced]
+    misplaced = [replace(m, kind="torn") if m.view in homes.torn and m.view in placed else m for m in misplaced]
     return Snooping(
-        linkage=linked,
+        linkage=homes.linkage,
         misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),
         suspected=tuple(m for m in standing_out if m.view not in sure),
         steps=steps,
@@ -156,8 +133,8 @@ def snoop(
         model=model,
         found=found,
         freed=freed,
-        tolerance=tolerance,
-        needed=needed,
+        tolerance=homes.tolerance,
+        needed=homes.needed,
     )
 
 
