@@ -21,6 +21,7 @@ def test_numbers_end_where_their_sigma_begins():
         (1e-3, 0.03, "rad", "0 ± 30 mrad"),
         (0.231, 0.02, "mm", "0.23 ± 0.02 mm"),
         (1.2e-5, 3e-6, "1", "1.2e-05 ± 3e-06"),
+        (1.15e-5, 3e-7, "1/°C", "11.5 ± 0.3 ppm/°C"),
         (600.0, None, "s", "600 s"),
         (12.0, float("nan"), "view", "12 view"),
     ],
