@@ -19,7 +19,7 @@ from stitch.integrity.arm_limits import (
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
-from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, unexplained
+from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.targets import check_targets
@@ -65,13 +65,15 @@ def admission(session: Session, measurement: Measurement, correction: Correction
 
     Raises:
         InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
-        NoResultError: they do, and none does; or groups of views share no surface.
+        NoResultError: they do, and none does; or two views alone do; or groups of views share no surface.
     """
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
         require_own_model(session, correction, index)
     found = _examined(session, measurement, correction, index)
     if contradicts(session, found):
+        if not correction.given:
+            require_two_motions(session)
         refuse(session, deep_check(session))
         raise unexplained(session, found)
     size = length_problem(found.model, own.T_reference_mount, found.found.further)

@@ -1,6 +1,7 @@
 """The fit of a rig with the views that belong: fit, examine, leave out what does not belong, and again."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from stitch.errors import NoResultError
@@ -42,8 +43,9 @@ def admitted_fit(
     own, measured = list(sessions), list(measurements)
     taken = [Admission() for _ in own]
     for _ in range(_ROUNDS):
-        fitted = fit(own, measured)
-        found = [_examined(session, fitted, i) for i, session in enumerate(own)]
+        with _said_of(taken):
+            fitted = fit(own, measured)
+            found = [_examined(session, fitted, i) for i, session in enumerate(own)]
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
         if keep or not any(a.left_out for a in found):
             break
@@ -58,6 +60,17 @@ def admitted_fit(
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)
     return Admitted(own, measured, fitted, taken)
+
+
+@contextmanager
+def _said_of(taken: Sequence[Admission]) -> Iterator[None]:
+    """Where the views that are left lead nowhere, say which were left out before, and why."""
+    try:
+        yield
+    except NoResultError as error:
+        if not (gone := "; ".join(a.line() for a in taken if a.left_out)):
+            raise
+        raise NoResultError(f"{error}; left out before: {gone}") from error
 
 
 def _examined(session: Session, fitted: Fitted, index: int) -> Admission:

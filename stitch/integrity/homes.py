@@ -25,7 +25,7 @@ class Homes:
     linkage: Linkage  # at the poses that overlaps alone give, from the model's
     placed: dict[int, Placement]  # views that nothing linked, and where they belong
     homeless: list[int]  # views that belong nowhere
-    torn: tuple[int, ...]  # views that contradict the others
+    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
     lines: list[int]  # views whose points lie in a line
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
@@ -60,5 +60,6 @@ def find_homes(capture: Capture, model_poses: Array, freed: FreePoses) -> Homes:
         for v, placement in placed.items():
             poses[v] = placement.T
         freed = free_poses(capture, poses, freed.overlaps.gate).seen_from(model_poses)
-        torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]), STILL) if torn else ()
+        still = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]), STILL) if torn else ()
+        torn = tuple(v for v in still if v in torn)
     return Homes(freed, linked, placed, homeless, torn, lines=lines, tolerance=tolerance, needed=needed)

@@ -21,6 +21,8 @@ from stitch.statistics.tails import chi2_limit
 
 # A hand-eye that differs by chance alone is refused once in a million.
 _CHANCE = 1e-6
+# Views that show two motions, the fewest that a hand-eye follows from.
+_MOTIONS = 3
 # From this share of the views on, a mistake of the whole session is looked for; a part that was clamped anew, or scans
 # that changed places, leave many views out and a good rest.
 _MANY = 1 / 3
@@ -88,6 +90,19 @@ def require_own_model(session: Session, correction: Correction, index: int) -> N
         raise NoResultError(
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
             "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
+        )
+
+
+def require_two_motions(session: Session) -> None:
+    """Refuse two views from which no hand-eye was found: one motion leaves two directions of it open.
+
+    Raises:
+        NoResultError: there are no more.
+    """
+    if len(session.views) < _MOTIONS:
+        raise NoResultError(
+            f"{session.path}: two views show one motion, and no hand-eye was found from it that brings them together; "
+            "to fix: add views turned about another axis, or take the hand-eye of another run (--hand-eye RUN)"
         )
 
 

@@ -115,15 +115,22 @@ def snoop(
         _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, homes.tolerance), b.view, b.p_value)
         for b in sorted((*off, *found.blunders), key=lambda b: b.view)
     ]
+    # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
+    torn = [v for v in homes.torn if v not in homeless]
+    standing_out += [
+        _misplaced(capture, model_poses[v], freed.poses[v], v, 0.0)
+        for v in torn
+        if v not in {m.view for m in standing_out}
+    ]
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
         alone = [*homeless, *(b.view for b in off)]
         again = find_blunders(model.with_usual(usual.twists(freed)), alone, steps)
-        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked)
+        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked) | set(torn)
     groups = homes.groups
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
     misplaced = [m for m in standing_out if m.view in sure] + foreign
-    misplaced = [replace(m, kind="torn") if m.view in homes.torn and m.view in placed else m for m in misplaced]
+    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in misplaced]
     return Snooping(
         linkage=homes.linkage,
         misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),

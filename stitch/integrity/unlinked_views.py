@@ -33,7 +33,8 @@ _FEW_SHARED = 0.1
 
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
     """Share of a scan on the surface of the others at which it counts as placed."""
-    return _ACCEPTED * _usual(capture, poses, linked.core, tolerance) if linked.unlinked else _ACCEPTED
+    compared = linked.unlinked and len(linked.core) > 1
+    return _ACCEPTED * _usual(capture, poses, linked.core, tolerance) if compared else _ACCEPTED
 
 
 def placed_views(

@@ -14,6 +14,7 @@ from stitch.integrity.admission import Admission
 from stitch.integrity.admitted_fit import admitted_fit
 from stitch.measurement.capture import capture
 from stitch.measurement.cloud import Cloud
+from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
@@ -46,6 +47,29 @@ def test_a_scan_that_is_torn_in_itself_is_named_and_left_out(good):
     found = run(with_view(good, 4, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, 1.0]))))
     assert [item.view for item in found.left_out] == ["v004"]
     assert "contradicts the other scans wherever it is put" in found.left_out[0].why
+
+
+def test_a_torn_scan_is_named_though_common_targets_hold_it():
+    """They say where it was taken from, and one half lies there: nothing of it is displaced as a whole."""
+    measured = measured_blade(21, views=6, pixels=80)
+    corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
+    corners = frames.transform(measured.T_reference_scanner[0], measured.clouds[0].points.mean(axis=0) + corners)
+    session, rng = session_of(measured), np.random.default_rng(3)
+    for v, T in enumerate(measured.T_reference_scanner):
+        seen = frames.transform(frames.inverse(T), corners) + 0.01 * rng.standard_normal(corners.shape)
+        session = with_view(session, v, sighting=Sighting(("a", "b", "c", "d"), seen, np.full(4, 0.01)))
+    assert run(session).left_out == ()
+    points = session.views[4].cloud.points
+    half = points[:, 0] > np.median(points[:, 0])
+    torn = with_view(session, 4, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, 2.0])))
+    (gone,) = run(torn).left_out
+    assert gone.view == "v004" and "contradicts the other scans" in gone.why
+
+
+def test_two_views_that_no_hand_eye_brings_together_accuse_nobody(good):
+    """One motion leaves two directions of the hand-eye open, and a good session of two views was told that it is wrong."""
+    with pytest.raises(NoResultError, match="two views show one motion"):
+        run(replace(good, views=(good.views[0], good.views[5])))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
