@@ -37,6 +37,8 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
             lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
             break
         result, state = tried, state_of(tried)
+        # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
+        del found
         found = diagnose(state)
     else:
         lines.append(f"Stopped after {at_most} effects; run it again to go on.")
