@@ -22,6 +22,7 @@ from stitch.integrity.problems import Problem
 from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
+from stitch.integrity.steps import MANY_VIEWS
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture
@@ -110,6 +111,10 @@ def doubts(session: Session, measurement: Measurement, correction: Correction, i
 def _examined(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
     usual, gate = UsualEffects(measurement, correction.model), correction.overlaps[index].gate
     found = snoop(correction.captures[index], correction.model.T_mount, gate, correction.freed[index], usual)
+    if len(session.views) >= MANY_VIEWS:
+        # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
+        large = (step for step in found.steps if beyond_any_arm(session, step.rotation, step.distance))
+        found = replace(found, steps=tuple(large))
     return judged_by_size(session, found)
 
 

@@ -17,7 +17,7 @@ from stitch.integrity.blunders import Found, find_blunders, off_anyway
 from stitch.integrity.homes import find_homes
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import judge, place, surface_of
-from stitch.integrity.steps import CHANCE, Step, find_steps
+from stitch.integrity.steps import CHANCE, MANY_VIEWS, Step, find_steps
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
@@ -104,7 +104,8 @@ def snoop(
     model = view_model(capture, T_mount, freed)
     off = off_anyway(model, homeless, placed)
     found = find_blunders(model, [*homeless, *(b.view for b in off)])
-    erring = model if usual is None else model.with_errors(usual.errors(freed))
+    few = model.count < MANY_VIEWS
+    erring = model.with_errors(usual.errors(freed)) if usual is not None and few else model
     singles = (found.further, len(off) + len(found.blunders))
     steps = find_steps(erring, model.columns(homeless), singles, CHANCE)
     if steps:

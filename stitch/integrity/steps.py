@@ -21,6 +21,8 @@ What = Literal["part", "scanner"]
 # That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
 # without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
 CHANCE = 1e-4
+# Views from which on all by which poses may err takes minutes to hold against a step.
+MANY_VIEWS = 100
 
 # Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
 _SIDE, _MOST = 2, 3
