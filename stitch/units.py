@@ -60,6 +60,15 @@ def rounded(value: float, sigma: float) -> str:
     return _short(value, max(int(np.floor(np.log10(abs(value)))) - place + 1, 1)) if value else "0"
 
 
+def told_in(unit: str) -> tuple[float, str]:
+    """Factor and unit in which numbers of a unit are read: rad in mrad, rad per something in µrad, growth in ppm."""
+    if unit.startswith("rad/"):
+        return 1e6, f"µ{unit}"
+    if unit in ("1/°C", "1/h"):
+        return 1e6, f"ppm{unit[1:]}"
+    return (1e3, unit.replace("rad", "mrad")) if "rad" in unit else (1.0, unit)
+
+
 class Amount(NamedTuple):
     """A parameter of an effect as people read it."""
 
@@ -79,13 +88,7 @@ def amount(value: float, sigma: float | None, unit: str) -> Amount:
     Args:
         unit: that of value and sigma, with angles in rad.
     """
-    factor, told = 1.0, unit
-    if unit.startswith("rad/"):
-        factor, told = 1e6, f"µ{unit}"
-    elif unit in ("1/°C", "1/h"):
-        factor, told = 1e6, f"ppm{unit[1:]}"
-    elif "rad" in unit:
-        factor, told = 1e3, unit.replace("rad", "mrad")
+    factor, told = told_in(unit)
     known = sigma is not None and np.isfinite(sigma) and sigma > 0
     size = factor * sigma if sigma is not None and known else np.nan
     return Amount(rounded(factor * value, size), _short(size, 1) if known else "–", told)

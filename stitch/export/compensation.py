@@ -10,7 +10,7 @@ from stitch.export.inverse_kinematics import LEVER
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
-from stitch.model.term import Term, split, stacked
+from stitch.model.term import Term, split, values_of
 
 _STEPS = 30
 _DONE = 1e-13
@@ -78,7 +78,7 @@ def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array)
     def place(terms: tuple[Term, ...]) -> Array:
         return np.asarray((replace(arm, terms=terms).true_flange(q, _previous(q), approach) @ T_flange_tool)[:, :3, 3])
 
-    here, values = place(arm.terms), np.array([p.value for p in stacked(arm.terms)], float)
+    here, values = place(arm.terms), values_of(arm.terms)
     # Columns of the root are steps of about one sigma: J·L by differences, column by column.
     steps = arm.covariance.root(arm.terms).T
     moved = np.array([place(split(arm.terms, values + step)) - here for step in steps]).reshape(-1, *here.shape)

@@ -13,11 +13,12 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.blunders import Found, find_blunders, off_anyway
-from stitch.integrity.homes import find_homes
+from stitch.integrity.blunders import Found, find_blunders
+from stitch.integrity.homes import Homes, find_homes
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import judge, place, surface_of
-from stitch.integrity.steps import CHANCE, MANY_VIEWS, Step, find_steps
+from stitch.integrity.pose_tests import PoseTests, pose_tests
+from stitch.integrity.steps import Step
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
@@ -100,50 +101,41 @@ def snoop(
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
     homes = find_homes(capture, model_poses, freed)
-    freed, homeless, placed = homes.freed, homes.homeless, list(homes.placed)
-    model = view_model(capture, T_mount, freed)
-    off = off_anyway(model, homeless, placed)
-    found = find_blunders(model, [*homeless, *(b.view for b in off)])
-    few = model.count < MANY_VIEWS
-    erring = model.with_errors(usual.errors(freed)) if usual is not None and few else model
-    singles = (found.further, len(off) + len(found.blunders))
-    steps = find_steps(erring, model.columns(homeless), singles, CHANCE)
-    if steps:
-        # A view at the step may stand for one of its sides.
-        off = off_anyway(model, homeless, placed, steps)
-        found = find_blunders(model, [*homeless, *(b.view for b in off)], steps)
-    standing_out = [
-        _misplaced(capture, model_poses[b.view], _refined(capture, freed, b.view, homes.tolerance), b.view, b.p_value)
-        for b in sorted((*off, *found.blunders), key=lambda b: b.view)
-    ]
+    model = view_model(capture, T_mount, homes.freed)
+    tests = pose_tests(model, homes, usual)
+    standing_out = _standing_out(capture, model_poses, homes, tests)
     # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
-    torn = [v for v in homes.torn if v not in homeless]
-    standing_out += [
-        _misplaced(capture, model_poses[v], freed.poses[v], v, 0.0)
-        for v in torn
-        if v not in {m.view for m in standing_out}
-    ]
+    torn = {v for v in homes.torn if v not in homes.homeless}
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
-        alone = [*homeless, *(b.view for b in off)]
-        again = find_blunders(model.with_usual(usual.twists(freed)), alone, steps)
-        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked) | set(torn)
+        again = find_blunders(model.with_usual(usual.twists(homes.freed)), tests.alone, tests.steps)
+        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked) | torn
     groups = homes.groups
-    foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homeless if (v,) in groups]
-    misplaced = [m for m in standing_out if m.view in sure] + foreign
-    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in misplaced]
+    foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.homeless if (v,) in groups]
+    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
     return Snooping(
         linkage=homes.linkage,
-        misplaced=tuple(sorted(misplaced, key=lambda m: m.view)),
+        misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
         suspected=tuple(m for m in standing_out if m.view not in sure),
-        steps=steps,
+        steps=tests.steps,
         disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
-        found=found,
-        freed=freed,
+        found=tests.found,
+        freed=homes.freed,
         tolerance=homes.tolerance,
         needed=homes.needed,
     )
+
+
+def _standing_out(capture: Capture, model_poses: Array, homes: Homes, tests: PoseTests) -> list[Misplaced]:
+    """Views that stand off and torn ones, with where the surface of the others puts them."""
+    off = sorted((*tests.off, *tests.found.blunders), key=lambda b: b.view)
+    refined = [_refined(capture, homes.freed, b.view, homes.tolerance) for b in off]
+    out = [_misplaced(capture, model_poses[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
+    known = {b.view for b in off} | set(homes.homeless)
+    return out + [
+        _misplaced(capture, model_poses[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known
+    ]
 
 
 def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:

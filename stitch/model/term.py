@@ -27,7 +27,7 @@ class Term:
     @property
     def values(self) -> Array:
         """(P,) in each parameter's unit."""
-        return np.array([p.value for p in self.parameters], float)
+        return values_of([self])
 
     @property
     def sigmas(self) -> Array:
@@ -37,7 +37,7 @@ class Term:
     @property
     def typical(self) -> Array:
         """(P,) plausible sizes."""
-        return np.array([p.typical for p in self.parameters], float)
+        return sizes_of([self])
 
     @property
     def gridded(self) -> Mask:
@@ -66,6 +66,16 @@ def term_of(measurement: Measurement, effect: Effect) -> Term:
 def stacked(terms: Sequence[Term]) -> tuple[Parameter, ...]:
     """All parameters of all terms in one row."""
     return tuple(p for term in terms for p in term.parameters)
+
+
+def values_of(terms: Sequence[Term]) -> Array:
+    """(P,) values of all parameters of all terms, each in its unit."""
+    return np.array([p.value for p in stacked(terms)], float)
+
+
+def sizes_of(terms: Sequence[Term]) -> Array:
+    """(P,) plausible sizes of the same."""
+    return np.array([p.typical for p in stacked(terms)], float)
 
 
 def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:

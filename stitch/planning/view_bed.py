@@ -11,7 +11,7 @@ from stitch.diagnosis.score import weights_of
 from stitch.effects.in_session import known, require
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.model.term import stacked, term_of
+from stitch.model.term import sizes_of, term_of
 from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.scanner_field import field_scatter
@@ -53,7 +53,7 @@ class Bed:
         field = field_scatter(m, freed)
         covariance += field @ field.T
         covariance += noise_of(self._information(), sizes[2] * g.variance, max(g.lever, 1e-9))
-        used = view_columns(m, model, freed) * np.array([p.typical for p in stacked(model.terms)])
+        used = view_columns(m, model, freed) * sizes_of(model.terms)
         common = np.tile(np.eye(6), (g.views, 1))
         own = jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
         return Channel(covariance, np.hstack([own, common, used, *columns]))

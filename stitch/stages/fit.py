@@ -12,7 +12,7 @@ import numpy as np
 from stitch.effects.groups import one_by_one
 from stitch.frames import Mask
 from stitch.model.model import Model
-from stitch.model.term import Term, stacked
+from stitch.model.term import Term, sizes_of
 from stitch.statistics.identifiability import independent
 from stitch.statistics.parameter_selection import UNSEEN, Whitened, supported
 
@@ -105,7 +105,7 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
         before: (P,) what explained scatter so far; never what another run's arm brought.
         whitened: the observation in units of the scatter that is left when some parameters explain theirs.
     """
-    sizes = np.array([p.typical for p in stacked(terms)])
+    sizes = sizes_of(terms)
     groups, effects, at = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
         kept = any(p.kept for p in term.parameters)

@@ -11,7 +11,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
 from stitch.model.model import Model
-from stitch.model.term import known_sigmas, split, stacked
+from stitch.model.term import known_sigmas, split, values_of
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
@@ -58,7 +58,7 @@ def fit_surfaces(
     last, history = iterate(_Surfaces(measurements, gates), model, watch)
     last = last.linearised.with_errors(last.choice)
     sigmas = known_sigmas(last.model.terms, last.fitted, np.sqrt(np.diag(last.hand_eye.values_covariance)))
-    values = np.array([p.value for p in stacked(last.model.terms)], float)
+    values = values_of(last.model.terms)
     covariance = covariance_of_fit(
         last.model.terms,
         last.fitted,

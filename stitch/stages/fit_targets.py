@@ -9,7 +9,7 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
 from stitch.model.model import Model
-from stitch.model.term import known_sigmas, split, stacked
+from stitch.model.term import known_sigmas, split, values_of
 from stitch.observations.targets.effect_rows import effect_columns
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.observations.targets.rows import Rows, rows_of
@@ -62,7 +62,7 @@ def fit_targets(
     moved = last.blocks.moved_by(last.linearised.columns @ kept)
     covariance = covariance + moved @ moved.T
     sigmas = known_sigmas(terms, last.fitted, np.sqrt(np.diag(covariance)[a:]))
-    values = np.array([p.value for p in stacked(last.model.terms)], float)
+    values = values_of(last.model.terms)
     model = Model(
         last.model.T_mount,
         split(terms, values, sigmas),

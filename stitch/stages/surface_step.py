@@ -10,7 +10,7 @@ from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import kept_root
 from stitch.model.model import Model
-from stitch.model.term import split, stacked
+from stitch.model.term import sizes_of, split, stacked, values_of
 from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.gram import pair_squares
@@ -57,12 +57,12 @@ class Linearised:
     @property
     def values(self) -> Array:
         """(P,) of the effects at which the views were freed."""
-        return np.array([p.value for p in stacked(self.model.terms)], float)
+        return values_of(self.model.terms)
 
     @property
     def sizes(self) -> Array:
         """(P,) plausible ones."""
-        return np.array([p.typical for p in stacked(self.model.terms)], float)
+        return sizes_of(self.model.terms)
 
     def choose(self, before: Choice | None) -> Choice:
         """The parameters that the views ask for, those of before first."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.frames import Array, Mask, exp
 from stitch.model.model import Model
-from stitch.model.term import split, stacked
+from stitch.model.term import sizes_of, split, stacked, values_of
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.observations.targets.rows import Rows, mixed_model_of_rows
 from stitch.observations.targets.target_fit import rms_of
@@ -54,12 +54,12 @@ class Linearised:
     @cached_property
     def values(self) -> Array:
         """(P,) of the effects at which the rows were taken."""
-        return np.array([p.value for p in stacked(self.model.terms)], float)
+        return values_of(self.model.terms)
 
     @cached_property
     def sizes(self) -> Array:
         """(P,) plausible ones."""
-        return np.array([p.typical for p in stacked(self.model.terms)], float)
+        return sizes_of(self.model.terms)
 
     def choose(self, before: Mask | None) -> Mask:
         """(P,) the parameters that the views ask for, those of before first."""

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from stitch.units import angle_text, length_text
+from stitch.units import length_text, told_in
 from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.changes import Change
 
@@ -48,13 +48,12 @@ def notes(report: CellReport) -> list[str]:
 
 
 def size_text(value: float, unit: str, sigma: float | None = None) -> str:
-    """A value with its unit for people: lengths in µm or mm, angles in mrad."""
+    """A value with its unit for people: lengths in µm or mm, the rest as everywhere."""
     told = value if sigma is None or not np.isfinite(sigma) else float(f"{value:.{_digits(value, sigma)}g}")
     if unit in ("mm", "m"):
         return length_text(told, unit)
-    if unit == "rad":
-        return angle_text(told)
-    return f"{told:.4g} {unit}"
+    factor, name = told_in(unit)
+    return f"{factor * told:.4g} {name}"
 
 
 def day_text(time: float | None) -> str:

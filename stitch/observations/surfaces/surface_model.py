@@ -9,7 +9,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
-from stitch.model.term import Term, stacked
+from stitch.model.term import Term, sizes_of, values_of
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import pose_errors
@@ -103,7 +103,7 @@ def surface_model(
     g, frames_of_mount = freed.overlaps.gram, capture.hand_eye_frames(model.T_mount)
     channel = pose_channel(g, freed.twists, frames_of_mount, capture.T_reference_flange)
     extra = view_columns(measurement, model, freed)
-    sizes = np.array([p.typical for p in stacked(model.terms)])
+    sizes = sizes_of(model.terms)
     field = channel.reduction @ field_scatter(measurement, freed)
     alone = replace(mixed_model(channel), fixed=(field @ field.T)[None])
     half = np.linalg.cholesky(alone.covariance(_null(alone, (), variances).variances)[0])
@@ -117,7 +117,7 @@ def surface_model(
         errors = pose_errors([measurement], model, [g.centre]).reduced(channel.reduction)
         mixed = with_errors(mixed, errors)
     null = _null(mixed, () if errors is None else errors.names, variances)
-    values = np.array([p.value for p in stacked(model.terms)])
+    values = values_of(model.terms)
     return LinearModel(
         measurement,
         model,

@@ -9,7 +9,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import corrected
 from stitch.model.model import Model
-from stitch.model.term import Term, stacked
+from stitch.model.term import Term, sizes_of, stacked, values_of
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import PointSums, Prior, Response
 from stitch.observations.targets.effect_rows import effect_columns, effect_rows
@@ -89,7 +89,7 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
     extra = effect_columns(rows, measurement, model)
     parameters = stacked(model.terms)
-    sizes = np.array([p.typical for p in parameters])
+    sizes = sizes_of(model.terms)
     # Parameters that the fit left at zero are not in the model.
     used = np.array([p.value != 0 and not p.discrete for p in parameters], bool)
     whole = mixed_model_of_rows(rows, np.concatenate([base, extra[..., used]], axis=2))
@@ -100,7 +100,7 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     A = np.concatenate([base, extra[..., seen]], axis=2)
     mixed = mixed_model_of_rows(rows, A)
     null = fit_variances(mixed, both_starts=True)
-    values = np.array([p.value for p in parameters])
+    values = values_of(model.terms)
     return LinearModel(
         measurement,
         model,
