@@ -64,8 +64,9 @@ def fit_variances(
     present = np.einsum("cbii->c", mixed.components) > 0
     bounds = [own if there else (np.log(_ABSENT),) * 2 for own, there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
-    begin = [np.clip(s, *np.array(bounds).T) for s in begin]
+    # Scoring has no bounds: begun within them, it would go once more where an earlier fit has ended beyond.
     near = [scored(problem, s, flat) if present.all() else None for s in begin]
+    begin = [np.clip(s, *np.array(bounds).T) for s in begin]
     search = partial(minimize, deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     fits = [
         _fit(problem, np.where(present, np.exp(search(s).x), 0.0))

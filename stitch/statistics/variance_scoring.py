@@ -9,6 +9,8 @@ from stitch.statistics.variance_prior import log_prior, prior_information
 # Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
 # (rounding alone moves that of thousands of numbers by a tenth of it), and the blocks from which they pay.
 _SCORINGS, _LEAP, _HALVINGS, _SETTLED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
+# Change of a variance, as a share of it, beyond which little of it would be left.
+_NEARLY_NONE = -0.8
 
 
 def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likelihood] | None:
@@ -27,12 +29,10 @@ def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likeliho
         variances = np.exp(x)
         shares = variances[:, None, None, None] * (here.inverse @ mixed.components)
         curvature = np.einsum("cbij,dbji->cd", shares, shares, optimize=True)
-        # In the log of a variance that is hardly seen the likelihood curves by its slope.
-        curvature += np.diag(2 * prior_information(variances, None) + np.maximum(here.slope - log_prior(x, None)[1], 0))
-        step = -np.linalg.solve(curvature, here.slope)
+        curvature += np.diag(2 * prior_information(variances, None))
+        step = _step(curvature, here.slope, np.maximum(here.slope - log_prior(x, None)[1], 0))
         if -0.5 * float(here.slope @ step) < _SETTLED:
             return x, here
-        step *= min(1.0, _LEAP / float(np.abs(step).max()))
         for _ in range(_HALVINGS):
             there = likelihood(x + step, problem)
             if there.deviance <= here.deviance + _SETTLED:
@@ -42,3 +42,16 @@ def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likeliho
             return None
         x, here = x + step, there
     return None
+
+
+def _step(curvature: Array, slope: Array, hardly_seen: Array) -> Array:
+    """(c,) in the log variances.
+
+    In the variances themselves scoring is exact where one of them decides. One that it would make negative is hardly
+    seen: there the likelihood curves, in the logarithm, by its slope.
+    """
+    share = -np.linalg.solve(curvature, slope)
+    if share.min() > _NEARLY_NONE:
+        return np.asarray(np.log1p(share))
+    step = -np.linalg.solve(curvature + np.diag(hardly_seen), slope)
+    return np.asarray(step * min(1.0, _LEAP / float(np.abs(step).max())))
