@@ -8,11 +8,12 @@ block-diagonal in B blocks: one for the pose channel of scans, one a view for la
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from stitch.frames import Array
-from stitch.statistics.inverse import inverted
+from stitch.statistics.inverse import Inverse, inverted
 from stitch.statistics.variance_prior import log_prior
 
 
@@ -66,11 +67,36 @@ def problem_of(mixed: MixedModel, G: Array | None, prior: Array | None) -> Probl
 class Likelihood:
     """The restricted likelihood at some variances, and what is best believed of the mean there."""
 
+    problem: Problem
+    log_variances: Array  # (c,)
     deviance: float  # −2 log of it, and of the prior of the log variances
-    slope: Array  # (c,) in the log variances
     mean: Array  # (a + g,) coefficients
-    covariance: Array  # (a + g, a + g)
-    inverse: Array  # (B, m, m) of the numbers' covariance
+    half: Array  # (a + g, r) square root of their covariance
+    inverse: Inverse  # of the numbers' covariance
+    white: Array  # (B·m, a + g) the mean's columns in units of the scatter
+    rest: Array  # (B·m,) what the mean leaves, in those units
+
+    @property
+    def covariance(self) -> Array:
+        """(a + g, a + g) of the coefficients."""
+        return self.half @ self.half.T
+
+    @cached_property
+    def slope(self) -> Array:
+        """(c,) of the deviance in the log variances; it takes as long as the deviance itself.
+
+        d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
+        """
+        variances, mixed = np.exp(self.log_variances), self.problem.mixed
+        if not np.isfinite(self.inverse.logdet):
+            return np.zeros(len(variances))
+        taken = np.empty((len(self.white), self.half.shape[1] + 1))
+        np.matmul(self.white, self.half, out=taken[:, :-1])
+        taken[:, -1] = self.rest
+        unwhitened = np.ascontiguousarray(self.inverse.half.transpose(0, 2, 1)) @ taken.reshape(*mixed.z.shape, -1)
+        against = self.inverse.matrix - unwhitened @ unwhitened.transpose(0, 2, 1)
+        own = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
+        return np.asarray(own + log_prior(self.log_variances, mixed.scales)[1])
 
 
 def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
@@ -79,7 +105,8 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
         mixed, variances = problem.mixed, np.exp(log_variances)
     inverse, k = inverted(mixed.covariance(variances)), problem.X.shape[2]
     if not np.isfinite(inverse.logdet):
-        return Likelihood(1e300, np.zeros(len(variances)), np.zeros(k), np.zeros((k, k)), inverse.matrix)
+        mean, half = np.zeros(k), np.zeros((k, k))
+        return Likelihood(problem, log_variances, 1e300, mean, half, inverse, white=half, rest=mean)
     white = rows_of_blocks(inverse.half @ problem.X)
     white_z = np.matmul(inverse.half, mixed.z[..., None]).ravel()
     M = white.T @ white + np.diag(problem.precision)
@@ -90,29 +117,17 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
     mean = half @ (half.T @ (white.T @ white_z))
     rest = white_z - white @ mean
-    # d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
-    taken = np.empty((len(white), half.shape[1] + 1))
-    np.matmul(white, half, out=taken[:, :-1])
-    taken[:, -1] = rest
-    unwhitened = inverse.half.transpose(0, 2, 1) @ taken.reshape(*mixed.z.shape, -1)
-    against = inverse.matrix - unwhitened @ unwhitened.transpose(0, 2, 1)
-    slope = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest @ rest) + float(mean @ (problem.precision * mean))
     logdet = inverse.logdet + float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
-    believed, pull = log_prior(log_variances, mixed.scales)
-    return Likelihood(logdet + square + believed, slope + pull, mean, half @ half.T, inverse.matrix)
+    value = logdet + square + log_prior(log_variances, mixed.scales)[0]
+    return Likelihood(problem, log_variances, value, mean, half, inverse, white, rest)
 
 
 def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     here = likelihood(log_variances, problem)
     return here.deviance, here.slope
-
-
-def deviance_slope(log_variances: Array, mixed: MixedModel) -> tuple[float, Array]:
-    """−2 log of restricted likelihood and prior of the log variances (c,), up to a constant, and its slope (c,)."""
-    return deviance(log_variances, problem_of(mixed, None, None))
 
 
 def rows_of_blocks(X: Array) -> Array:

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize, minimize_scalar
 
 from stitch.statistics.inverse import inverted
-from stitch.statistics.restricted_likelihood import MixedModel, deviance_slope, problem_of
+from stitch.statistics.restricted_likelihood import MixedModel, deviance, problem_of
 from stitch.statistics.variance_components import at_variances, fit_variances
 from stitch.statistics.variance_scoring import scored
 
@@ -74,8 +74,8 @@ def test_scatter_that_no_number_has_is_none():
 def test_variances_beyond_all_numbers_are_as_unlikely_as_nothing_else():
     mixed = MixedModel(np.ones((1, 4)), np.zeros((1, 4, 0)), np.eye(4)[None, None])
     for log_variance in (800.0, np.nan):
-        deviance, slope = deviance_slope(np.array([log_variance]), mixed)
-        assert deviance == 1e300 and not slope.any()
+        value, slope = deviance(np.array([log_variance]), problem_of(mixed, None, None))
+        assert value == 1e300 and not slope.any()
 
 
 def test_one_block_is_inverted_as_many_are():
@@ -102,12 +102,12 @@ def test_scoring_ends_where_a_search_ends():
     true = np.array([0.5, 0.02, 1.5])
     V = np.einsum("c,cbij->bij", true, components)
     z = np.einsum("bij,bj->bi", np.linalg.cholesky(V), rng.normal(size=(blocks, m)))
-    mixed = MixedModel(z, np.ones((blocks, m, 1)), components)
+    problem = problem_of(MixedModel(z, np.ones((blocks, m, 1)), components), None, None)
     for factor in (1.0, 30.0, 0.05):
         begin = np.log(true * [factor, 1 / factor, 1.0])
-        found = scored(problem_of(mixed, None, None), begin, 1e-3)
+        found = scored(problem, begin, 1e-3)
         looked = minimize(
-            lambda x: deviance_slope(x, mixed),
+            lambda x: deviance(x, problem),
             begin,
             jac=True,
             method="L-BFGS-B",
@@ -115,4 +115,4 @@ def test_scoring_ends_where_a_search_ends():
         )
         assert found is not None or factor != 1.0
         if found is not None:
-            assert found[1].deviance == deviance_slope(found[0], mixed)[0] == pytest.approx(looked.fun, abs=2e-3)
+            assert found[1].deviance == deviance(found[0], problem)[0] == pytest.approx(looked.fun, abs=2e-3)

@@ -87,15 +87,12 @@ def _eliminated_back(
         return own, extrapolate(beside, own.score) if certain(own) else None
 
     # Mostly all hold their place: then none was asked beside one that goes, and the order is of no account.
-    at_once = list(parallel(asked, chosen))
-    if all(_as_before(r, own) for r, (own, _) in zip(chosen, at_once, strict=True)):
-        return [own for own, _ in at_once], {own.name: found for own, found in at_once}
-    kept, beyond = list(chosen), dict[str, Extrapolation | None]()
-    for r in chosen:
-        own, found = asked(r, kept)
+    kept, beyond, as_asked = list(chosen), dict[str, Extrapolation | None](), True
+    for r, at_once in zip(chosen, list(parallel(asked, chosen)), strict=True):
+        own, found = at_once if as_asked else asked(r, kept)
         others = [other for other in kept if other.name != r.name]
         if not _as_before(r, own):
-            beyond = {}  # what was asked of the others was asked beside this one
+            beyond, as_asked = {}, False  # what was asked of the others was asked beside this one
         kept = [*others, own] if certain(own) else others
         if certain(own):
             beyond[own.name] = found
