@@ -22,10 +22,11 @@ from stitch.integrity.problems import Problem
 from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
+from stitch.integrity.standing_still import standing_still
 from stitch.integrity.steps import MANY_VIEWS
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.measurement.capture import Capture
+from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session, View
 from stitch.observations.targets.target_fit import TargetFit
@@ -119,11 +120,13 @@ def _examined(session: Session, measurement: Measurement, correction: Correction
 
 
 def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """Steps between two views, and poses that contradict the scans as no arm of use does."""
+    """What stands still before the scanner, steps between two views, poses that contradict the scans as no arm does."""
     names = [view.name for view in session.views]
-    steps = tuple(step.said(names, session.length_unit) for step in found.steps)
+    still = standing_still(own.scans, own.poses(T_mount), found.tolerance, part_size([own]))
+    background = () if still is None else (still.said(len(own.scans), session.length_unit),)
+    said = (*background, *(step.said(names, session.length_unit) for step in found.steps))
     if not doubtful(session, found):
-        return steps
+        return said
     twists = frames.log(found.freed.poses @ frames.inverse(own.poses(T_mount)))
     middles = np.array([points.mean(axis=0) for points in own.shown])
     moved = np.linalg.norm(
@@ -134,7 +137,7 @@ def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> 
     return (
         f"No arm scatters by {contradicted_by(session, found)}: several rows or scans are wrong, and the views hold "
         f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {farthest}.",
-        *steps,
+        *said,
     )
 
 

@@ -8,26 +8,19 @@ two scans are in one file, fits with one half and contradicts with the other.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.shown import Shown, shown_by
 from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.match import near_pairs, sample
 
 # Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
 # surface, as a share of the part's size.
 _PROBES, _ASKED, _REACH = 500, 20, 0.03
-# The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
-_SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
-# Elsewhere is farther than so many tolerances: what a lens or a slant does to a scan moves it by less.
-_ELSEWHERE = 3.0
 # A scan contradicts the others if this share of what they show of it stands elsewhere; one that was put where it fits
 # best, and still does by the second, is torn.
 CONTRADICTS, STILL = 0.2, 0.05
-
-# Per point what another scan shows of it: 2 in its place, 1 elsewhere, 0 nothing, or neither.
-Shown = NDArray[np.int8]
 
 
 def contradicting(
@@ -74,21 +67,6 @@ def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) 
             asked, T_w_v = slice(k % turns, None, turns), frames.inverse(poses[w]) @ poses[v]
             points = frames.transform(T_w_v, scan.points[index[asked]])
             normals = frames.rotate(T_w_v, scan.normals[index[asked]])
-            shown[w][asked] = _shown(scans[w], points, normals, (tolerance, reach))
+            shown[w][asked] = shown_by(scans[w], points, normals, (tolerance, reach))
         out.append(shown)
     return out
-
-
-def _shown(scan: Scan, points: Array, normals: Array, limits: tuple[float, float]) -> Shown:
-    """(n,) what a scan shows of points with normals in its frame."""
-    tolerance, reach = limits
-    distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
-    found = np.isfinite(distance)
-    partner = np.where(found, partner, 0).astype(np.int64)
-    own, apart = scan.normals[partner], points - scan.points[partner]
-    along = np.einsum("ni,ni->n", apart, own)
-    beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=found, out=np.full(len(points), np.inf))
-    found &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, own) > _SAME_SIDE)
-    found &= beside < _SPACINGS * scan.spacing
-    away = np.abs(along) / tolerance
-    return np.asarray(2 * (found & (away < 1)) + (found & (away > _ELSEWHERE)), np.int8)

@@ -89,7 +89,11 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
     still = np.broadcast_to(np.eye(4), T.shape)
     yield Hypothesis(
-        "mount", still, mount, "the clouds stand in one common frame already: export them as the scanner sees them"
+        "mount",
+        still,
+        mount,
+        "the clouds stand in one common frame already: export them as the scanner sees them; or most of them shows "
+        "what stands still before the scanner, a wall or a table: cut it away (within, under [scanner])",
     )
 
 

@@ -25,6 +25,12 @@ class Cloud:
         """How many points were scanned."""
         return len(self.points) if self.whole is None else self.whole.count
 
+    def within(self, box: Array) -> "Cloud":
+        """Its points inside a box (2, 3)."""
+        inside = ((self.points >= box[0]) & (self.points <= box[1])).all(axis=1)
+        scalars = {name: column[inside] for name, column in self.scalars.items()}
+        return Cloud(self.points[inside], None if self.normals is None else self.normals[inside], scalars)
+
 
 @dataclass(frozen=True)
 class WholeCloud:

@@ -1,6 +1,6 @@
 """A session folder on disk -> `Session`; every check of input is made here or in the readers it calls."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import get_args
@@ -57,7 +57,9 @@ def load_session(
     sightings = _sightings(path, [row.name for row in rows]) if scans else {}
     if memory is not None:
         at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
-    read = partial(_cloud, path, scale=METRES[cloud_unit] / METRES[unit], metres=METRES[unit], at_most=at_most)
+    within = session_toml.within(file, document.get("scanner", {}))
+    cloud = partial(_read, scale=METRES[cloud_unit] / METRES[unit], within=within)
+    read = partial(_cloud, path, read=cloud, metres=METRES[unit], at_most=at_most)
     clouds = parallel(read, rows, "reading scans") if scans else [None] * len(rows)
     views = _views(path, rows, clouds, sightings, scans)
     cad, cad_unit = session_toml.cad(file, document.get("part", {}))
@@ -137,12 +139,12 @@ def _views(
     return tuple(views)
 
 
-def _cloud(path: Path, row: Row, scale: float, metres: float, at_most: int | None) -> Cloud | None:
+def _cloud(path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, at_most: int | None) -> Cloud | None:
     if not row.cloud:
         return None
     file = path / row.cloud
     try:
-        cloud = read_cloud(file, scale)
+        cloud = read(file)
         if len(cloud.points) < _FEWEST:
             raise InputError(
                 f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
@@ -152,4 +154,15 @@ def _cloud(path: Path, row: Row, scale: float, metres: float, at_most: int | Non
         require_near(str(file), cloud.points * metres)
     except InputError as error:
         raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read_cloud, file, scale))
+    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read, file))
+
+
+def _read(file: Path, scale: float, within: Array | None) -> Cloud:
+    """A scan in length_unit, what counts of it."""
+    cloud = read_cloud(file, scale)
+    if within is None:
+        return cloud
+    inside = cloud.within(within)
+    if not len(inside.points):
+        raise InputError(f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml")
+    return inside

@@ -23,7 +23,7 @@ FORMAT = "stitch-session/1"
 
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
-    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within"},
     "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
@@ -103,6 +103,26 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
     noise, standoff = (positive(file, table, "scanner", key) for key in ("noise", "standoff"))
     kind = choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
     return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind))
+
+
+def within(file: Path, table: dict[str, Any]) -> Array | None:
+    """[scanner] within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit.
+
+    Raises:
+        InputError: not two corners, or the second one not above the first.
+    """
+    if "within" not in table:
+        return None
+    try:
+        box = np.array(table["within"], float)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise InputError(
+            f"{file}: scanner.within is {shortened(table['within'])}; state the lowest and the highest corner of the "
+            "box that counts, in the scanner's frame: [[-200, -200, 300], [200, 200, 600]]"
+        )
+    return box
 
 
 def _pose(file: Path, value: Any) -> Array:

@@ -17,6 +17,17 @@ def test_good_session(session):
     assert np.allclose(loaded.scanner.optical_axis, [0, 0, 1])
 
 
+def test_only_what_lies_within_the_stated_box_is_read(session):
+    points = [view.cloud.points for view in load_session(session).views]
+    deepest = max(float(np.median(own[:, 2])) for own in points)
+    toml(r"\[scanner\]", f"[scanner]\nwithin = [[-1e3, -1e3, -1e3], [1e3, 1e3, {deepest}]]")(session)
+    left = load_session(session, at_most=10)
+    for before, view in zip(points, left.views, strict=True):
+        assert view.cloud.count == int((before[:, 2] <= deepest).sum())
+        whole = view.cloud.points if view.cloud.whole is None else view.cloud.whole.read().points
+        assert len(whole) == view.cloud.count and whole[:, 2].max() <= deepest
+
+
 def spoil_cell(row, column, value):
     """An edit of one cell of views.csv."""
     return lambda folder: set_cell(folder / "views.csv", row, column, value)
@@ -73,6 +84,11 @@ BAD = {
     "axis": (toml(r"\+z", "up"), ["optical_axis"]),
     "axis as a vector": (toml(r'"\+z"', "[0, 0, 1]"), ["scanner.optical_axis is [0, 0, 1]", '"+z"']),
     "axis that no effect knows": (toml(r"\+z", "-x"), ["scanner.optical_axis is '-x'", "turn the clouds"]),
+    "box of one corner": (
+        toml(r'"\+z"', '"+z"\nwithin = [0, 0, 300]'), ["scanner.within is [0, 0, 300]", "highest corner"]),
+    "box upside down": (toml(r'"\+z"', '"+z"\nwithin = [[9, 9, 9], [0, 0, 0]]'), ["scanner.within", "highest corner"]),
+    "box beside the scans": (
+        toml(r'"\+z"', '"+z"\nwithin = [[0, 0, -9], [1, 1, -8]]'), ["v000", "none of its", "scanner.within"]),
     "sensor of no kind": (toml(r'"\+z"', '"+z"\nkind = "laser"'), ["kind is 'laser'", "'tracker'"]),
     "gravity in words": (table('[robot]\njoints = [{ a = 1 }]\ngravity = "down"'), ["session.toml", "gravity is 'down'"]),
     "URDF that is no name": (table("[robot]\nurdf = 5"), ["session.toml", "robot.urdf is 5"]),

@@ -1,0 +1,86 @@
+"""What stands still before the scanner: walls of known place in simulated scans, and surfaces that only look still."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch import frames
+from stitch.comparison.model_history import model_history
+from stitch.comparison.run_verdict import run_verdict
+from stitch.integrity.standing_still import standing_still
+from stitch.measurement.capture import capture, part_size
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.scan import prepare_view
+from stitch.pipeline import run
+
+TOLERANCE = 0.1
+SIDE = np.arange(-40.0, 40.0, 1.0)
+GRID = np.stack(np.meshgrid(SIDE, SIDE), axis=-1).reshape(-1, 2)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return measured_blade(21, views=12, pixels=80)
+
+
+def before_wall(session, width, behind):
+    """Every scan with the same square wall behind the part, in the scanner's frame."""
+    rng = np.random.default_rng(3)
+    every = np.concatenate([view.cloud.points for view in session.views])
+    place = np.append(every.mean(axis=0)[:2], every[:, 2].max() + behind)
+
+    def with_wall(points):
+        flat = GRID[np.abs(GRID).max(axis=1) < width / 2]
+        wall = place + np.column_stack([flat, 0.02 * rng.standard_normal(len(flat))])
+        return Cloud(np.concatenate([points, wall]))
+
+    views = [replace(view, cloud=with_wall(view.cloud.points)) for view in session.views]
+    return replace(session, views=tuple(views)), place[2]
+
+
+def cut(session, box):
+    views = [replace(view, cloud=view.cloud.within(np.array(box))) for view in session.views]
+    return replace(session, views=tuple(views))
+
+
+def test_a_wall_behind_the_part_is_said_first_with_the_box_that_leaves_it_out(measured):
+    session, depth = before_wall(session_of(measured), 40.0, 25.0)
+    found = run(session)
+    said = run_verdict(found, model_history(found))
+    assert "of what the scans show stands still before the scanner whatever the arm did (12 of 12 scans" in said
+    scans, poses = capture(session), found.model.T_mount
+    still = standing_still(scans.scans, scans.poses(poses), TOLERANCE, part_size([scans]))
+    shown = np.mean(np.abs(np.concatenate([view.cloud.points for view in session.views])[:, 2] - depth) < 0.2)
+    assert still.share == pytest.approx(shown, abs=0.05)
+    assert still.box[:, 2] == pytest.approx([depth, depth], abs=0.2)
+    without = cut(session, still.within)
+    assert [v.cloud.count for v in without.views] == [v.cloud.count for v in session_of(measured).views]
+    assert run(without).doubts == ()
+
+
+def test_without_a_wall_nothing_stands_still(measured):
+    own = capture(session_of(measured))
+    assert standing_still(own.scans, own.poses(measured.T_mount), TOLERANCE, part_size([own])) is None
+
+
+def scans_of(shape):
+    rng = np.random.default_rng(0)
+    return [prepare_view(str(v), shape + [0, 0, 300] + 0.02 * rng.standard_normal(shape.shape)) for v in range(12)]
+
+
+@pytest.mark.parametrize("overlap", [0.3, 0.05])
+def test_a_plate_that_slides_along_itself_does_not_stand_still(overlap):
+    step = 80 * (1 - overlap)
+    poses = np.array([frames.make(np.eye(3), [step * i, step * j, 0]) for i in range(4) for j in range(3)])
+    flat = np.column_stack([GRID, np.zeros(len(GRID))])
+    assert standing_still(scans_of(flat), poses, TOLERANCE, 300.0) is None
+
+
+def test_a_disc_that_turns_about_its_axis_does_not_stand_still():
+    radius = np.linalg.norm(GRID, axis=1)
+    disc = np.column_stack([GRID, 3 * np.cos(radius / 5)])[radius < 38]
+    turned = frames.exp(np.array([[0, 0, 0.5 * v, 0, 0, 0] for v in range(12)]))
+    assert standing_still(scans_of(disc), turned, TOLERANCE, 80.0) is None
