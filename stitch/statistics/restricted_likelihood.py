@@ -16,6 +16,9 @@ from stitch.frames import Array
 from stitch.statistics.inverse import Inverse, inverted
 from stitch.statistics.variance_prior import log_prior
 
+# Blocks that are held against the components at a time: as many as stay in a core's cache.
+_IN_CACHE = 256
+
 
 @dataclass(frozen=True)
 class MixedModel:
@@ -90,13 +93,15 @@ class Likelihood:
         variances, mixed = np.exp(self.log_variances), self.problem.mixed
         if not np.isfinite(self.inverse.logdet):
             return np.zeros(len(variances))
-        taken = np.empty((len(self.white), self.half.shape[1] + 1))
-        np.matmul(self.white, self.half, out=taken[:, :-1])
-        taken[:, -1] = self.rest
-        unwhitened = np.ascontiguousarray(self.inverse.half.transpose(0, 2, 1)) @ taken.reshape(*mixed.z.shape, -1)
-        against = self.inverse.matrix - unwhitened @ unwhitened.transpose(0, 2, 1)
-        own = variances * (mixed.components.reshape(len(variances), -1) @ against.ravel())
-        return np.asarray(own + log_prior(self.log_variances, mixed.scales)[1])
+        (blocks, m), own = mixed.z.shape, np.zeros(len(variances))
+        for start in range(0, blocks, _IN_CACHE):
+            at, rows = slice(start, start + _IN_CACHE), slice(m * start, m * (start + _IN_CACHE))
+            taken = np.column_stack([self.white[rows] @ self.half, self.rest[rows]])
+            back = np.ascontiguousarray(self.inverse.half[at].transpose(0, 2, 1))
+            unwhitened = back @ taken.reshape(-1, m, taken.shape[1])
+            against = self.inverse.matrix[at] - unwhitened @ unwhitened.transpose(0, 2, 1)
+            own += mixed.components[:, at].reshape(len(own), -1) @ against.ravel()
+        return np.asarray(variances * own + log_prior(self.log_variances, mixed.scales)[1])
 
 
 def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
