@@ -54,25 +54,29 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         linear = linear.scatter_only if as_before else linear
         found = concluded(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
-        then = tuple(named_after(linear, a.candidates, found)) if part in AGAIN else ()
+        then, group = named_after(linear, a.candidates, found) if part in AGAIN else ((), ())
         also = () if world.arm is None else OF_THE_ARM
         cell = f"{a.cell.scene} {a.cell.seed}"
         follows = unnamed_errors(linear) if found.verdict == "unknown_effect" else ()
         words = ", ".join(u.words for u in follows)
-        yield Trial(cell, hidden, found.verdict, also, names, then, words, seconds=time.process_time() - begun)
+        yield Trial(cell, hidden, found.verdict, also, names, then, group, words, seconds=time.process_time() - begun)
 
 
-def named_after(linear: LinearModel, candidates: Sequence[Candidate], found: Selection) -> Iterator[str]:
-    """What is named next, and next again, when the effect that was named is added, as `stitch add` would."""
+def named_after(
+    linear: LinearModel, candidates: Sequence[Candidate], found: Selection
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What is named next, and next again, when the effect that was named is added, as `stitch add` would; and the
+    group that cannot be told apart, if it ends with one."""
+    then = list[str]()
     for _ in range(ASKED_AGAIN):
         if found.verdict != "missing_effect":
-            return
+            break
         form = found.named[0].score.form
         linear = linear.conditioned_on(form.columns, form.sizes)
         candidates = [c for c in candidates if c.name != found.named[0].name]
         found = concluded(linear, candidates, USUAL)
-        if found.verdict == "missing_effect":
-            yield found.named[0].name
+        then += [found.named[0].name] if found.verdict == "missing_effect" else []
+    return tuple(then), tuple(r.name for r in found.named) if found.verdict == "cannot_tell" else ()
 
 
 def told(part: str, cells: Sequence[Asked], as_before: bool, fewer: int) -> Iterator[Trial]:

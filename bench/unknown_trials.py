@@ -16,11 +16,13 @@ class Trial:
     also: tuple[str, ...]  # what else is there: the errors of an ordinary arm
     named: tuple[str, ...]
     then: tuple[str, ...]  # named when asked again with what was named added
+    group: tuple[str, ...]  # of which one is there at the end, if it ends so
     follows: str  # what is said to repeat without a name
     seconds: float
 
     def __str__(self) -> str:
         hidden, named = ", ".join(self.hidden) or "nothing", " ".join((*self.named, *(f"then {n}" for n in self.then)))
+        named += f" then one of {' '.join(self.group)}" if self.then and self.group else ""
         return f"{self.cell}: {hidden} → {self.verdict} {named}{self.follows} ({self.seconds:.1f} s)"
 
     @property
@@ -58,6 +60,12 @@ class Trial:
         """All that is hidden is named in the end."""
         return bool(self.hidden) and set(self.hidden) <= {*self.named, *self.then}
 
+    @property
+    def whole_or_group(self) -> bool:
+        """All that is hidden is named in the end, or the last of it in a group of which one is there."""
+        left = set(self.hidden) - {*self.named, *self.then}
+        return bool(self.hidden) and (not left or (len(left) == 1 and left <= set(self.group)))
+
 
 _COLUMNS: dict[str, Callable[[Trial], bool]] = {
     "wrong name": lambda t: t.single and t.wrong,
@@ -65,6 +73,7 @@ _COLUMNS: dict[str, Callable[[Trial], bool]] = {
     "right name": lambda t: t.single and t.right,
     "right name or group": lambda t: t.right,
     "all of it, asked again": lambda t: t.whole,
+    "all of it, or the last in a group": lambda t: t.whole_or_group,
     "wrong when asked again": lambda t: any(name not in (*t.hidden, *t.also) for name in t.then),
     "unknown": lambda t: t.verdict == "unknown_effect",
     "adequate": lambda t: t.verdict == "adequate",

@@ -32,16 +32,16 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class _Seen:
-    """Numbers without their mean: n of them, and square roots of the components of their covariance."""
+    """Numbers without their mean: n of them, the components of their covariance and square roots of these."""
 
     z: Array  # (n,)
+    components: Array  # (c, n, n)
     roots: list[Array]  # per component (n, rank)
     fixed: Array  # (n, n)
 
     def half(self, variances: Array) -> Array:
         """(n, n) lower Cholesky factor of the covariance."""
-        V = self.fixed + np.sum([v * (root @ root.T) for v, root in zip(variances, self.roots, strict=True)], axis=0)
-        return np.asarray(np.linalg.cholesky(V))
+        return np.asarray(np.linalg.cholesky(self.fixed + np.tensordot(variances, self.components, axes=1)))
 
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
@@ -78,7 +78,7 @@ def _without_mean(mixed: MixedModel) -> _Seen:
         roots.append(vectors[:, keep] * np.sqrt(values[keep]))
     n = len(turn)
     fixed = np.zeros((n, n)) if mixed.fixed is None else turn @ block_diag(*mixed.fixed) @ turn.T
-    return _Seen(turn @ mixed.z.ravel(), roots, fixed)
+    return _Seen(turn @ mixed.z.ravel(), np.array([root @ root.T for root in roots]), roots, fixed)
 
 
 def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
