@@ -13,7 +13,7 @@ from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.session import Mount, Session, View
 from stitch.measurement.thinning import ENOUGH, points_within, thinned_cloud
-from stitch.reading import session_toml
+from stitch.reading import scanner_toml, session_toml
 from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.plausible import check_scale, require_near
@@ -57,7 +57,7 @@ def load_session(
     sightings = _sightings(path, [row.name for row in rows]) if scans else {}
     if memory is not None:
         at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
-    within = session_toml.within(file, document.get("scanner", {}))
+    within = scanner_toml.within(file, document.get("scanner", {}))
     cloud = partial(_read, scale=METRES[cloud_unit] / METRES[unit], within=within)
     read = partial(_cloud, path, read=cloud, metres=METRES[unit], at_most=at_most)
     clouds = parallel(read, rows, "reading scans") if scans else [None] * len(rows)
@@ -68,7 +68,7 @@ def load_session(
         name=session_toml.name_of(file, document),
         length_unit=unit,
         mount=mount,  # type: ignore[arg-type]
-        scanner=session_toml.scanner(file, document.get("scanner", {})),
+        scanner=scanner_toml.scanner(file, document.get("scanner", {})),
         robot=robot,
         sphere_radius=session_toml.positive(file, document.get("sphere", {}), "sphere", "radius"),
         cad=cad,

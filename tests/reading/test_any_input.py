@@ -13,7 +13,8 @@ from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.points_csv import read_points
-from stitch.reading.session_toml import cad, document, name_of, positive, robot, scanner
+from stitch.reading.scanner_toml import scanner, within
+from stitch.reading.session_toml import cad, document, name_of, positive, robot
 from stitch.reading.views_csv import read_views
 from stitch.stored.run_documents import read_ledger, read_result
 
@@ -106,6 +107,7 @@ def test_descriptions_of_anything(tmp_path, text, value, key):
     for read in (
         lambda: name_of(file, {"name": value}),
         lambda: scanner(file, inner | {"pose": value, "noise": value}),
+        lambda: within(file, inner | {"within": value}),
         lambda: robot(file, {"joints": value, "gravity": value}, "mm"),
         lambda: robot(file, {"joints": [{"a": value, "com": value}], "payload": value}, "mm"),
         lambda: robot(file, {"urdf": value}, "mm"),
