@@ -123,7 +123,7 @@ def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> 
     """What stands still before the scanner, steps between two views, poses that contradict the scans as no arm does."""
     names = [view.name for view in session.views]
     still = standing_still(own.scans, own.poses(T_mount), found.tolerance, part_size([own]))
-    background = () if still is None else (still.said(len(own.scans), session.length_unit),)
+    background = () if still is None else (still.said(session.length_unit),)
     said = (*background, *(step.said(names, session.length_unit) for step in found.steps))
     if not doubtful(session, found):
         return said

@@ -39,17 +39,16 @@ class StandingStill:
     box: Array  # (2, 3) lowest and highest corner, scanner frame
     within: Array | None  # (2, 3) corners of a box with the part and without it, where one side of a box parts them
 
-    def said(self, scans: int, length_unit: str) -> str:
+    def said(self, length_unit: str) -> str:
         """In words, and what to do."""
         sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *self.box, strict=True))
-        cut = "cut it out of the scans"
+        mend = f"Cut {', '.join(sides)} {length_unit} out of the scans"
         if self.within is not None:
             low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in self.within)
-            cut = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
+            mend = f"State within = [[{low}], [{high}]] under [scanner] in session.toml"
         return (
-            f"{self.share:.0%} of what the scans show stands still before the scanner whatever the arm did "
-            f"({self.views} of {scans} scans; {', '.join(sides)} {length_unit} in its frame): a wall, a table or a "
-            f"bracket, and no part. Every scan puts it elsewhere in the stitched cloud: {cut}, and run again."
+            f"{self.share:.0%} of what the scans show stands still before the scanner whatever the arm did: a wall, a "
+            f"table or a bracket, which is in the stitched cloud at {self.views} places. {mend}, and run again."
         )
 
 
