@@ -136,7 +136,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         before = kind.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = kind.refit([session], [measurement], model, [state.gate], recorder)
-        own, correction = fitted.sessions[0].measurement, fitted.correction
+        own = fitted.sessions[0].measurement
         end = End(
             begun=begun,
             fitted=fitted,
@@ -145,7 +145,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
             ledger=state.ledger,
             left_out=state.left_out,
             links=state.links,
-            doubts=() if correction is None else doubts(session, own, correction, 0),
+            doubts=doubts(session, own, fitted.correction, 0),
         )
         return collected(session, 0, end, before, recorder)
 

@@ -17,6 +17,7 @@ from stitch.integrity.arm_limits import (
     stands_off,
 )
 from stitch.integrity.deep_check import deep_check
+from stitch.integrity.moved_targets import said_of_targets
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
@@ -86,7 +87,7 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     if doubtful(session, found):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
-    told = _doubts(session, own, found, T_mount)
+    told = (*said_of_targets(session, own.sightings), *_doubts(session, own, found, T_mount))
     if not any(beyond_any_arm(session, step.rotation, step.distance) for step in found.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         found = replace(found, steps=())
@@ -103,10 +104,17 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     )
 
 
-def doubts(session: Session, measurement: Measurement, correction: Correction, index: int) -> tuple[str, ...]:
-    """What to say of a session as a whole under a model, whose views were admitted before."""
+def doubts(session: Session, measurement: Measurement, correction: Correction | None, index: int) -> tuple[str, ...]:
+    """What to say of a session as a whole under a model, whose views were admitted before.
+
+    Args:
+        correction: of surfaces; None where there are none.
+    """
+    targets = said_of_targets(session, measurement.capture.sightings)
+    if correction is None:
+        return targets
     found = _examined(session, measurement, correction, index)
-    return _doubts(session, correction.captures[index], found, correction.model.T_mount)
+    return (*targets, *_doubts(session, correction.captures[index], found, correction.model.T_mount))
 
 
 def _examined(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
@@ -151,7 +159,7 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     rotation, translation = np.sqrt(found.variances[:2])
     if beyond_any_arm(session, rotation, translation):
         refuse(session, check_targets(session))
-    return Admission()
+    return Admission(doubts=said_of_targets(session, found.rows.sightings))
 
 
 def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
