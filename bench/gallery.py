@@ -3,8 +3,8 @@
 Run: python -m bench.gallery [CASE …] [--keep FOLDER]
 
 Each case is made, run and diagnosed by the command line. With --keep, runs and recordings stay in FOLDER, and cases
-that are there already are not made again. Measured objects need the scans of RegHEC, a folder each, in
-$STITCH_SHARED_DATA/reghec; without them their sections are left out.
+that are there already are not made again. Of a case that is not made, the page keeps what it says. Measured objects
+need the scans of RegHEC, a folder each, in $STITCH_SHARED_DATA/reghec.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-from bench.gallery_page import Case, Made, page, picture_of
+from bench.gallery_page import Case, Made, entries, entry, page, picture_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -95,10 +95,6 @@ def _json(file: Path) -> dict[str, object]:
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
-def _others(shown: dict[Case, Made]) -> list[str]:
-    return [case.name for case in CASES if case not in shown]
-
-
 def _cpu() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
@@ -109,22 +105,20 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", metavar="CASE", help="those that are made; all if none is named")
     parser.add_argument("--keep", type=Path, help="where runs and recordings stay")
     given = parser.parse_args()
+    told, gallery = {}, DOCS / "gallery.md"
     with tempfile.TemporaryDirectory() as scratch:
-        home, shown = given.keep or Path(scratch), {}
         for case in CASES:
-            folder = home / case.name
+            if (given.cases and case.name not in given.cases) or (case.hidden is None and not MEASURED.is_dir()):
+                continue
+            folder = (given.keep or Path(scratch)) / case.name
             kept = folder / "made.json"
-            if case.hidden is None and not MEASURED.is_dir():
-                continue
-            if kept.is_file():
-                shown[case] = Made(**json.loads(kept.read_text(encoding="utf-8")))
-            elif not given.cases or case.name in given.cases:
-                shown[case] = make(case, folder)
-            else:
-                continue
+            made = Made(**json.loads(kept.read_text(encoding="utf-8"))) if kept.is_file() else make(case, folder)
             size = picture_of(folder / "run" / "report.html", DOCS / "pictures" / f"gallery-{case.name}.webp")
-            print(f"{case.name}: {shown[case].verdict or shown[case].codes}, picture {size / 1000:.0f} kB", flush=True)
-            (DOCS / "gallery.md").write_text(page(shown, _others(shown)), encoding="utf-8")
+            print(f"{case.name}: {made.verdict or made.codes}, picture {size / 1000:.0f} kB", flush=True)
+            told[case] = entry(case, made)
+            known = entries(gallery.read_text(encoding="utf-8"), CASES) | told
+            shown = {case: known[case] for case in CASES if case in known}
+            gallery.write_text(page(shown, [case.name for case in CASES if case not in shown]), encoding="utf-8")
 
 
 if __name__ == "__main__":

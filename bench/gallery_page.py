@@ -58,35 +58,49 @@ def _text(file: Path) -> str:
     return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
-def page(made: dict[Case, Made], others: list[str]) -> str:
+@dataclass(frozen=True)
+class Entry:
+    """What the page has of a case: a row of its table, and a section."""
+
+    row: str
+    section: str
+
+
+def entry(case: Case, own: Made) -> Entry:
+    """What the page says of a case that was made."""
+    return Entry(_row(case, own), _section(case, own))
+
+
+def entries(text: str, cases: tuple[Case, ...]) -> dict[Case, Entry]:
+    """What a page says already, by case: those that are not made again keep it."""
+    rows = {row[1]: row[0] for row in re.finditer(r"^\| \[(\S+)\]\(#.*$", text, re.MULTILINE)}
+    sections = {part[1]: part[0].rstrip() + "\n" for part in re.finditer(_SECTION, text, re.MULTILINE | re.DOTALL)}
+    return {case: Entry(rows[case.name], sections[case.name]) for case in cases if case.name in rows.keys() & sections}
+
+
+def page(told: dict[Case, Entry], others: list[str]) -> str:
     """The whole page.
 
     Args:
-        others: names of the cases that were not made.
+        others: names of the cases of which nothing is known.
     """
-    synthetic = {case: own for case, own in made.items() if case.hidden is not None}
-    measured = {case: own for case, own in made.items() if case.hidden is None}
+    synthetic = [told[case].section for case in told if case.hidden is not None]
+    measured = [told[case].section for case in told if case.hidden is None]
     missing = f"Not on this page: {', '.join(others)}; `python -m bench.gallery` adds them.\n" if others else ""
-    parts = [_HEAD, missing, _table(made), "## Scenes of the simulator\n", _SCENES, *_sections(synthetic)]
+    table = "\n".join([*_TABLE, *(told[case].row for case in told), ""])
+    parts = [_HEAD, missing, table, "## Scenes of the simulator\n", _SCENES, *synthetic]
     if measured:
-        parts += ["## Measured objects\n", _OBJECTS, *_sections(measured)]
+        parts += ["## Measured objects\n", _OBJECTS, *measured]
     return "\n".join(part for part in parts if part).rstrip() + "\n"
 
 
-def _table(made: dict[Case, Made]) -> str:
-    rows = ["| case | hidden | what `stitch diagnose` says | exits | seconds of one core |", "|---|---|---|---|---:|"]
-    for case, own in made.items():
-        hidden = "measured" if case.hidden is None else case.hidden.partition("=")[0] or "nothing"
-        named = f": {', '.join(own.effects)}" if own.effects else ""
-        told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}"
-        exits = ", ".join(f"{name} {code}" for name, code in own.codes.items())
-        spent = sum(seconds for name, seconds in own.seconds.items() if name != "synth")
-        rows.append(f"| [{case.name}](#{case.name}) | {hidden} | {told} | {exits} | {spent:.0f} |")
-    return "\n".join([*rows, ""])
-
-
-def _sections(made: dict[Case, Made]) -> list[str]:
-    return [_section(case, own) for case, own in made.items()]
+def _row(case: Case, own: Made) -> str:
+    hidden = "measured" if case.hidden is None else case.hidden.partition("=")[0] or "nothing"
+    named = f": {', '.join(own.effects)}" if own.effects else ""
+    told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}"
+    exits = ", ".join(f"{name} {code}" for name, code in own.codes.items())
+    spent = sum(seconds for name, seconds in own.seconds.items() if name != "synth")
+    return f"| [{case.name}](#{case.name}) | {hidden} | {told} | {exits} | {spent:.0f} |"
 
 
 def _section(case: Case, own: Made) -> str:
@@ -99,6 +113,12 @@ def _section(case: Case, own: Made) -> str:
         f"`{case.name}/run/recording.rrd`, {size}.\n\n{pictured}{told}{evidence}\n"
     )
 
+
+_TABLE = (
+    "| case | hidden | what `stitch diagnose` says | exits | seconds of one core |",
+    "|---|---|---|---|---:|",
+)
+_SECTION = r"^### (\S+)$.*?(?=^##|\Z)"
 
 _HEAD = """# Gallery
 
