@@ -61,6 +61,10 @@ def reveal(
         print(json.dumps(judged, indent=1))
         return
     table = Table("", "", show_header=False, box=None)
+    if judged["in_the_model"] and not judged["named"]:
+        del judged["named"]
+    # Values of what is in the model follow, each beside what was found.
+    judged["hidden"] = {name: {} if name in judged["in_the_model"] else own for name, own in judged["hidden"].items()}
     for key, value in judged.items():
         # Names of effects stay as they are.
         table.add_row(key if "." in key else key.replace("_", " "), _told(value))
@@ -70,7 +74,7 @@ def reveal(
 def _told(value: object) -> str:
     """Plain data for people."""
     if isinstance(value, dict):
-        return "; ".join(f"{name} {_told(own)}" for name, own in value.items()) or "nothing"
+        return "; ".join(f"{name} {_told(own)}" if own != {} else name for name, own in value.items()) or "nothing"
     if isinstance(value, list):
         return ", ".join(_told(own) for own in value) or "nothing"
     return f"{value:.3g}" if isinstance(value, float) else str(value)

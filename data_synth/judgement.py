@@ -9,6 +9,7 @@ import numpy as np
 from data_synth.nature import LAWS
 from stitch import frames
 from stitch.errors import InputError
+from stitch.units import amount
 
 
 def judge(run: Path, truth: Path) -> dict[str, Any]:
@@ -33,6 +34,7 @@ def judge(run: Path, truth: Path) -> dict[str, Any]:
     named = set(diagnosis.get("effects", []))
     judged: dict[str, Any] = {
         "hidden": hidden,
+        "in_the_model": sorted(fitted),
         "verdict": diagnosis.get("verdict", "not diagnosed"),
         "named": sorted(named),
         "judgement": _judgement(hidden, diagnosis.get("verdict"), named, fitted),
@@ -45,8 +47,8 @@ def judge(run: Path, truth: Path) -> dict[str, Any]:
         for name, value in parameters.items():
             got = fitted.get(effect, {}).get(name)
             if got:
-                sigma = "" if got["sigma"] is None else f" ± {got['sigma']:.1g}"
-                judged[f"{effect}.{name}"] = f"{got['value']:.3g}{sigma}, true {value:.3g}"
+                found, true = amount(got["value"], got["sigma"], got["unit"]), amount(value, None, got["unit"])
+                judged[f"{effect}.{name}"] = f"{found}, true {true}"
     return judged
 
 

@@ -38,6 +38,7 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
             break
         result, state = tried, state_of(tried)
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
+        lines.append(f"Added {found.effects[0]}. With it:")
         del found
         found = diagnose(state)
     else:

@@ -8,6 +8,7 @@ import typer
 from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.errors import InputError
 
+AT_MOST = 5  # effects that --suggested adds one by one
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd anew.")]
 
 
@@ -16,7 +17,7 @@ def add(
     effects: Annotated[list[str] | None, typer.Argument(metavar="EFFECT...", help="Effects to add.")] = None,
     suggested: Annotated[bool, typer.Option("--suggested", help="Diagnose and add until nothing is left.")] = False,
     group: Annotated[bool, typer.Option("--group", help="Diagnose; add effects that it cannot tell apart.")] = False,
-    at_most: Annotated[int, typer.Option("--at-most", help="Limit for --suggested.")] = 5,
+    at_most: Annotated[int, typer.Option("--at-most", help="Limit for --suggested.")] = AT_MOST,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     recording: _Recording = True,

@@ -50,10 +50,10 @@ class Step:
         off = f"{length_text(self.distance, length_unit)} and {angle_text(self.rotation, 2)}"
         other = "scanner" if self.moved == "part" else "part"
         unsure = "" if self.told else f" (or the {other}: these views do not tell which)"
-        further = " or add part_slip" if self.moved == "part" and self.told else ""
+        further = ", or add the effect part_slip" if self.moved == "part" and self.told else ""
         return (
             f"From view {after} on the {self.moved} sits elsewhere{unsure}, {off} off at the part: no hand-eye holds "
-            f"before and after. Make two sessions of it, up to {before} and from {after} on{further}."
+            f"before and after. Make two sessions of it, one up to {before} and one from {after} on{further}."
         )
 
     def columns(self, model: ViewModel) -> Array:

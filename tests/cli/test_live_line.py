@@ -21,7 +21,7 @@ def said(monkeypatch):
 
     class Line:
         say = staticmethod(out.append)
-        stop = staticmethod(lambda: out.append(""))
+        stop = loops_ended = staticmethod(lambda: out.append(""))
 
     monkeypatch.setattr(live_line, "live_line", Line)
     monkeypatch.setattr(live_line.time, "monotonic", lambda: float(next(clock)))
@@ -58,10 +58,11 @@ def test_nobody_watches_nobody_counts(said):
 
 CODE = """
 import time
-from stitch.cli.terminal.live_line import TimeLeft
+from stitch.cli.terminal.live_line import TimeLeft, doing
 from stitch.system.steps import steps, watched
-with watched(TimeLeft()):
+with watched(TimeLeft()), doing("diagnosing [2]"):
     for _ in steps("scans", range(4)): time.sleep(0.4)
+    time.sleep(1.2)
 """
 
 
@@ -70,6 +71,9 @@ def test_a_terminal_shows_it_and_a_pipe_does_not():
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
     subprocess.run([sys.executable, "-c", CODE], stderr=theirs, env=environment, check=True)
     os.close(theirs)
-    assert b"scans: 3 of 4, 0:00 left" in os.read(ours, 100_000)
+    shown = os.read(ours, 100_000)
+    # Before a loop and after it the line says what is done, and the time goes on.
+    first, loop = shown.index(b"diagnosing [2]; 0:00"), shown.index(b"scans: 3 of 4, 0:00 left")
+    assert first < loop < shown.index(b"diagnosing [2]; 0:02")
     os.close(ours)
     assert not subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True).stderr

@@ -4,23 +4,23 @@ from types import SimpleNamespace
 
 import pytest
 
+from data_synth import commands, made_session, write
 from data_synth import demo as told
-from data_synth import made_session, write
-from stitch.cli import change, diagnose
-from stitch.cli.actions import run_sessions
+from stitch.cli.actions import changed_run, diagnosed_run, run_sessions
 from stitch.errors import InputError
 
 
 def test_the_next_command_is_the_last_line_and_the_only_one(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(made_session, "make", lambda *_: SimpleNamespace(clouds=[None] * 3))
-    for module, name in ((write, "write_session"), (write, "write_truth"), (change, "add"), (diagnose, "diagnose_run")):
-        monkeypatch.setattr(module, name, lambda *_, **options: None)
-    monkeypatch.setattr("data_synth.commands.reveal", lambda *_: None)
-    monkeypatch.setattr(run_sessions, "run_sessions", lambda sessions, options: asked.append(options))
+    for module, name in ((write, "write_session"), (write, "write_truth"), (commands, "reveal")):
+        monkeypatch.setattr(module, name, lambda *_: None)
+    monkeypatch.setattr(run_sessions, "run_sessions", lambda sessions, options: asked.append(options.says_next))
+    for module, name in ((diagnosed_run, "diagnosed_run"), (changed_run, "add_chosen")):
+        monkeypatch.setattr(module, name, lambda *_, says_next=True, **others: asked.append(says_next))
     told.demo(tmp_path / "demo here")
     lines = capsys.readouterr().err.splitlines()
-    assert [options.says_next for options in asked] == [False]
+    assert asked == [False, False, False]
     assert [line for line in lines if "Next:" in line] == [lines[-1]]
     assert lines[-1] == f"Next: stitch review '{tmp_path}/demo here/run'"
 

@@ -18,6 +18,19 @@ def test_reveal_prints_json_alone(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["judgement"] == "right"
 
 
+def test_people_read_what_was_hidden_once_and_with_units(tmp_path, capsys):
+    judged(tmp_path, fitted=FITTED, diagnosis={**NAMED, "verdict": "adequate", "effects": []})
+    with pytest.raises(SystemExit):
+        main(["reveal", str(tmp_path / "run"), str(tmp_path / "truth.json")])
+    told = capsys.readouterr().err.split("\n")
+    assert [line.split() for line in told[:3]] == [
+        ["hidden", "joint_compliance"],
+        ["in", "the", "model", "joint_compliance"],
+        ["verdict", "adequate"],
+    ]
+    assert not any(line.strip().startswith("named") for line in told)
+
+
 NAMED = {"format": "stitch-diagnosis/1", "verdict": "missing_effect", "effects": ["joint_compliance"]}
 
 
@@ -92,7 +105,7 @@ def test_judgement(tmp_path, hidden, verdict, named, fitted, judgement):
 def test_judge_measures_the_hand_eye_in_millimetres(tmp_path, unit):
     got = judged(tmp_path, unit=unit, off=0.25, fitted=FITTED)
     assert got["hand_eye_error_mm"] == pytest.approx(0.25, abs=1e-4)
-    assert "1.1e-06 ± 2e-07, true 1e-06" in got["joint_compliance.c2"]
+    assert "1.1 ± 0.2 µrad/(N m), true 1 µrad/(N m)" in got["joint_compliance.c2"]
     assert "joint_compliance.c3" not in got
 
 

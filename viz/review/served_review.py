@@ -39,8 +39,9 @@ def served_review(run: Path, port: int, *, browser: bool, effects_file: Path | N
         timeout_graceful_shutdown=_GRACE,
     )
     print(f"  {address}", file=sys.stderr, flush=True)
-    if browser:
-        webbrowser.open(address)
+    opened = browser and webbrowser.open(address)
+    how = "Ctrl-C ends it." if opened else "Open this address in a browser on this machine; Ctrl-C ends it."
+    print(how, file=sys.stderr, flush=True)
     uvicorn.Server(config).run(sockets=[listening])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from stitch.cli.actions.diagnosed_run import write_diagnosis
 from stitch.cli.terminal.ledger_summary import show_ledger
+from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.recorders import recorder_for
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import Diagnosis
@@ -42,7 +43,14 @@ def add_named(
 
 
 def add_chosen(
-    run: Path, at_most: int | None, effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
+    run: Path,
+    at_most: int | None,
+    effects_file: Path | None = None,
+    *,
+    trust: bool = False,
+    recording: bool = True,
+    as_json: bool = False,
+    says_next: bool = True,
 ) -> None:
     """Add what a diagnosis chooses: at most so many effects one by one, or None: the group that it cannot tell apart.
 
@@ -50,21 +58,24 @@ def add_chosen(
         InputError, NoResultError: as `stitch add` ends.
     """
     with run_folder.held(run):
-        state = load_state(run, effects_file, trust=trust)
-        run_folder.load_early("stitch.reports")
-        chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
-        _suggested(run, state, chosen, recording, as_json)
+        with doing("diagnosing"):
+            state = load_state(run, effects_file, trust=trust)
+            run_folder.load_early("stitch.reports")
+            chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
+        found = _suggested(run, state, chosen, recording, as_json)
+    if says_next and not as_json:
+        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
 
 
 def _suggested(
     run: Path, state: State, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
-) -> None:
+) -> Diagnosis:
     """Write and show what a diagnosis chose; what was tried on the way leaves no recording, the end does."""
     result, lines, found = chosen
     for line in lines:
         console().print(line, soft_wrap=True)
     if result is not None:
-        with run_folder.changed(run) as scratch:
+        with doing("writing cloud and page"), run_folder.changed(run) as scratch:
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
                 before = replace(state_of(result), ledger=result.ledger[:-1])
@@ -77,8 +88,7 @@ def _suggested(
     else:
         console().print("Nothing was added: the model is as it was.", soft_wrap=True)
     write_diagnosis(found, state if result is None else state_of(result), run)
-    if not as_json:
-        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
+    return found
 
 
 def drop_named(
@@ -102,7 +112,7 @@ def drop_named(
 def _change(run: Path, state: State, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it."""
     run_folder.load_early("stitch.reports")
-    with run_folder.changed(run) as scratch:
+    with doing("reading the run"), run_folder.changed(run) as scratch:
         result = change(state, effects, recorder_for(scratch, recording))
         run_folder.write_with_page(result, scratch)
     _show(result, as_json)

@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of, curve_text
@@ -22,7 +23,7 @@ from stitch.writing.run_folder import extend, held, load_early
 _SHOWN = 6
 
 
-def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool, says_next: bool = True) -> None:
     """Diagnose a run and show what was found.
 
     Raises:
@@ -33,6 +34,7 @@ def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json:
         emit(to_json(document))
     else:
         show(found, unit)
+    if says_next and not as_json:
         console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
 
 
@@ -62,7 +64,7 @@ def _nothing_next(found: Diagnosis) -> str:
 
 
 def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
-    with held(run):
+    with held(run), doing("diagnosing"):
         state = load_state(run, effects_file, trust=trust)
         load_early("stitch.diagnosis_reports")
         found = diagnose(state)
@@ -103,7 +105,7 @@ def show(found: Diagnosis, length_unit: str) -> None:
     if found.verdict == "adequate":
         _show_missed(terminal, found, length_unit)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
-        terminal.print(f"What is left follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
+        terminal.print(f"What the present model leaves follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
     for curve in found.curves[:2]:
         terminal.print(curve_text(curve), soft_wrap=True)
     for p in found.next[:3]:

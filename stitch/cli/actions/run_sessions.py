@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from stitch.cli.run_options import RunOptions
+from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.recorders import recorder_for
 from stitch.cli.terminal.run_summary import show
 from stitch.cli.terminal.streams import emit
@@ -41,7 +42,10 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     target = asked.output or Path("../runs" if here else "runs") / "+".join(names)
     model, kept, own_effects = _given(asked)
     run_folder.load_early("stitch.reports")
-    with run_folder.new_folder(target, sessions, asked.force) as scratch:
+    with (
+        doing(f"{'+'.join(names)}: reading the scans"),
+        run_folder.new_folder(target, sessions, asked.force) as scratch,
+    ):
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, asked.recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, asked.effects, asked.keep, kept)

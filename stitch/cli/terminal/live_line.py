@@ -3,11 +3,28 @@
 import atexit
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 # What ends sooner (s) needs no line.
 _SOON = 1.0
+
+
+@dataclass(frozen=True)
+class _Course:
+    """What is done, and for how long: how many iterations there will be nobody knows."""
+
+    text: str
+    begun: float
+
+    def __rich__(self) -> Any:
+        from rich.text import Text
+
+        seconds = round(time.monotonic() - self.begun)
+        return Text(f"{self.text}; {seconds // 60}:{seconds % 60:02d}")
 
 
 class LiveLine:
@@ -16,8 +33,21 @@ class LiveLine:
     def __init__(self) -> None:
         self._status: Any = None
         self._shown = False
+        self._course: _Course | None = None
 
-    def say(self, text: str) -> None:
+    def begin(self, text: str) -> None:
+        """Show a text with the time since it was first asked for, until `stop`; loops stand in its place meanwhile."""
+        self._course = _Course(text, time.monotonic() if self._course is None else self._course.begun)
+        self.say(self._course)
+
+    def loops_ended(self) -> None:
+        """What stood before the loops stands again; nothing if there was nothing."""
+        if self._course is None:
+            self.stop()
+        else:
+            self.say(self._course)
+
+    def say(self, text: "str | _Course") -> None:
         """Show a text in place of the last."""
         if not sys.stderr.isatty():
             return
@@ -35,6 +65,7 @@ class LiveLine:
 
     def stop(self) -> None:
         """Clear the line; the next text begins it anew."""
+        self._course = None
         if self._status is not None and self._shown:
             self._status.stop()
             self._shown = False
@@ -44,6 +75,16 @@ class LiveLine:
 def live_line() -> LiveLine:
     """The one line of this process: two would fight for the cursor."""
     return LiveLine()
+
+
+@contextmanager
+def doing(text: str) -> Iterator[None]:
+    """While the block lasts, the line says what is done, and for how long, unless something more precise does."""
+    live_line().begin(text)
+    try:
+        yield
+    finally:
+        live_line().stop()
 
 
 class TimeLeft:
@@ -62,7 +103,7 @@ class TimeLeft:
             self._begun.pop(label, None)
             self._said.pop(label, None)
             if not self._said:
-                live_line().stop()
+                live_line().loops_ended()
             return
         text = told(label, done, total, now - self._begun.get(label, now))
         if text is not None:

@@ -1,6 +1,5 @@
 """Progress on a terminal, as one of the recorders."""
 
-import time
 from math import isfinite
 
 from stitch.cli.terminal.live_line import live_line
@@ -15,27 +14,21 @@ class Progress:
 
     def __init__(self) -> None:
         self.unit = "mm"
-        self.begun = time.monotonic()
 
     def start(self, session: Session) -> None:
         """Name what is being done."""
         self.unit = session.length_unit
-        self._say(f"{session.name}: {len(session.views)} views, finding the hand-eye")
+        live_line().begin(f"{session.name}: {len(session.views)} views, finding the hand-eye")
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Show where the iteration stands."""
         # Labelled points have their partners by name.
         within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
-        self._say(f"{stage} {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
+        live_line().begin(f"{stage} {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
         """A stage has ended."""
 
     def finish(self, run: Run) -> None:
-        """Clear the line."""
-        live_line().stop()
-
-    def _say(self, text: str) -> None:
-        """How many iterations there will be nobody knows: the time that has passed."""
-        seconds = round(time.monotonic() - self.begun)
-        live_line().say(f"{text}; {seconds // 60}:{seconds % 60:02d}")
+        """What follows takes its time too."""
+        live_line().begin(f"{run.session.name}: writing cloud and page")
