@@ -83,8 +83,7 @@ def main() -> None:
         with served(folder / "run") as (address, process):
             page = browser.new_page(viewport=WIDE)
             camera = Camera(page, keep=given.session is None)
-            if given.session is None:
-                choices(address, process)
+            choices(folder / "run", address, process)
             page.goto(address)
             story(camera, given.effect)
             print(memory(process))

@@ -44,9 +44,10 @@ def memory(process: subprocess.Popen[str]) -> str:
     return f"{sizes['VmRSS']:.0f} MB, {sizes['VmHWM']:.0f} MB at most"
 
 
-def choices(address: str, process: subprocess.Popen[str]) -> None:
+def choices(run: Path, address: str, process: subprocess.Popen[str]) -> None:
     """What the fields of everything, of a view and of a place cost the server."""
-    for choice in ({}, {"views": ["v003"]}, {"place": [0.0, 0.0, 0.0], "within": 50.0}):
+    view = json.loads((run / "result.json").read_text(encoding="utf-8"))["views"][0]["view"]
+    for choice in ({}, {"views": [view]}, {"place": [0.0, 0.0, 0.0], "within": 50.0}):
         before = processor_seconds(process)
         asked = urllib.request.Request(f"{address}chosen", json.dumps(choice).encode(), method="POST")
         told = json.load(urllib.request.urlopen(asked))["chosen"]

@@ -4,13 +4,17 @@ import numpy as np
 import rerun as rr
 from matplotlib import colormaps
 
+from viz.colours import UNSEEN
+
 _LENGTH, _HEIGHT = 256, 14
 
 
-def log_colour_bar(recording: rr.RecordingStream, path: str, name: str, ticks: list[str]) -> None:
-    """The colours of a map from left to right, with labels at equal distances below."""
+def log_colour_bar(recording: rr.RecordingStream, path: str, name: str, ticks: list[str], grey: str) -> None:
+    """The colours of a map from left to right, with labels at equal distances below, and what grey means below them."""
     row = np.asarray(colormaps[name](np.linspace(0, 1, _LENGTH))[:, :3] * 255, np.uint8)
     recording.log(f"{path}/colours", rr.Image(np.tile(row, (_HEIGHT, 1, 1))), static=True)
     places = np.column_stack([np.linspace(0, _LENGTH, len(ticks)), np.full(len(ticks), _HEIGHT + 6.0)])
     marks = rr.Points2D(places, labels=ticks, radii=0.4, colors=[(128, 128, 128)], show_labels=True)
     recording.log(f"{path}/ticks", marks, static=True)
+    unseen = rr.Points2D([(_LENGTH / 2, _HEIGHT + 34.0)], labels=[grey], radii=4.0, colors=[UNSEEN], show_labels=True)
+    recording.log(f"{path}/grey", unseen, static=True)

@@ -75,6 +75,7 @@ def part_data(
         "full": full_colour(first) * um,
         "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour(first) * um),
         "colours": colour_stops(),
+        "unseen": bool(np.isnan(first.overall).any()),
         "radius": f"{history.patches.radius:.3g} {length_unit}",
         "begin": 1,
         "end": len(history.steps) - 2,

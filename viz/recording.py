@@ -76,7 +76,9 @@ class RerunRecorder:
             log_model(rec, run, scene, camera.up)
             full = scene.limit * um
             fell = tuple(stage for stage, rms in self.rms.items() if rms[-1] < _FELL * rms[0])
-            log_colour_bar(rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"])
+            log_colour_bar(
+                rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only"
+            )
             rec.send_blueprint(model_blueprint(scene, camera, run, fell))
         file.write()
 

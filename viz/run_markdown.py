@@ -6,8 +6,6 @@ from stitch.runs.run import Run
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
 
-_UNSEEN = "Grey: seen by one view only."
-
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
     """Verdict, how the error fell, what could not be seen."""
@@ -18,7 +16,7 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
     if history is not None:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]
         lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
-        lines += ["", _UNSEEN, ""]
+        lines += [""]
     lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
     lines += [f"- {note}" for note in run.notes]
     return "\n".join(lines)

@@ -78,6 +78,9 @@ function showPart(root, data, more, eye) {
       text.textContent = end;
       return text;
     }));
+    const grey = bar.querySelector("small");
+    grey.hidden = !data.unseen;
+    grey.textContent = signed ? "nothing to compare with" : "seen by one view only";
   }
   const digits = x => x === 0 ? "0" : Number(x.toPrecision(3)).toString();
   const length = um => um >= 999.5 ? `${digits(um / 1e3)} mm` : `${digits(um)} µm`;
