@@ -43,6 +43,14 @@ def at(page):
     return page.evaluate("Number(document.querySelector('#part input[type=range]').value)")
 
 
+def drawn(page):
+    """The part as it is seen."""
+    canvas = page.locator("#part canvas")
+    canvas.scroll_into_view_if_needed()
+    page.wait_for_timeout(1000)
+    return canvas.screenshot()
+
+
 def test_it_waits_until_the_part_is_in_sight_then_runs_evenly_to_the_present_model(browser, page_after_an_effect):
     page = opened(browser, page_after_an_effect)
     page.wait_for_timeout(1500)
@@ -54,17 +62,19 @@ def test_it_waits_until_the_part_is_in_sight_then_runs_evenly_to_the_present_mod
     assert seen == sorted(seen) and seen[0] == 1 and any(1 < place < 2 for place in seen)
     assert page.locator("#part [data-title]").inner_text().startswith("+ backlash")
     assert page.locator("#part [data-steps] button[aria-pressed=true]").inner_text() == "+ backlash"
+    still = opened(browser, page_after_an_effect, reduced_motion="reduce")
+    assert drawn(page) == drawn(still)
     page.close()
+    still.close()
 
 
 def test_it_stands_still_where_less_motion_is_asked_for_and_both_ends_are_drawn(browser, page_after_an_effect):
     page = opened(browser, page_after_an_effect, reduced_motion="reduce")
     assert at(page) == 2
-    canvas, shots = page.locator("#part canvas"), []
+    shots = []
     for name in ("+ backlash", "hand-eye alone", "+ backlash"):
         page.get_by_role("button", name=name, exact=True).click()
-        page.wait_for_timeout(1000)
-        shots.append(canvas.screenshot())
+        shots.append(drawn(page))
     assert shots[0] == shots[2] != shots[1]
     page.close()
 

@@ -53,6 +53,8 @@ def _draw_slaves(ax: Axes, steps: Array, sizes: Array, names: Sequence[str], *, 
             ax.plot(steps, sizes[:, :, i].max(axis=0), label=name, **_STYLES[i % len(_STYLES)])
     # An error of zero shall look like zero, not like magnified rounding.
     ax.set_ylim(0, max(0.05, 1.05 * sizes.max()))
+    if np.allclose(sizes, 0.0, atol=1e-6):
+        ax.text(0.5, 0.5, "none: what is only moved does not turn", transform=ax.transAxes, ha="center", color=DARK)
     ax.grid(alpha=0.3)
 
 
