@@ -97,7 +97,9 @@ def page(told: dict[Case, Entry], others: list[str]) -> str:
 def _row(case: Case, own: Made) -> str:
     hidden = "measured" if case.hidden is None else case.hidden.partition("=")[0] or "nothing"
     named = f": {', '.join(own.effects)}" if own.effects else ""
-    told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}"
+    follows = own.plain.partition("what is left follows ")[2].rstrip(".")
+    traced = f"; it follows {follows}" if follows else ""
+    told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}{traced}"
     exits = ", ".join(f"{name} {code}" for name, code in own.codes.items())
     spent = sum(seconds for name, seconds in own.seconds.items() if name != "synth")
     return f"| [{case.name}](#{case.name}) | {hidden} | {told} | {exits} | {spent:.0f} |"
@@ -124,8 +126,8 @@ _HEAD = """# Gallery
 
 Scenes of the simulator and measured objects, run and diagnosed by the command line. Made by
 `python -m bench.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in the
-stitched cloud, light where the views agree, dark red where they do not, each with a scale of its own
-([how to read them](report.md)).
+stitched cloud, light where the views agree, dark red where they do not, grey where one view alone saw it, each with a
+scale of its own ([how to read them](report.md)).
 
 Recordings are not kept in the project; `python -m bench.gallery --keep FOLDER` makes them, then
 `stitch view FOLDER/blade/run` shows one.

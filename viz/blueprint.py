@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from stitch.comparison.model_history import change_of
 from stitch.frames import Array
 from stitch.runs.run import Run
+from viz.colour_bar import HIGH, WIDE
 from viz.model_scene import ModelScene, shown_steps
 from viz.model_timeline import FRAMES
 from viz.part_camera import Camera
@@ -96,7 +97,8 @@ def _eye(scene: ModelScene, camera: Camera) -> rrb.EyeControls3D:
 
 
 def _bar(origin: str, name: str) -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(origin=origin, name=name)
+    bounds = rrb.VisualBounds2D(x_range=WIDE, y_range=HIGH)
+    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
 
 
 def _bars(origin: str, name: str, *contents: str) -> rrb.BarChartView:
@@ -132,16 +134,19 @@ def _cell(points: Array) -> rrb.Vertical:
 
 
 def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
-    """Every model that was fitted, in the fit and on views left out; below, the last fit closing in, and register."""
+    """Every model that was fitted, in the fit and on views left out; below, the last fit closing in, and register.
+
+    A single model stands in words beside the part; a bar alone says nothing.
+    """
     models = ", ".join(f"{i} {change_of(run.ledger, i)}" for i in range(len(run.ledger)))
     fell = [
         _bars("steps/residual_rms", f"Rms of each model in the fit (µm): {models}"),
         _bars("steps/heldout_rms", "The same on views left out (µm)"),
     ]
     closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
-    return rrb.Vertical(
-        rrb.Horizontal(*fell), rrb.Horizontal(*closed, _moved()), row_shares=[2, 1], name="How the error fell"
-    )
+    last = rrb.Horizontal(*closed, _moved())
+    rows = [rrb.Horizontal(*fell), last] if len(run.ledger) > 1 else [last]
+    return rrb.Vertical(*rows, row_shares=[2, 1][: len(rows)], name="How the error fell")
 
 
 def _moved() -> rrb.BarChartView:
