@@ -90,9 +90,9 @@ class Likelihood:
 
         d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
         """
-        variances, mixed = np.exp(self.log_variances), self.problem.mixed
         if not np.isfinite(self.inverse.logdet):
-            return np.zeros(len(variances))
+            return np.zeros(len(self.log_variances))
+        variances, mixed = np.exp(self.log_variances), self.problem.mixed
         (blocks, m), own = mixed.z.shape, np.zeros(len(variances))
         for start in range(0, blocks, _IN_CACHE):
             at, rows = slice(start, start + _IN_CACHE), slice(m * start, m * (start + _IN_CACHE))
