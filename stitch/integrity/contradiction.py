@@ -14,17 +14,25 @@ from stitch.frames import Array
 from stitch.integrity.shown import Shown, shown_by
 from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.match import near_pairs, sample
+from stitch.statistics.tails import binomial_tail
 
 # Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
 # surface, as a share of the part's size.
-_PROBES, _ASKED, _REACH = 500, 20, 0.03
+_PROBES, _ASKED, _REACH = 500, 20, 0.1
 # A scan contradicts the others if this share of what they show of it stands elsewhere; one that was put where it fits
 # best, and still does by the second, is torn.
 CONTRADICTS, STILL = 0.2, 0.05
+# The chance of as many where the share is no larger: of a scan seen from its edge others show few points.
+_CHANCE = 1e-4
 
 
 def contradicting(
-    scans: Sequence[Scan], poses: Array, tolerance: float, size: float, share: float = CONTRADICTS
+    scans: Sequence[Scan],
+    poses: Array,
+    tolerance: float,
+    size: float,
+    share: float = CONTRADICTS,
+    groups: Sequence[Sequence[int]] = (),
 ) -> tuple[int, ...]:
     """Views that contradict the others, most of all first; each is asked without those before it.
 
@@ -33,24 +41,29 @@ def contradicting(
         tolerance: distance along the normal that is the same place, length_unit.
         size: of the part, length_unit.
         share: of what others show of a view that stands elsewhere.
+        groups: views that link each other: only within one is each asked, since groups may stand apart. Empty: all are.
     """
     said = _pairs(scans, poses, tolerance, _REACH * size)
+    for group in groups:
+        for v in group:
+            said[v] = {w: shown for w, shown in said[v].items() if w in group}
     out = list[int]()
     while True:
-        shares = [0.0 if v in out else _share(own, out) for v, own in enumerate(said)]
+        shares = [0.0 if v in out else _share(own, out, share) for v, own in enumerate(said)]
         worst = int(np.argmax(shares))
-        if shares[worst] < share:
+        if not shares[worst]:
             return tuple(out)
         out.append(worst)
 
 
-def _share(own: dict[int, Shown], without: Sequence[int]) -> float:
-    """Of the points that other views show too, the share that all of these show elsewhere."""
+def _share(own: dict[int, Shown], without: Sequence[int], least: float) -> float:
+    """Of the points that other views show too, the share that all of these show elsewhere; 0 up to the least one."""
     others = [shown for w, shown in own.items() if w not in without]
     if not others:
         return 0.0
     best = np.max(others, axis=0)
-    return float(np.sum(best == 1) / max(np.sum(best > 0), 1))
+    elsewhere, asked = int(np.sum(best == 1)), int(np.sum(best > 0))
+    return elsewhere / asked if binomial_tail(elsewhere - 1, asked, least) < _CHANCE else 0.0
 
 
 def _pairs(scans: Sequence[Scan], poses: Array, tolerance: float, reach: float) -> list[dict[int, Shown]]:

@@ -26,6 +26,11 @@ def normal_limit(p: float) -> float:
     return float(-special.ndtri(p))
 
 
+def binomial_tail(x: int, count: int, share: float) -> float:
+    """P(X > x) of so many trials with a chance each."""
+    return float(special.bdtrc(x, count, share))
+
+
 def f_tail(x: float, numerator: float, denominator: float) -> float:
     """P(F > x) with degrees of freedom of numerator and denominator."""
     return float(special.fdtrc(numerator, denominator, x))
