@@ -21,7 +21,7 @@ def judged_by_size(session: Session, found: Snooping) -> Snooping:
 
 def contradicts(session: Session, found: Snooping) -> bool:
     """True if the poses contradict the scans beyond what any arm does."""
-    lost = len(found.left_out) > len(session.views) / 2
+    lost = len(found.not_belonging) > len(session.views) / 2
     return lost or beyond_any_arm(session, found.rotation, found.translation)
 
 

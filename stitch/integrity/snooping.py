@@ -14,6 +14,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.blunders import Found, find_blunders
+from stitch.integrity.expected_poses import expected_poses
 from stitch.integrity.homes import Homes, find_homes
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import judge, place, surface_of
@@ -54,11 +55,19 @@ class Snooping:
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Views that are not to be fused: misplaced, not linked, or not between the same steps as most are."""
-        out = {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
+        """Views that are not to be fused: they do not belong, or not between the same steps as most are."""
+        return tuple(sorted(self.not_belonging | (set(range(self.linkage.views)) - set(self.between))))
+
+    @property
+    def between(self) -> range:
+        """The views between the same two steps, or ends, as most are."""
         ends = [0, *(step.start for step in self.steps), self.linkage.views]
-        most = max((range(a, b) for a, b in pairwise(ends)), key=len)
-        return tuple(sorted(out | (set(range(self.linkage.views)) - set(most))))
+        return max((range(a, b) for a, b in pairwise(ends)), key=len)
+
+    @property
+    def not_belonging(self) -> set[int]:
+        """Views that are misplaced or not linked."""
+        return {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
 
     def settled(self, sure: Callable[[Misplaced], bool]) -> "Snooping":
         """The same with those suspected views misplaced of which one is sure."""
@@ -103,13 +112,14 @@ def snoop(
     homes = find_homes(capture, model_poses, freed)
     model = view_model(capture, T_mount, homes.freed)
     tests = pose_tests(model, homes, usual)
-    standing_out = _standing_out(capture, model_poses, homes, tests)
+    expected = expected_poses(model, model_poses, homes.freed, tests) if tests.steps else model_poses
+    standing_out = _standing_out(capture, expected, homes, tests)
     # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
     torn = {v for v in homes.torn if v not in homes.homeless}
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
         again = find_blunders(model.with_usual(usual.twists(homes.freed)), tests.alone, tests.steps)
-        sure &= {b.view for b in again.blunders} | set(homes.linkage.unlinked) | torn
+        sure &= {b.view for b in again.blunders} | {b.view for b in tests.off} | torn
     groups = homes.groups
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.homeless if (v,) in groups]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
@@ -127,15 +137,13 @@ def snoop(
     )
 
 
-def _standing_out(capture: Capture, model_poses: Array, homes: Homes, tests: PoseTests) -> list[Misplaced]:
+def _standing_out(capture: Capture, expected: Array, homes: Homes, tests: PoseTests) -> list[Misplaced]:
     """Views that stand off and torn ones, with where the surface of the others puts them."""
     off = sorted((*tests.off, *tests.found.blunders), key=lambda b: b.view)
     refined = [_refined(capture, homes.freed, b.view, homes.tolerance) for b in off]
-    out = [_misplaced(capture, model_poses[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
+    out = [_misplaced(capture, expected[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
     known = {b.view for b in off} | set(homes.homeless)
-    return out + [
-        _misplaced(capture, model_poses[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known
-    ]
+    return out + [_misplaced(capture, expected[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known]
 
 
 def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:

@@ -29,6 +29,8 @@ _SIDE, _MOST = 2, 3
 # Fewer views than this show no step beside their scatter.
 _FEWEST = 6
 _BOTH: tuple[What, What] = ("part", "scanner")
+# Less of its columns than this outside the mean is rounding.
+_NEW = 1e-6
 # −2 log likelihood of part against scanner at odds of 20 to 1; closer ones these views do not tell apart.
 _TOLD = 2 * np.log(20)
 
@@ -64,7 +66,7 @@ class Step:
 def find_steps(
     model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
 ) -> tuple[Step, ...]:
-    """Change points in the order of time.
+    """Change points in the order of time, beside single views that are off.
 
     Args:
         model: with all that may happen without a step.
@@ -72,10 +74,9 @@ def find_steps(
         singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
         chance: that a session without a step shows one.
     """
-    found = _searched(model, first, chance)
-    if singles[1] and (not found or _less_likely(model, found, first, singles)):
-        first = singles[0]
-        found = _searched(model, first, chance)
+    found, columns = _searched(model, first, chance)
+    if singles[1] and (not found or _criterion(model, singles[0]) < _criterion(model, columns)):
+        found, _ = _searched(model, singles[0], chance)
     return tuple(sorted(found, key=lambda s: s.start))
 
 
@@ -84,58 +85,89 @@ def step_columns(model: ViewModel, start: int, moved: str) -> Array:
     return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
 
 
-def _searched(model: ViewModel, first: Array | None, chance: float) -> list[Step]:
-    """Steps on top of columns that are in the mean already.
+@dataclass(frozen=True)
+class _Pick:
+    """What explains most beside what was picked before: a step, or a single view that is off."""
 
-    As with single views (Rosner 1983) the search goes on beside a step that does not stand out yet: what is moved there
-    and back are two, and each hides in the scatter that the other makes.
+    columns: Array  # (n, 6)
+    p_value: float
+    starts: dict[What, int] | None = None  # where the step of each begins; None: a single view
+
+
+def _searched(model: ViewModel, first: Array | None, chance: float) -> tuple[list[Step], Array | None]:
+    """Steps on top of columns that are in the mean already, and all columns with them and with single views.
+
+    As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
+    back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
     """
-    if model.count < _FEWEST:
-        return []
-    picked, significant, columns = list[tuple[dict[What, int], What, float]](), 0, first
-    while len(picked) < _MOST:
-        best, moved, p = _next_step(model, columns, [own[other] for own, other, _ in picked])
-        picked.append((best, moved, p))
-        significant = len(picked) if p < chance else significant
-        columns = beside(columns, step_columns(model, best[moved], moved))
-    out = []
-    for best, _, p in picked[:significant]:
-        others = first
-        for own, other, _ in picked[:significant]:
-            others = others if own is best else beside(others, step_columns(model, own[other], other))
-        out.append(_step(model, others, best, min(p, picked[significant - 1][2])))
-    return out
+    picked, significant = list[_Pick](), 0
+    while model.count >= _FEWEST and len(picked) < significant + _MOST and len(_starts(picked)) < _MOST:
+        picked.append(_next(model, _beside(first, picked), _starts(picked)))
+        significant = len(picked) if picked[-1].p_value < chance else significant
+    picked = picked[:significant]
+    steps = []
+    for pick in picked:
+        if pick.starts is not None:
+            others = _beside(first, [other for other in picked if other is not pick])
+            steps.append(_step(model, others, pick.starts))
+    # What was picked early may stand out no more beside the rest.
+    return [step for step in steps if step.p_value < chance], _beside(first, picked)
 
 
-def _next_step(model: ViewModel, columns: Array | None, taken: Sequence[int]) -> tuple[dict[What, int], What, float]:
-    """Where the likeliest step of each begins beside some columns, which of the two is likelier, and its chance."""
+def _starts(picked: Sequence[_Pick]) -> list[dict[What, int]]:
+    return [pick.starts for pick in picked if pick.starts is not None]
+
+
+def _beside(first: Array | None, picked: Sequence[_Pick]) -> Array | None:
+    for pick in picked:
+        first = beside(first, pick.columns)
+    return first
+
+
+def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, int]]) -> _Pick:
+    """The likeliest step, or the single view that is off, beside some columns."""
     under = projector(model, model.fit(columns), columns)
-    starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in taken]
+    starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in [k for own in taken for k in own.values()]]
     tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in _BOTH for k in starts}
+    mean = model.mixed(columns).A[0]
+    alone = {v: test(under, own) for v, own in enumerate(model.views) if not _held(own, mean)}
+    view = min(alone, key=lambda v: (alone[v].p_value, -alone[v].statistic))
+    likelier = min(tests, key=lambda at: (tests[at].p_value, -tests[at].statistic))
+    if (alone[view].p_value, -alone[view].statistic) < (tests[likelier].p_value, -tests[likelier].statistic):
+        return _Pick(model.views[view], alone[view].p_value * model.count)
     best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in _BOTH}
-    likelier = max(_BOTH, key=lambda moved: tests[moved, best[moved]].statistic)
-    return best, likelier, min(found.p_value for found in tests.values()) * len(tests) * _MOST
+    moved, start = likelier
+    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * _tests(model), best)
 
 
-def _step(model: ViewModel, columns: Array | None, best: dict[What, int], p: float) -> Step:
+def _held(columns: Array, mean: Array) -> bool:
+    """True if columns (n, 6) say nothing that a mean of orthonormal columns (n, K) does not hold."""
+    left = columns - mean @ (mean.T @ columns)
+    return bool(np.linalg.norm(left) < _NEW * np.linalg.norm(columns))
+
+
+def _tests(model: ViewModel) -> int:
+    """How many steps are tested."""
+    return len(_BOTH) * (model.count - 2 * _SIDE + 1) * _MOST
+
+
+def _step(model: ViewModel, columns: Array | None, best: dict[What, int]) -> Step:
     """The likelier one of the best step of the part and of the scanner, with its size."""
     own = {moved: beside(columns, step_columns(model, best[moved], moved)) for moved in _BOTH}
     deviance = {moved: model.deviance(own[moved]) for moved in _BOTH}
     likelier = min(_BOTH, key=lambda moved: deviance[moved])
     told = bool(abs(deviance["part"] - deviance["scanner"]) > _TOLD)
     start = best[likelier]
-    under = projector(model, model.fit(own[likelier]), columns)
-    estimate = test(under, step_columns(model, start, likelier)).estimate
+    displaced = step_columns(model, start, likelier)
+    p = test(projector(model, model.fit(columns), columns), displaced).p_value * _tests(model)
+    estimate = test(projector(model, model.fit(own[likelier]), columns), displaced).estimate
     moved = (model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]) @ estimate
     turn, shift = (float(np.median(np.linalg.norm(half, axis=1))) for half in (moved[:, :3], moved[:, 3:]))
     return Step(start, likelier, told, turn / model.lever, shift, p)
 
 
-def _less_likely(
-    model: ViewModel, found: Sequence[Step], first: Array | None, singles: tuple[Array | None, int]
-) -> bool:
-    """True if single blunders explain more: by Akaike's rule each number that they take must earn two."""
-    columns, count = singles
-    for step in found:
-        first = beside(first, step.columns(model))
-    return model.deviance(columns) + 12 * (count - len(found)) < model.deviance(first)
+def _criterion(model: ViewModel, columns: Array | None) -> float:
+    """Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
+    count = len(model.z)
+    taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
+    return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf

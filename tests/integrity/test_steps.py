@@ -12,10 +12,13 @@ from stitch import frames
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.integrity.blunders import find_blunders
+from stitch.integrity.expected_poses import expected_poses
+from stitch.integrity.pose_tests import PoseTests
 from stitch.integrity.steps import find_steps
 from stitch.integrity.view_test import ViewModel
 from stitch.measurement.cloud import Cloud
 from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.pipeline import run
 
 VIEWS, SIGMA, MEMORY = 18, 0.02, 20.0
@@ -71,6 +74,37 @@ def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
     singles = find_blunders(replace(model, errors=None))
     assert [b.view for b in singles.blunders] == [VIEWS - 1]
     assert find_steps(model, None, (singles.further, 1), 0.01) == ()
+
+
+def off(model, view, times=100.0):
+    return replace(model, z=model.z + times * np.kron(np.arange(VIEWS) == view, STEP))
+
+
+def test_one_view_in_the_middle_that_is_off_is_no_two_steps():
+    assert steps(off(direct(9), 9)) == ()
+
+
+def test_a_step_is_found_beside_a_view_farther_off():
+    (found,) = steps(off(stepped(direct(10), 9), 4))
+    assert found.start == 9
+    assert found.distance == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
+
+
+def test_half_of_the_views_let_go_explain_a_step_no_better_than_the_step():
+    model = stepped(direct(11), 9)
+    (found,) = find_steps(model, None, (model.columns(range(9, VIEWS)), 9), 0.01)
+    assert found.start == 9
+
+
+def test_what_a_view_is_off_by_beside_a_step_is_its_own():
+    model = off(stepped(direct(12), 9), 4, times=50.0)
+    tests = PoseTests([], [], find_blunders(replace(model, errors=None), [4], steps(model)), steps(model))
+    tests = replace(tests, homeless=[4])
+    freed = FreePoses(np.empty((VIEWS, 4, 4)), model.z.reshape(VIEWS, 6), None)
+    expected = frames.log(expected_poses(replace(model, errors=None), np.tile(np.eye(4), (VIEWS, 1, 1)), freed, tests))
+    own = freed.twists - expected
+    np.testing.assert_allclose(own[4], 50 * STEP, atol=0.1)
+    assert np.abs(np.delete(own, 4, axis=0)).max() < 5 * SIGMA
 
 
 @pytest.mark.slow
