@@ -45,12 +45,14 @@ def find_homes(capture: Capture, model_poses: Array, freed: FreePoses) -> Homes:
     """
     lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
     tolerance = _TOLERANCE_SIGMAS * freed.overlaps.gram.scale
-    torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]))
+    groups = linkage(freed.overlaps, lines).components
+    torn = contradicting(capture.scans, freed.poses, tolerance, part_size([capture]), groups=groups)
     linked = linkage(freed.overlaps, {*lines, *torn})
     needed = needed_closure(capture, freed.poses, linked, tolerance)
     placed, homeless = placed_views(capture, model_poses, freed, linked, (tolerance, needed))
-    if homeless and placed:
-        apart = linked.unlinked
+    apart = linked.unlinked
+    if placed and len(apart) > 1:
+        # One displacement of all explains more than one of each, which may have closed in a wrong place.
         together = moved_together(capture, model_poses, freed, placed, unlinked=apart, tolerance=tolerance)
         if together is not None:
             linked = linkage(together.overlaps, lines)

@@ -19,7 +19,7 @@ from stitch.observations.surfaces.overlaps import Overlaps
 # real; pairs with a view displaced by more than the gate 0 to 0.3.
 LINKED_SHARE = 0.5
 # Correspondences that determine six numbers with some to spare.
-_FEWEST = 20
+HOLDING = 20
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Link:
     @property
     def holds(self) -> bool:
         """True if the pair says something about its two poses."""
-        return self.share >= LINKED_SHARE and self.count >= _FEWEST
+        return self.share >= LINKED_SHARE and self.count >= HOLDING
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
     for i, (v, w) in enumerate(overlaps.gram.pairs):
         if overlaps.gram.labelled[i]:
             # Common targets have names: they always belong together.
-            links.append(Link(int(v), int(w), _FEWEST, 1.0))
+            links.append(Link(int(v), int(w), HOLDING, 1.0))
         elif v in holding_nothing or w in holding_nothing:
             continue
         elif found.get((int(v), int(w))):
@@ -108,19 +108,6 @@ def _cuts(near: Mask, view: int) -> bool:
     neighbours = np.flatnonzero(np.delete(near[view], view))
     _, label = connected_components(coo_array(rest), directed=False)
     return len(set(label[neighbours])) > 1
-
-
-def apart(linked: Linkage, names: Sequence[str]) -> str | None:
-    """One line that names two or more groups of at least two views that nothing links; None if there are none."""
-    groups = [part for part in linked.components if len(part) > 1]
-    if len(groups) < 2:
-        return None
-    shown = "; ".join(_few([names[v] for v in part]) for part in groups)
-    return f"the views fall into {len(groups)} groups that share no surface: {shown}; to fix: add views that link them"
-
-
-def _few(names: Sequence[str], most: int = 6) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def only(indices: Indices | Sequence[int], names: Sequence[str]) -> list[str]:

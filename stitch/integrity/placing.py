@@ -20,8 +20,7 @@ from stitch.observations.surfaces.match import sample
 
 # Points of the other views that make up their surface, and of the scan that is placed.
 _SURFACE_POINTS = 30_000
-_PROBES = 160
-_FINAL_PROBES = 600
+_PROBES, _FINAL_PROBES = 160, 600
 _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Gates of the search as shares of the size: from a third of the part to a two-hundredth.
 _FIRST_GATE, _LAST_GATE, _STEPS = 0.35, 0.005, 14
@@ -41,6 +40,11 @@ class Surface:
     tree: Any
     spacing: float  # median distance between neighbours of one scan
     tolerance: float  # a point this far from the surface, along the normal, lies on it
+
+    @property
+    def near(self) -> float:
+        """Distance from its points within which a point lies near the surface."""
+        return 2 * self.spacing + 3 * self.tolerance
 
     def meets(self, poses: Array, points: Array, normals: Array, gate: float) -> tuple[Array, Array, Mask]:
         """Signed distance (S, n), normal of the partner (S, n, 3), and whether there is one within `gate`."""
@@ -100,9 +104,8 @@ def judge_all(scan: Scan, poses: Array, surface: Surface, probes: int = _FINAL_P
     index = sample(scan, probes)
     if not len(index):
         return [Placement(T, 0.0, 0.0) for T in poses]
-    near = 2 * surface.spacing + 3 * surface.tolerance
-    residual, _, meets = surface.meets(poses, scan.points[index], scan.normals[index], near)
-    inside = _inside(scan, poses, surface, index, near)
+    residual, _, meets = surface.meets(poses, scan.points[index], scan.normals[index], surface.near)
+    inside = _inside(scan, poses, surface, index, surface.near)
     on = meets & (np.abs(residual) < surface.tolerance)
     return [
         Placement(T, float(i.mean()), float(o.sum() / max(i.sum(), 1)))

@@ -6,7 +6,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.linkage import Linkage
+from stitch.integrity.linkage import HOLDING, Linkage
+from stitch.integrity.placed_groups import FEW_SHARED, placed_groups
 from stitch.integrity.placing import (
     Placement,
     judge,
@@ -27,8 +28,6 @@ _ACCEPTED = 0.8
 _AT_A_ROW = 0.75
 CLOSE_SHARE = 0.03  # of the part's size
 _NEAR = 0.2
-# Views that cannot be seen to belong: the smallest share of a linked view that counts for that comparison.
-_FEW_SHARED = 0.1
 
 
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
@@ -46,10 +45,13 @@ def placed_views(
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
         limits: distance from the surface that still lies on it, length_unit, and the closure needed.
     """
-    core, waiting, placed = list(linked.core), list(linked.unlinked), dict[int, Placement]()
-    if not waiting or len(core) < 2:
-        return placed, waiting
+    if not linked.unlinked or len(linked.core) < 2:
+        return {}, list(linked.unlinked)
     (tolerance, needed), size, poses = limits, part_size([capture]), np.array(freed.poses)
+    placed = placed_groups(capture, poses, linked, limits)
+    for v, placement in placed.items():
+        poses[v] = placement.T
+    core, waiting = [*linked.core, *placed], [v for v in linked.unlinked if v not in placed]
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
         new = {}
@@ -61,7 +63,8 @@ def placed_views(
             found = place(scan, surface, np.concatenate(starts), size)
             # A part clamped anew lies near: a wide gate would lead past it.
             found += place(scan, surface, model_poses[v][None], _NEAR * size)
-            best = _likeliest(scan, [p for p in found if p.near > _FEW_SHARED], model_poses, (needed, size))
+            shared = max(FEW_SHARED, HOLDING / scan.usable.sum())
+            best = _likeliest(scan, [p for p in found if p.near > shared], model_poses, (needed, size))
             if best is not None:
                 new[v] = best
         if not new:
