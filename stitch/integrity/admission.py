@@ -5,36 +5,33 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import (
     beyond_any_arm,
-    contradicted_by,
     contradicts,
     doubtful,
     judged_by_size,
     stands_off,
 )
 from stitch.integrity.deep_check import deep_check
+from stitch.integrity.doubts import doubts_of
 from stitch.integrity.moved_targets import said_of_targets
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
-from stitch.integrity.standing_still import standing_still
 from stitch.integrity.steps import MANY_VIEWS
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.measurement.capture import Capture, part_size
+from stitch.integrity.view_names import listed
+from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session, View
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.stages.correction import Correction
-
-_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -51,9 +48,11 @@ class Admission:
         """Of the views that are left out."""
         return {item.view for item in self.left_out}
 
-    def line(self) -> str:
-        """What was left out and why."""
-        return "; ".join(f"{item.view}: {item.why}" for item in self.left_out)
+    def line(self, order: Sequence[str]) -> str:
+        """What was left out and why; with the names of all views as they follow each other."""
+        why = dict.fromkeys(item.why for item in self.left_out)
+        alike = {w: [item.view for item in self.left_out if item.why == w] for w in why}
+        return "; ".join(f"{listed(views, order)}: {w}" for w, views in alike.items())
 
     def indices(self, session: Session) -> list[int]:
         """Numbers of the views that are left out."""
@@ -87,14 +86,14 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     if doubtful(session, found):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
-    told = (*said_of_targets(session, own.sightings), *_doubts(session, own, found, T_mount))
+    told = (*said_of_targets(session, own.sightings), *doubts_of(session, own, found, T_mount))
     if not any(beyond_any_arm(session, step.rotation, step.distance) for step in found.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         found = replace(found, steps=())
     problems = explain(session, own, T_mount, found) if found.left_out else []
     apart = next((p for p in problems if p.kind == "disconnected"), None)
     if apart is not None:
-        raise NoResultError(f"{session.path}: {apart.line()}")
+        raise NoResultError(f"{session.path}: {apart.line(session.names)}")
     out = _not_belonging(session, own, found, T_mount, problems)
     return Admission(
         left_out=out,
@@ -114,7 +113,7 @@ def doubts(session: Session, measurement: Measurement, correction: Correction | 
     if correction is None:
         return targets
     found = _examined(session, measurement, correction, index)
-    return (*targets, *_doubts(session, correction.captures[index], found, correction.model.T_mount))
+    return (*targets, *doubts_of(session, correction.captures[index], found, correction.model.T_mount))
 
 
 def _examined(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
@@ -125,28 +124,6 @@ def _examined(session: Session, measurement: Measurement, correction: Correction
         large = (step for step in found.steps if beyond_any_arm(session, step.rotation, step.distance))
         found = replace(found, steps=tuple(large))
     return judged_by_size(session, found)
-
-
-def _doubts(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """What stands still before the scanner, steps between two views, poses that contradict the scans as no arm does."""
-    names = [view.name for view in session.views]
-    still = standing_still(own.scans, own.poses(T_mount), found.tolerance, part_size([own]))
-    background = () if still is None else (still.said(session.length_unit),)
-    said = (*background, *(step.said(names, session.length_unit) for step in found.steps))
-    if not doubtful(session, found):
-        return said
-    twists = frames.log(found.freed.poses @ frames.inverse(own.poses(T_mount)))
-    middles = np.array([points.mean(axis=0) for points in own.shown])
-    moved = np.linalg.norm(
-        twists[:, 3:] + np.cross(twists[:, :3], frames.transform(own.poses(T_mount), middles[:, None])[:, 0]), axis=1
-    )
-    worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
-    farthest = ", ".join(f"{names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
-    return (
-        f"No arm scatters by {contradicted_by(session, found)}: several rows or scans are wrong, and the views hold "
-        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {farthest}.",
-        *said,
-    )
 
 
 def admission_of_targets(session: Session, found: TargetFit) -> Admission:
@@ -174,7 +151,7 @@ def _not_belonging(
     out = []
     for v in found.left_out:
         name = session.views[v].name
-        why = next((p.line() for p in problems if name in p.views), "it shares no surface with the others")
+        why = next((p.line(session.names) for p in problems if name in p.views), "it shares no surface with the others")
         out.append(LeftOut(name, why, poses[v], _scanned(session.views[v])))
     return tuple(out)
 

@@ -43,7 +43,7 @@ def admitted_fit(
     own, measured = list(sessions), list(measurements)
     taken = [Admission() for _ in own]
     for _ in range(_ROUNDS):
-        with _said_of(taken):
+        with _said_of(sessions, taken):
             fitted = fit(own, measured)
             found = [_examined(session, fitted, i) for i, session in enumerate(own)]
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
@@ -53,9 +53,10 @@ def admitted_fit(
             require_majority(session, a.left_out)
         measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
         own = [s.without(a.names) for s, a in zip(own, found, strict=True)]
-        short = next((s for s in own if len(s.views) < 2), None)
+        short = next((i for i, s in enumerate(own) if len(s.views) < 2), None)
         if short is not None:
-            raise NoResultError(f"{short.path}: fewer than two views are left that belong together: {taken[0].line()}")
+            gone = taken[short].line(sessions[short].names)
+            raise NoResultError(f"{own[short].path}: fewer than two views are left that belong together: {gone}")
     else:
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)
@@ -63,12 +64,13 @@ def admitted_fit(
 
 
 @contextmanager
-def _said_of(taken: Sequence[Admission]) -> Iterator[None]:
+def _said_of(sessions: Sequence[Session], taken: Sequence[Admission]) -> Iterator[None]:
     """Where the views that are left lead nowhere, say which were left out before, and why."""
     try:
         yield
     except NoResultError as error:
-        if not (gone := "; ".join(a.line() for a in taken if a.left_out)):
+        every = zip(sessions, taken, strict=True)
+        if not (gone := "; ".join(a.line(session.names) for session, a in every if a.left_out)):
             raise
         raise NoResultError(f"{error}; left out before: {gone}") from error
 

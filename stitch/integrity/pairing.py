@@ -14,6 +14,7 @@ from stitch.integrity.problems import Problem
 from stitch.integrity.scan_faults import ScanFault, copies, same_poses, scale_fault, scan_fault
 from stitch.integrity.snooping import Misplaced, Snooping
 from stitch.integrity.unlinked_views import CLOSE_SHARE
+from stitch.integrity.view_names import listed
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.session import Session
 
@@ -51,14 +52,16 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
     step = common_step(capture, poses, [m for m in misplaced if m.view not in told]) if not found.steps else None
     if step is not None:
         told |= set(step[0])
-        out.append(_reclamped(step[0].start or step[0].stop, step[1], names))
+        out.append(_reclamped(step[0], step[1], names))
     same = same_poses(capture)
     for m in misplaced:
         if m.view not in told:
             out.append(_single(session, capture, T_mount, found, m, same))
-    out += [_reclamped(s.start, s.moved if s.told else "either", names) for s in found.steps]
+    for s in found.steps:
+        side = range(s.start) if s.start <= found.between.start else range(s.start, len(names))
+        out.append(_reclamped(side, s.moved if s.told else "either", names))
     if len(found.disconnected) > 1:
-        shown = " | ".join(", ".join(only(group, names)) for group in found.disconnected)
+        shown = " | ".join(listed(only(group, names), names) for group in found.disconnected)
         views = tuple(n for group in found.disconnected[1:] for n in only(group, names))
         out.append(Problem("disconnected", views, f"no surface links {shown}: add views between them"))
     return out
@@ -143,9 +146,11 @@ def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> S
     return look(scan, T_pose, surface, part_size([capture]), found.needed)
 
 
-def _reclamped(start: int, moved: str, names: Sequence[str]) -> Problem:
-    views = tuple(names[start:]) if start >= len(names) / 2 else tuple(names[:start])
+def _reclamped(views: range, moved: str, names: Sequence[str]) -> Problem:
+    """Some views at one end of the list that stand off from the rest."""
+    start = views.start or views.stop
     what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
         moved, "the part or the scanner moved"
     )
-    return Problem("reclamped", views, f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it")
+    fix = f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it"
+    return Problem("reclamped", tuple(only(views, names)), fix)

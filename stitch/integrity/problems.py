@@ -1,7 +1,10 @@
 """One mistake of a session: its kind, the views it concerns and what to do."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from stitch.integrity.view_names import listed
 
 KINDS = (
     "exchanged",
@@ -38,7 +41,7 @@ class Problem:
         """As `stitch check --deep --json` prints it."""
         return {"kind": self.kind, "views": list(self.views), "fix": self.fix}
 
-    def line(self) -> str:
-        """As a message: kind, views, to fix."""
-        where = f" ({', '.join(self.views[:6])}{' …' if len(self.views) > 6 else ''})" if self.views else ""
+    def line(self, order: Sequence[str]) -> str:
+        """As a message: kind, views, to fix; with the names of all views as they follow each other."""
+        where = f" ({listed(self.views, order)})" if self.views else ""
         return f"{self.kind}{where}: {self.fix}"

@@ -11,6 +11,7 @@ from stitch.integrity.arm_limits import beyond_any_arm, contradicted_by
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.problems import Problem
 from stitch.integrity.snooping import Snooping
+from stitch.integrity.view_names import listed
 from stitch.measurement.capture import Capture
 from stitch.measurement.session import Session
 from stitch.observations.surfaces.free_poses import free_poses
@@ -34,7 +35,7 @@ def refuse(session: Session, problems: Sequence[Problem]) -> None:
     """Raise what a deep check found; nothing where it found nothing certain."""
     for problem in (p for p in problems if p.certain):
         kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
-        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line()}")
+        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line(session.names)}")
 
 
 def refuse_whole(session: Session) -> list[Problem]:
@@ -65,7 +66,8 @@ def require_majority(session: Session, left_out: Sequence[LeftOut]) -> None:
         return
     found = refuse_whole(session)
     if 2 * len(left_out) >= len(session.views) and not any(p.kind in _LEAVE_A_REST for p in found):
-        names = ", ".join(item.view for item in left_out)
+        gone = {item.view for item in left_out}
+        names = listed([name for name in session.names if name in gone], session.names)
         raise NoResultError(
             f"{session.path}: {len(left_out)} of {len(session.views)} views ({names}) do not belong to the others, and "
             "which half is right nobody can say; to fix: check that rows and clouds belong together and how the poses "

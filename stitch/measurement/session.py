@@ -89,6 +89,11 @@ class Session:
         """True if some view shows labelled points or a probe."""
         return any(view.sighting is not None for view in self.views)
 
+    @property
+    def names(self) -> list[str]:
+        """Of the views, in the session's order."""
+        return [view.name for view in self.views]
+
     def without(self, names: Collection[str]) -> "Session":
         """The session less some views."""
         return replace(self, views=tuple(view for view in self.views if view.name not in names))

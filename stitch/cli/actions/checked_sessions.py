@@ -45,7 +45,8 @@ def deeply_checked(sessions: list[Path], as_json: bool) -> None:
     Raises:
         typer.Exit: with 2, where something is wrong for certain.
     """
-    found = {str(path): deep_check(load_session(path)) for path in sessions}
+    loaded = {str(path): load_session(path) for path in sessions}
+    found = {path: deep_check(session) for path, session in loaded.items()}
     documents = [
         {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
         for path, problems in found.items()
@@ -54,7 +55,7 @@ def deeply_checked(sessions: list[Path], as_json: bool) -> None:
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         for path, problems in found.items():
-            for line in [p.line() for p in problems] or ["nothing wrong was found"]:
+            for line in [p.line(loaded[path].names) for p in problems] or ["nothing wrong was found"]:
                 console().print(f"{path}: {line}", soft_wrap=True)
     if any(p.certain for problems in found.values() for p in problems):
         raise typer.Exit(2)

@@ -1,0 +1,30 @@
+"""Three views cannot tell which of them is off, but that something is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch.measurement.cloud import Cloud
+from stitch.pipeline import run
+
+
+@pytest.fixture(scope="module")
+def good():
+    return session_of(measured_blade(22, views=3, pixels=80))
+
+
+def test_three_views_that_agree_raise_no_doubt(good):
+    assert run(good).doubts == ()
+
+
+def test_one_of_three_views_that_is_off_is_doubted_and_none_accused(good):
+    first, off, last = good.views
+    found = run(
+        replace(good, views=(first, replace(off, cloud=Cloud(off.cloud.points + np.array([0.0, 2.0, 1.0]))), last))
+    )
+    assert found.left_out == () and len(found.doubts) == 1
+    assert found.doubts[0].startswith("Three poses contradict their scans by")
+    assert "three views do not tell which" in found.doubts[0]
