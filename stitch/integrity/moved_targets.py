@@ -17,6 +17,8 @@ from stitch.units import length_text
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
 _SIDE, _TARGETS = 2, 3
+# More targets hold each other, so that one that moved pulls little; to compare all their pairs takes minutes.
+_MANY = 24
 # Standard error of a median over that of a mean, and a standard deviation over the median of its deviations.
 _MEDIAN, _MAD = 1.25, 1.4826
 # Places of a step that are tried at a time, ever closer.
@@ -43,13 +45,15 @@ def said_of_targets(session: Session, sightings: Sightings | None) -> tuple[str,
     """Which targets moved, in words; nothing where a session has none."""
     if sightings is None:
         return ()
-    names = [view.name for view in session.views]
+    names = session.names
     found = moved_targets(sightings.everything)
     return tuple(m.said(names[m.start], length_text(m.distance, session.length_unit)) for m in found)
 
 
 def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
-    """Targets that moved once, the clearest first; each is asked without those before it."""
+    """Targets that moved once, the clearest first; each is asked without those before it; none among more than 24."""
+    if len(sightings.targets) > _MANY:
+        return ()
     apart, sigma = _distances(sightings), float(np.median(sightings.sigma[sightings.used]))
     left, found = list(range(len(sightings.targets))), list[MovedTarget]()
     while len(left) >= _TARGETS:

@@ -103,6 +103,8 @@ def _parted(part: Array, other: Array, every: Array, size: float) -> Array | Non
 
 def _moved(points: Array, poses: Array, v: int, size: float) -> list[int]:
     """Views between which and view v the model moves its points before the scanner, evenly over the session."""
+    if not len(points):
+        return []
     there = frames.transform(frames.inverse(poses) @ poses[v], points[None])
     far = np.flatnonzero(np.median(np.linalg.norm(there - points, axis=2), axis=1) > _MOVED * size)
     return [int(w) for w in far[np.linspace(0, len(far) - 1, min(len(far), _ASKED)).astype(int)]]
