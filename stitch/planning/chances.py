@@ -144,20 +144,20 @@ class Court:
         return out
 
     def _lawful(self, k: int, numbers: Array) -> Mask:
-        """(D,) whether a candidate is ahead of every joint that follows the angles by no law (`joint_laws.py`)."""
+        """(D,) whether a candidate is ahead of every joint that follows by no law (`joint_laws.py`)."""
         own = self._bench({self.candidates[k].name}, self.candidates[k])
         linear, errors = own.linear, own.linear.pose_errors
-        if errors is None or errors.of_joints is None:
+        if errors is None or errors.of_joints is None or errors.of_ways is None:
             return np.ones(numbers.shape[1], bool)
         usual = float(errors.scales[errors.names.index("smooth")])
-        joints = range(errors.of_joints.columns.shape[1])
+        lawless = [smooth.of(p) for smooth in (errors.of_joints, errors.of_ways) for p in range(smooth.count)]
         if k not in self._laws:
-            halves = [_factor(linear.reduce(linear.reduce(errors.of_joints.of(joint)).T)) for joint in joints]
+            halves = [_factor(linear.reduce(linear.reduce(covariance).T)) for covariance in lawless]
             sizes = [usual * np.sqrt(times) for times in TIMES]
             laws = tuple(_judge(linear, size * half, 1.0, 1) for half in halves for size in sizes)
             self._laws[k] = tuple(_Bench(linear, (law,)) for law in laws)
         found = np.max([law.judged(numbers)[0] for law in self._laws[k]], axis=0)
-        rival = found - WIDTH + np.log(PRIOR_UNKNOWN / len(joints))
+        rival = found - WIDTH + np.log(PRIOR_UNKNOWN / len(lawless))
         return np.asarray(own.judged(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:

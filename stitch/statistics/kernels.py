@@ -33,6 +33,14 @@ def alike_joint_by_joint(some: Array, others: Array, reach: float = REACH) -> Ar
     return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
 
 
+def alike_in_way(joint: Array, came: Array) -> Array:
+    """(V, V) of a function of one joint's angle (V,) rad, smooth, and of how far it came, (V,) rad, by any law:
+    continuous and no more (Ornstein–Uhlenbeck, over the range of the joint), as play, friction and settling are.
+    """
+    reach = max(float(np.ptp(joint)), 1e-9)
+    return np.asarray(alike_in_joints(joint[:, None]) * alike_in_time(came, reach))
+
+
 def alike_in_time(time: Array, memory: float, others: Array | None = None) -> Array:
     """(V, V) of a process that forgets (Ornstein–Uhlenbeck), or (V, O) with other times (O,).
 
@@ -56,11 +64,16 @@ class SmoothErrors:
     """Errors Σ_p f_p(view)·column_p of all views, with smooth processes f_p that nobody wrote down."""
 
     columns: Array  # (6V, P) twists of the views per unit of each process
-    alike: Array  # (V, V) covariance of each
+    alike: Array  # (V, V) covariance of each, or (P, V, V) where they differ
+
+    @property
+    def count(self) -> int:
+        """P."""
+        return int(self.columns.shape[1])
 
     def of(self, p: int) -> Array:
         """(6V, 6V) covariance of the twists by process p alone."""
-        return spread_over(self.columns[:, [p]], self.alike)
+        return spread_over(self.columns[:, [p]], self.alike if self.alike.ndim == 2 else self.alike[p])
 
 
 def spread_over(columns: Array, alike: Array) -> Array:

@@ -94,6 +94,22 @@ def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law
     assert unnamed_errors(linear)[0].words == f"follow the joints, joint {joint} above all"
 
 
+def test_friction_is_neither_play_nor_settling(cell):
+    """A joint that follows its last reversals as dry friction on a spring does; play and settling of it keep their
+    names."""
+    measured, measurement, _ = cell
+    q, views = measured.plan.joints, measurement.views
+    found, _ = said_of(
+        cell,
+        kinematics.flange(measured.plan.arm, q + 2 * UNNAMED["hysteresis"](measured.plan, np.random.default_rng(0))),
+    )
+    assert found.verdict == "unknown_effect" and not found.named
+    fifth = np.eye(6)[4]
+    for name, off in (("backlash", 3e-4 * views.approach), ("settling", 2e-3 * (q - views.previous))):
+        found, _ = said_of(cell, kinematics.flange(measured.plan.arm, q + off * fifth))
+        assert [r.name for r in found.named] == [name]
+
+
 def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     """Against the density of what the hand-eye leaves, by scipy: scatter, the law at many sizes, of all else little."""
     measured, *_ = cell

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.kernels import alike_in_joints, alike_in_time, spread_over
+from stitch.statistics.kernels import alike_in_joints, alike_in_time, alike_in_way, spread_over
 
 JOINTS = np.random.default_rng(0).uniform(-np.pi, np.pi, (25, 6))
 
 
 def test_covariances_have_no_negative_direction():
-    for alike in (alike_in_joints(JOINTS), alike_in_time(np.cumsum(JOINTS[:, 0] ** 2), 2.0)):
+    in_time, in_way = alike_in_time(np.cumsum(JOINTS[:, 0] ** 2), 2.0), alike_in_way(JOINTS[:, 0], JOINTS[:, 1])
+    for alike in (alike_in_joints(JOINTS), in_time, in_way):
         assert np.linalg.eigvalsh(alike).min() > -1e-12
         assert np.diag(alike) == pytest.approx(1.0)
 
@@ -29,6 +30,13 @@ def test_time_forgets():
     alike = alike_in_time(np.array([0.0, 1.0, 500.0]), 20.0)
     assert alike[0, 1] == pytest.approx(np.exp(-1 / 20))
     assert alike[0, 2] < 1e-10
+
+
+def test_the_way_counts_in_ranges_of_the_joint():
+    """At one angle, views that came a whole range apart are alike by 1/e; a joint that never moves is as alike as can be."""
+    alike = alike_in_way(np.array([0.2, 0.2, 0.8]), np.array([-0.3, 0.3, 0.3]))
+    assert alike[0, 1] == pytest.approx(np.exp(-1))
+    assert np.all(alike_in_way(np.zeros(3), np.zeros(3)) == 1)
 
 
 def test_spread_is_the_covariance_of_drawn_processes():

@@ -3,7 +3,8 @@
 A name is worth no more than what it is compared with. All joints and links following the pose at once (`smooth` in the
 prior of pose errors) is a poor rival: it may do so much that it is believed to do little of anything. One joint that is
 off by a smooth function of the joint angles is what a coupling, a hose, a worn tooth or a gear with play really does,
-and where it explains the views about as well as an effect of the library, these views cannot tell which it is.
+and where it explains the views about as well as an effect of the library, these views cannot tell which it is. Likewise
+one joint that is off by any function of the way it came, as by friction, which is neither play nor settling.
 """
 
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.kernels import SmoothErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -37,25 +39,32 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `log_posterior` charges it for the width of its prior.
     """
+    return _laws(base, None if base.pose_errors is None else base.pose_errors.of_joints)
+
+
+def log_posterior(base: LinearModel) -> float:
+    """Of the likeliest law of a joint, by its angles or by the way it came, as those of effects in the same model
+    (`Ranked`); −∞ where there is none."""
+    laws = joint_laws(base)
+    laws += _laws(base, None if base.pose_errors is None else base.pose_errors.of_ways)
+    likeliest = max((law.log_bayes_factor for law in laws), default=-np.inf)
+    return likeliest - WIDTH + float(np.log(PRIOR_UNKNOWN / max(len(laws), 1)))
+
+
+def _laws(base: LinearModel, smooth: SmoothErrors | None) -> tuple[JointLaw, ...]:
     errors = base.pose_errors
-    if errors is None or errors.of_joints is None:
+    if errors is None or smooth is None:
         return ()
     scale = float(errors.scales[errors.names.index("smooth")])
     found = []
-    for k in range(errors.of_joints.columns.shape[1]):
-        half = base.reduce(errors.of_joints.of(k))
+    for k in range(smooth.count):
+        half = base.reduce(smooth.of(k))
         every = errors.beside(f"joint {k + 1}", base.reduce(half.T), scale)
         mixed = with_errors(base.mixed, every)
         fit = _fit(base, mixed, scale**2)
         model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
         found.append(JointLaw(k + 1, 0.5 * (base.null.deviance - fit.deviance), model))
     return tuple(sorted(found, key=lambda law: -law.log_bayes_factor))
-
-
-def log_posterior(base: LinearModel) -> float:
-    """Of the likeliest law of a joint, as those of effects in the same model (`Ranked`); −∞ where there is none."""
-    laws = joint_laws(base)
-    return laws[0].log_bayes_factor - WIDTH + float(np.log(PRIOR_UNKNOWN / len(laws))) if laws else -np.inf
 
 
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
