@@ -82,7 +82,8 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
     library = [e for e in EFFECTS.values() if e.name not in used]
     missing = {e.name: lacks for e in library if (lacks := lacking(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
-    effects += empirical_effects(linear.measurement.views) if empirical else []
+    shapes = empirical_effects(linear.measurement.views) if empirical else []
+    effects += [e for e in shapes if not lacking(linear.measurement, e)]
     terms = [_grid_terms(linear, effect) for effect in effects]
     responses = iter(linear.responses([term for own in terms for term in own]))
     tried = [_candidate(linear, own, [next(responses) for _ in own]) for own in terms]

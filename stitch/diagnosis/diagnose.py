@@ -9,6 +9,7 @@ from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.covariate_dependence import dependences
 from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
@@ -45,7 +46,9 @@ def diagnose_state(state: State) -> Diagnosis:
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
-        unnamed = unnamed_errors(linear) if selection.verdict == "unknown_effect" else ()
+        unknown = selection.verdict == "unknown_effect"
+        unnamed = unnamed_errors(linear) if unknown else ()
+        of_field = unknown and follows_field(selection.empirical, unnamed)
         curves = joint_curves([law for kind in unnamed for law in kind.laws])
         beyond = implausible(linear, limit)
         # Where it is said what repeats, scatter is the rest; else all of it.
@@ -72,6 +75,7 @@ def diagnose_state(state: State) -> Diagnosis:
             implausible=beyond,
             unnamed=unnamed,
             curves=curves,
+            of_field=of_field,
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))

@@ -48,6 +48,11 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
 
 def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
     start = f"No effect of the library explains what is left ({now}, noise {floor}): "
+    if d.of_field:
+        return (
+            f"{start}the scanner errs by where in its field a point is seen, the same in every view; have it "
+            f"calibrated, or describe how it errs by an effect of your own{_notes(d)}."
+        )
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
     if d.unnamed and (d.curves or not d.implausible):

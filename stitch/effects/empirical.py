@@ -6,6 +6,7 @@ unknown is at work.
 """
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
@@ -14,7 +15,13 @@ from stitch.effects.specs import Spec, event, number, twist
 from stitch.frames import Array
 from stitch.measurement.views import ScanView, Views
 
+# A distortion of the scanner's field by no law.
+FIELD = "distortion_over_field"
 _HARMONICS = (1, 2, 3, 4)
+# Monomials of the place in the scanner's field, a = x/z, b = y/z and r/r₀ − 1, up to the second degree.
+_PLACES = [powers for powers in product(range(3), repeat=3) if 0 < sum(powers) <= 2]
+# Where a scanner sees, a and b reach so far, and the range r from its standoff r₀.
+_FIELD = (0.3, 0.3, 0.1)
 
 
 def empirical_effects(views: Views) -> list[Effect]:
@@ -28,11 +35,14 @@ def empirical_effects(views: Views) -> list[Effect]:
     for name, course in (courses | views.covariates).items():
         if np.ptp(course) > 0 and len(np.unique(course)) > 2:
             out += [_bias(name, course, 1), _bias(name, course, 2), _mount(name, course, 1), _mount(name, course, 2)]
+    out.append(_field())
     return [*out, _effect("an event", "knock_of_mount", "mount", _step, xi=twist("", 6e-4, 0.2), v=event())]
 
 
-def _effect(group: str, name: str, place: str, function: Callable[..., Array], **specs: Spec) -> Effect:
-    return Effect(name, place, specs, function=function, needs=(), prefers=(), tier="empirical", group=group)
+def _effect(
+    group: str, name: str, place: str, function: Callable[..., Array], needs: tuple[str, ...] = (), **specs: Spec
+) -> Effect:
+    return Effect(name, place, specs, function=function, needs=needs, prefers=(), tier="empirical", group=group)
 
 
 def _harmonic(joint: int, order: int) -> Effect:
@@ -44,6 +54,25 @@ def _harmonic(joint: int, order: int) -> Effect:
     fourier.__doc__ = f"joint {joint + 1}: A sin {order}q + B cos {order}q"
     name, size = f"fourier_{order}_of_j{joint + 1}", number("rad", 4e-4, 0.01)
     return _effect(f"j{joint + 1}_deg", name, "robot", fourier, A=size, B=size)
+
+
+def _field() -> Effect:
+    """Points move in all three directions by a function of where they are seen; 0.1 mm at the edge is usual."""
+    terms = {f"c{axis}_{i}{j}{k}": (axis, (i, j, k)) for axis in range(3) for i, j, k in _PLACES}
+
+    def distort(points: Array, view: ScanView, **c: float) -> Array:
+        """x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"""
+        ray = np.sqrt(np.einsum("ij,ij->i", points, points))
+        at = np.column_stack([points[:, :2] / points[:, 2:], ray / view.views.standoff - 1])
+        moved = points.copy()
+        for name in (name for name in terms if c[name]):
+            axis, powers = terms[name]
+            moved[:, axis] += c[name] * (at**powers).prod(axis=1)
+        return moved
+
+    sizes = {name: 0.1 / float(np.prod(np.power(_FIELD, powers))) for name, (_, powers) in terms.items()}
+    specs = {name: number("mm", size, 50 * size) for name, size in sizes.items()}
+    return _effect("the scanner's field", FIELD, "sensor", distort, ("optics",), **specs)
 
 
 def _standard(course: Array, order: int) -> Array:

@@ -1,0 +1,50 @@
+"""A scanner whose axes are not of equal length or not at right angles: no effect of the library, and none is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import captured, measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch.diagnosis.diagnose import diagnose_state
+from stitch.effects.empirical import FIELD, empirical_effects
+from stitch.measurement.measurement import measurement_of
+from stitch.pipeline import run
+from stitch.runs.state import state_of
+
+
+def said_of(measured, axes=None):
+    """The diagnosis of a run in which the scanner's axes (3, 3) are these."""
+    clouds = measured.clouds if axes is None else [replace(c, points=c.points @ axes.T) for c in measured.clouds]
+    return diagnose_state(state_of(run(session_of(replace(measured, clouds=clouds)))))
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return measured_blade(4, views=12, pixels=60)
+
+
+@pytest.mark.parametrize("axes", [np.diag([1, 1, 1.01]), np.eye(3) + 0.01 * np.eye(3, k=1)], ids=["longer", "askew"])
+def test_a_scanner_of_bad_axes_gets_no_name(measured, axes):
+    found = said_of(measured, axes)
+    assert found.verdict == "unknown_effect" and not found.effects
+    assert "the scanner errs by where in its field a point is seen" in found.sentence
+    assert "pose errors dominate" not in found.sentence
+
+
+def test_a_good_scanner_is_not_accused(measured):
+    assert not said_of(measured).of_field
+
+
+def test_points_move_by_the_polynomial_that_is_stated(measured):
+    """z off by c·(x/z)·(y/z) and x by c·(r/r₀ − 1)², worked out for single points."""
+    view = measurement_of(session_of(measured), captured(measured)).scan_views[0]
+    field = next(e for e in empirical_effects(view.views) if e.name == FIELD)
+    points, r0 = np.array([[30.0, -40.0, 400.0], [0.0, 0.0, 500.0]]), view.views.standoff
+    zero = dict.fromkeys(field.specs, 0.0)
+    moved = field.function(points, view, **zero | {"c2_110": 2.0, "c0_002": 3.0}) - points
+    r = np.linalg.norm(points, axis=1)
+    assert moved[:, 2] == pytest.approx(2.0 * points[:, 0] * points[:, 1] / points[:, 2] ** 2)
+    assert moved[:, 0] == pytest.approx(3.0 * (r / r0 - 1) ** 2)
+    assert np.all(moved[:, 1] == 0)
