@@ -10,6 +10,7 @@ from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
 from stitch.integrity.admission import doubts
 from stitch.integrity.admitted_fit import admitted_fit
+from stitch.integrity.refusals import mistakes_named
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
 from stitch.measurement.session import Session
@@ -70,7 +71,10 @@ def run_rig(
         begun = kind.start(sessions, measurements, model)
         measurements = [about_part(m, begun.T_mount) for m in measurements]
         seconds = clock.lap()
-        before = [kind.begin(m, begun, seconds, r) for m, r in zip(measurements, recorders, strict=True)]
+        before = []
+        for session, measurement, recorder in zip(sessions, measurements, recorders, strict=True):
+            with mistakes_named(session):
+                before.append(kind.begin(measurement, begun, seconds, recorder))
         clock.lap()
         if model:
             fit = partial(kind.apply, file=model)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array, Indices
+from stitch.integrity.misread_positions import other_columns
 from stitch.integrity.misread_rotations import degrees_for_radians, other_angles, other_quaternions
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Mount, Session
@@ -26,7 +27,8 @@ UNITS = {
     0.1: "cm where mm are stated",
 }
 _OTHER: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
-_HANDED = "the scans are left-handed: two of their columns are exchanged, or one has the wrong sign"
+_HANDED = "the scans, or the frames of the poses, are left-handed: two columns are exchanged, or one has the wrong sign"
+_AS_TEXT = "the {} are in the order of numbers as text (1, 10, 11, 2, …), the {} in that of numbers: pair by number"
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
@@ -87,6 +89,8 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
         yield Hypothesis("degrees", frames.make(turned.as_matrix(), position), mount, name)
     flip = np.diag([-1.0, 1, 1])
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
+    for name, moved in other_columns(position):
+        yield Hypothesis("mirrored", frames.make(T[:, :3, :3], moved), mount, f"{name}: correct the table of poses")
     still = np.broadcast_to(np.eye(4), T.shape)
     yield Hypothesis(
         "mount",
@@ -109,6 +113,10 @@ def _rows(T: Array, mount: Mount) -> Iterator[Hypothesis]:
     V = len(T)
     index = np.arange(V)
     yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order: turn the list around")
+    for first in (0, 1):
+        as_text = np.argsort([str(v + first) for v in range(V)])
+        yield Hypothesis("shifted", T[as_text], mount, _AS_TEXT.format("clouds", "poses"))
+        yield Hypothesis("shifted", T[np.argsort(as_text)], mount, _AS_TEXT.format("poses", "clouds"))
     for by in _SHIFTS:
         if abs(by) < V - 2:
             kept = index[(index + by >= 0) & (index + by < V)]

@@ -1,6 +1,7 @@
 """Sessions that no run may use: poses that contradict the scans, another mount's model, too few views that belong."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
@@ -50,6 +51,23 @@ def refuse_whole(session: Session) -> list[Problem]:
     found = deep_check(session)
     refuse(session, [p for p in found if p.kind not in (*_OF_VIEWS, *_LEAVE_A_REST)])
     return found
+
+
+@contextmanager
+def mistakes_named(session: Session) -> Iterator[None]:
+    """Where views do not overlap, refuse the mistake of the whole session that explains it, if there is one.
+
+    Raises:
+        InputError: there is one.
+        NoResultError: as it was raised inside.
+    """
+    try:
+        yield
+    except NoResultError:
+        # That nothing overlaps under any hand-eye says no more than what was said already.
+        with suppress(NoResultError):
+            refuse_whole(session)
+        raise
 
 
 def require_majority(session: Session, left_out: Sequence[LeftOut]) -> None:

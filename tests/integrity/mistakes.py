@@ -30,6 +30,11 @@ def _exchanged(T):
     return T
 
 
+def _as_text(views):
+    """Files 1 to so many as `ls` sorts them."""
+    return sorted(range(views), key=lambda v: str(v + 1))
+
+
 MISTAKES = {
     "inverse": (_of(frames.inverse), ("inverse",)),
     # Poses without joints: the other mount is the same as poses inverted.
@@ -44,6 +49,11 @@ MISTAKES = {
     "inches": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 25.4)), ("unit",)),
     "metres": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 1000)), ("unit",)),
     "scaled": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] * 1.05)), ("scale",)),
+    "y, x, z": (_of(lambda T: frames.make(T[:, :3, :3], T[:, [1, 0, 2], 3])), ("mirrored",)),
+    "z, x, y": (_of(lambda T: frames.make(T[:, :3, :3], T[:, [2, 0, 1], 3])), ("mirrored",)),
+    "x negated": (_of(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] * [-1, 1, 1])), ("mirrored",)),
+    "poses as text": (_of(lambda T: T[_as_text(len(T))]), ("shifted",)),
+    "clouds as text": (_of(lambda T: T[np.argsort(_as_text(len(T)))]), ("shifted",)),
     "shifted by one": (_of(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),
     "shifted by two": (_of(lambda T: np.roll(T, -2, axis=0)), ("shifted",)),
     "reversed": (_of(lambda T: T[::-1]), ("reversed",)),
