@@ -56,7 +56,7 @@ def calibrate_tracker(session: Session) -> TrackerCalibration:
         InputError: frames.csv missing or broken.
         NoResultError: poses that cannot show both, or poses and frames that belong to different motions.
     """
-    measured = read_frames(session.path / "frames.csv", [view.name for view in session.views])
+    measured = read_frames(session.path / "frames.csv", session.names)
     flange = {view.name: view.T_base_flange for view in session.views}
     A = np.array([flange[name] for name in measured.views])
     eye_to_hand = session.mount == "eye_to_hand"

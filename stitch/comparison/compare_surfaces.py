@@ -34,7 +34,7 @@ def compare(state: State) -> Comparison:
         poses = own.poses(state.model.T_mount)
         overlaps = collect(own, poses, state.gate, [sample(s, FINE_SAMPLES) for s in own.scans])
     rows = _Rows(state, poses, overlaps.matches, overlaps.gram.scale)
-    names = [view.name for view in state.session.views]
+    names = state.session.names
     tables = [_labelled(rows, "view", rows.view, names), _pairs(rows, names)]
     tables += [_binned(rows, name, unit, values) for name, unit, values in _properties(state, rows)]
     tables.append(_regions(rows))

@@ -34,15 +34,15 @@ def compare_targets(state: State) -> Comparison:
     rows = _offsets(state)
     s = state.measurement.capture.sightings
     assert s is not None
-    labels = {"view": (rows.view, [v.name for v in state.session.views]), "target": (rows.target, list(s.targets))}
+    labels = {"view": (rows.view, state.session.names), "target": (rows.target, list(s.targets))}
     tables = [_table(rows, name, "", bins, _numbers(names), names) for name, (bins, names) in labels.items()]
     for name, unit, values in _properties(state, rows):
         edges = edges_of(values)
         bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
         tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
-    names = tuple(view.name for view in state.session.views)
-    return Comparison(tuple(tables), rms, rms, names, {name: values for name, _, values in _of_views(state)})
+    of_views = {name: values for name, _, values in _of_views(state)}
+    return Comparison(tuple(tables), rms, rms, tuple(state.session.names), of_views)
 
 
 def _offsets(state: State) -> _Offsets:

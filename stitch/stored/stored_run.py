@@ -56,7 +56,7 @@ def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state
             f"--hand-eye {folder} -o ANOTHER`"
         )
     gone = {item.view for item in state.left_out}
-    if [v["view"] for v in document["views"] if v["view"] not in gone] != [view.name for view in state.session.views]:
+    if [v["view"] for v in document["views"] if v["view"] not in gone] != state.session.names:
         raise InputError(f"{state.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
 
 

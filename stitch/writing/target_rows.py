@@ -71,7 +71,7 @@ def residual_columns(found: TargetFit, session: Session) -> dict[str, Array]:
     rows, s = found.rows, found.rows.sightings
     v, slot = np.nonzero(s.used)
     left = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
-    names = np.array([view.name for view in session.views])
+    names = np.array(session.names)
     out: dict[str, Array] = {"view": names[v], "partner": np.array(s.targets)[s.target[v, slot]]}
     out |= dict(zip("xyz", found.landmarks.positions[s.target[v, slot]].T, strict=True))
     distance = np.linalg.norm(left, axis=1)

@@ -110,7 +110,7 @@ def read_session(folder: Path, hand_eye: Path) -> Placed:
         clouds.append(view.cloud.points)
     poses = np.array([view.T_base_flange for view in session.views])
     T_flange_scanner = read_hand_eye(hand_eye, session.length_unit)
-    names = tuple(view.name for view in session.views)
+    names = tuple(session.names)
     return Placed(names, tuple(clouds), poses, T_flange_scanner, session.length_unit)
 
 

@@ -31,7 +31,7 @@ def detected_targets(
         raise InputError(f"{output}: exists already; to fix: remove it, or name another file")
     loaded = load_session(session, at_most=None)
     found, notes = targets_in(scans_of(loaded), wanted)
-    views = [view.name for view in loaded.views]
+    views = loaded.names
     columns = points_columns(views, found)
     if output is not None:
         with whole(output) as scratch:
