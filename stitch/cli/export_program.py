@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from stitch.cli.options import require_new
 from stitch.cli.terminal.streams import emit
 from stitch.controllers.program import Program, read_program
 from stitch.controllers.taught import program_bytes
@@ -86,8 +87,7 @@ def _places(program: Program, output: Path) -> dict[Path, Path]:
     places = {program.file: output}
     places |= {file: output.with_suffix(file.suffix) for file in program.texts if file != program.file}
     for place in places.values():
-        if place.exists() or place.is_symlink():
-            raise InputError(f"{place}: exists already; name another file, or remove it")
+        require_new(place)
     return places
 
 

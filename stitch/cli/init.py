@@ -5,41 +5,56 @@ from typing import Annotated
 
 import typer
 
+from stitch.cli.options import names_in
 from stitch.cli.target_options import BallOption, BoardOption
 from stitch.errors import InputError
 
+_Folder = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP.")
+]
+_Poses = Annotated[Path | None, typer.Option("--poses", help="File or folder of the poses; default: found.")]
+_Columns = Annotated[
+    str | None, typer.Option("--columns", help="Names of the columns of numbers: rx,ry,rz,x,y,z; - leaves one out.")
+]
+_Rotation = Annotated[
+    str | None, typer.Option("--rotation", help="xyz-extrinsic, zyx-intrinsic, rotation-vector, quaternion-xyzw …")
+]
+_Angles = Annotated[str | None, typer.Option("--angles", help="deg or rad.")]
+_Unit = Annotated[str | None, typer.Option("--unit", help="Of the poses: mm, m, cm or inch.")]
+_CloudUnit = Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm or m.")]
+_Mount = Annotated[str | None, typer.Option("--mount", help="eye_in_hand or eye_to_hand.")]
+_Inverse = Annotated[
+    bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
+]
+_Topic = Annotated[str | None, typer.Option("--topic", help="Of a bag: the topic of the scans.")]
+_Frames = Annotated[
+    str | None, typer.Option("--frames", metavar="BASE,FLANGE[,SCANNER]", help="Of a bag: frames of tf.")
+]
+_Output = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER, or BAG-session."),
+]
+_Yes = Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")]
+
 
 def init(
-    folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP."),
-    ],
-    poses: Annotated[Path | None, typer.Option("--poses", help="File or folder of the poses; default: found.")] = None,
-    columns: Annotated[
-        str | None, typer.Option("--columns", help="Names of the columns of numbers: rx,ry,rz,x,y,z; - leaves one out.")
-    ] = None,
-    rotation: Annotated[
-        str | None, typer.Option("--rotation", help="xyz-extrinsic, zyx-intrinsic, rotation-vector, quaternion-xyzw …")
-    ] = None,
-    angles: Annotated[str | None, typer.Option("--angles", help="deg or rad.")] = None,
-    unit: Annotated[str | None, typer.Option("--unit", help="Of the poses: mm, m, cm or inch.")] = None,
-    cloud_unit: Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm or m.")] = None,
-    mount: Annotated[str | None, typer.Option("--mount", help="eye_in_hand or eye_to_hand.")] = None,
-    inverse: Annotated[
-        bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
-    ] = None,
+    folder: _Folder,
+    poses: _Poses = None,
+    columns: _Columns = None,
+    rotation: _Rotation = None,
+    angles: _Angles = None,
+    unit: _Unit = None,
+    cloud_unit: _CloudUnit = None,
+    mount: _Mount = None,
+    inverse: _Inverse = None,
     board: BoardOption = None,
     ball: BallOption = None,
-    topic: Annotated[str | None, typer.Option("--topic", help="Of a bag: the topic of the scans.")] = None,
-    named: Annotated[
-        str | None, typer.Option("--frames", metavar="BASE,FLANGE[,SCANNER]", help="Of a bag: frames of tf.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER, or BAG-session."),
-    ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")] = False,
+    topic: _Topic = None,
+    frames: _Frames = None,
+    output: _Output = None,
+    yes: _Yes = False,
+    as_json: _Json = False,
 ) -> None:
     """Make a session of a folder of scans and poses; the scans tell which convention the poses are in.
 
@@ -57,13 +72,13 @@ def init(
     from stitch.intake.stated import Stated
 
     if is_bag(folder):
-        of_bag(folder, output or folder.with_name(f"{folder.stem}-session"), topic, named, as_json)
+        of_bag(folder, output, topic, frames, as_json)
         return
-    if topic or named:
+    if topic or frames:
         raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
     stated = Stated(
         poses,
-        tuple(name.strip() for name in columns.split(",")) if columns else (),
+        names_in(columns),
         rotation,
         angle_unit=angles,
         length_unit=unit,
@@ -72,4 +87,4 @@ def init(
         inverse=inverse,
         targets=looked_for(board, ball),
     )
-    of_scans(folder, folder if output is None else output, stated, yes, as_json)
+    of_scans(folder, output, stated, yes, as_json)

@@ -24,6 +24,21 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `sti
 Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone on standard output.")]
 
 
+def names_in(text: str | None) -> tuple[str, ...]:
+    """What a list with commas names, empty places too."""
+    return tuple(name.strip() for name in text.split(",")) if text else ()
+
+
+def require_new(file: Path | None) -> None:
+    """Refuse to write over a file; a link counts, whether or not it leads anywhere.
+
+    Raises:
+        InputError: there is one.
+    """
+    if file is not None and (file.exists() or file.is_symlink()):
+        raise InputError(f"{file}: exists already; name another file, or remove it")
+
+
 def require_tolerance(tolerance: float | None) -> None:
     """Refuse what is no length.
 

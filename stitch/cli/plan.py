@@ -8,41 +8,47 @@ import typer
 from stitch.cli.options import Json, Trust
 from stitch.errors import InputError
 
+_Folder = Annotated[
+    Path, typer.Argument(metavar="SESSION|RUN", help="Session with planned views, or folder that `stitch run` wrote.")
+]
+_Views = Annotated[int | None, typer.Option("--views", metavar="N", help="Further views at the most.")]
+_Split = Annotated[
+    tuple[str, str] | None,
+    typer.Option("--split", metavar="EFFECT EFFECT", help="Views that tell these two apart."),
+]
+_Halve = Annotated[bool, typer.Option("--halve", help="Views that halve the hand-eye's uncertainty.")]
+_Feature = Annotated[
+    str | None,
+    typer.Option("--for", metavar="FEATURE", help="Where U counts: x,y,z in the frame of the stitched cloud."),
+]
+_Part = Annotated[
+    Path | None, typer.Option("--part", metavar="MESH", help="The part: a mesh, or a cloud with normals.")
+]
+_Size = Annotated[
+    float | None,
+    typer.Option("--size", metavar="MM", help="Longest side of a part of which nothing else is known."),
+]
+_Field = Annotated[float | None, typer.Option("--field", metavar="DEG", help="Full angle of the scanner's field.")]
+_Start = Annotated[
+    str | None,
+    typer.Option("--start", metavar="J1,J2,…", help="Joint angles (°) that see the part, where no view is planned."),
+]
+_Output = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="New folder for views.csv and plan.json.")
+]
+
 
 def plan_views(
-    folder: Annotated[
-        Path,
-        typer.Argument(metavar="SESSION|RUN", help="Session with planned views, or folder that `stitch run` wrote."),
-    ],
-    views: Annotated[int | None, typer.Option("--views", metavar="N", help="Further views at the most.")] = None,
-    split: Annotated[
-        tuple[str, str] | None,
-        typer.Option("--split", metavar="EFFECT EFFECT", help="Views that tell these two apart."),
-    ] = None,
-    halve: Annotated[bool, typer.Option("--halve", help="Views that halve the hand-eye's uncertainty.")] = False,
-    feature: Annotated[
-        str | None,
-        typer.Option("--for", metavar="FEATURE", help="Where U counts: x,y,z in the frame of the stitched cloud."),
-    ] = None,
-    part: Annotated[
-        Path | None, typer.Option("--part", metavar="MESH", help="The part: a mesh, or a cloud with normals.")
-    ] = None,
-    size: Annotated[
-        float | None,
-        typer.Option("--size", metavar="MM", help="Longest side of a part of which nothing else is known."),
-    ] = None,
-    field: Annotated[
-        float | None, typer.Option("--field", metavar="DEG", help="Full angle of the scanner's field.")
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            "--start", metavar="J1,J2,…", help="Joint angles (°) that see the part, where no view is planned."
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="New folder for views.csv and plan.json.")
-    ] = None,
+    folder: _Folder,
+    views: _Views = None,
+    split: _Split = None,
+    halve: _Halve = False,
+    feature: _Feature = None,
+    part: _Part = None,
+    size: _Size = None,
+    field: _Field = None,
+    start: _Start = None,
+    output: _Output = None,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:

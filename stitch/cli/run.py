@@ -5,32 +5,39 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import EffectsFile, Force, Json, Memory, Tolerance, Trust, bytes_of, require_tolerance
-from stitch.cli.run_options import RunOptions
+from stitch.cli.options import EffectsFile, Force, Json, Memory, Tolerance, Trust, bytes_of, names_in, require_tolerance
+from stitch.cli.run_options import ModelOptions, RunOptions
+
+_Sessions = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[SESSION]...", help="Session folders of one rig; default: the one you stand in."),
+]
+_Output = Annotated[Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")]
+_HandEye = Annotated[
+    Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
+]
+_Arm = Annotated[
+    Path | None,
+    typer.Option("--arm", metavar="RUN2", help="Keep the arm of another run (joints, links), fit all else."),
+]
+_Effects = Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")]
+_Keep = Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")]
+_Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
+_Mesh = Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")]
 
 
 def run(
-    sessions: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[SESSION]...", help="Session folders of one rig; default: the one you stand in."),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default runs/NAME.")
-    ] = None,
-    hand_eye: Annotated[
-        Path | None, typer.Option("--hand-eye", metavar="RUN2", help="Use the model of another run, do not correct.")
-    ] = None,
-    arm: Annotated[
-        Path | None,
-        typer.Option("--arm", metavar="RUN2", help="Keep the arm of another run (joints, links), fit all else."),
-    ] = None,
-    effects: Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")] = "",
+    sessions: _Sessions = None,
+    output: _Output = None,
+    hand_eye: _HandEye = None,
+    arm: _Arm = None,
+    effects: _Effects = "",
     effects_file: EffectsFile = None,
     trust: Trust = False,
     force: Force = False,
-    keep: Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")] = False,
-    recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
-    mesh: Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")] = False,
+    keep: _Keep = False,
+    recording: _Recording = True,
+    mesh: _Mesh = False,
     tolerance: Tolerance = None,
     memory: Memory = None,
     as_json: Json = False,
@@ -51,13 +58,10 @@ def run(
     # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.cli.actions.run_sessions import run_sessions
 
+    named = tuple(name for name in names_in(effects) if name)
     options = RunOptions(
         output=output,
-        hand_eye=hand_eye,
-        arm=arm,
-        effects=tuple(name.strip() for name in effects.split(",") if name.strip()),
-        effects_file=effects_file,
-        trust=trust,
+        model=ModelOptions(hand_eye, arm, named, effects_file=effects_file, trust=trust),
         force=force,
         keep=keep,
         recording=recording,

@@ -5,15 +5,22 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
+class ModelOptions:
+    """From which model a run starts: that of another run as it is, its arm alone, or effects by name."""
+
+    hand_eye: Path | None = None  # run whose model is used and not corrected
+    arm: Path | None = None  # run whose arm is kept
+    effects: tuple[str, ...] = ()
+    effects_file: Path | None = None
+    trust: bool = False
+
+
+@dataclass(frozen=True)
 class RunOptions:
     """The options by their names on the command line."""
 
     output: Path | None = None
-    hand_eye: Path | None = None
-    arm: Path | None = None
-    effects: tuple[str, ...] = ()
-    effects_file: Path | None = None
-    trust: bool = False
+    model: ModelOptions = ModelOptions()
     force: bool = False
     keep: bool = False
     recording: bool = True

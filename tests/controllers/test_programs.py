@@ -186,3 +186,11 @@ def test_command_writes_once(tmp_path, capsys):
         assert ended.value.code == code
     assert "7 rows of views.csv" in (text := capsys.readouterr().err) and "exists already" in text
     assert target.read_text().startswith("view,j1_deg,")
+
+
+def test_the_command_warns_of_the_program_and_not_of_the_table(tmp_path, capsys):
+    program = tmp_path / "p.ls"
+    program.write_text(FANUC)
+    with pytest.raises(SystemExit):
+        cli.main(["import", str(program), "-o", str(tmp_path / "views.csv")])
+    assert f"stitch: {program}: poses are those of the tool" in capsys.readouterr().err

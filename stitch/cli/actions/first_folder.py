@@ -9,6 +9,7 @@ from typing import Any
 
 import typer
 
+from stitch.cli.options import names_in
 from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.intake.bag_session import write_bag_session
@@ -21,12 +22,14 @@ from stitch.intake.stated import Stated
 _ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
 
 
-def of_scans(folder: Path, out: Path, stated: Stated, yes: bool, as_json: bool) -> None:
-    """A session of scans and poses; what they do not tell is asked on a terminal, or guessed with `yes`.
+def of_scans(folder: Path, output: Path | None, stated: Stated, yes: bool, as_json: bool) -> None:
+    """A session of scans and poses, in their folder if nowhere else; what they do not tell is asked on a terminal, or
+    guessed with `yes`.
 
     Raises:
         InputError, NoResultError: as `stitch init` ends.
     """
+    out = folder if output is None else output
     require_free(out, not stated.targets.nothing)
     first = first_session(folder, stated)
     _tell(first.guesses)
@@ -36,13 +39,14 @@ def of_scans(folder: Path, out: Path, stated: Stated, yes: bool, as_json: bool) 
     _end(out, len(first.pairing.used), first.guesses, as_json)
 
 
-def of_bag(bag: Path, out: Path, topic: str | None, named: str | None, as_json: bool) -> None:
-    """A session of a bag: what its messages do not say is not asked, flags state it.
+def of_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
+    """A session of a bag, beside it if nowhere else; what its messages do not say is not asked, flags state it.
 
     Raises:
         InputError, NoResultError: as `stitch init` ends.
     """
-    frames = tuple(name.strip() for name in named.split(",")) if named else ()
+    out = output or bag.with_name(f"{bag.stem}-session")
+    frames = names_in(named)
     if named and len(frames) not in (2, 3):
         raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
     made = write_bag_session(bag, out, topic, frames)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from stitch.cli.run_options import RunOptions
+from stitch.cli.run_options import ModelOptions, RunOptions
 from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.recorders import recorder_for
 from stitch.cli.terminal.run_summary import show
@@ -30,9 +30,9 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     Raises:
         InputError, NoResultError: as `stitch run` ends.
     """
-    if asked.effects_file:
-        load_effects(asked.effects_file)
-    for name in asked.effects:
+    if asked.model.effects_file:
+        load_effects(asked.model.effects_file)
+    for name in asked.model.effects:
         known(name)
     here = not sessions
     sessions = sessions or [_here()]
@@ -40,7 +40,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     loaded = [load_session(path, memory=memory) for path in sessions]
     names = _names(loaded)
     target = asked.output or Path("../runs" if here else "runs") / "+".join(names)
-    model, kept, own_effects = _given(asked)
+    model, kept, own_effects = _given(asked.model)
     run_folder.load_early("stitch.reports")
     with (
         doing(f"{'+'.join(names)}: reading the scans"),
@@ -48,7 +48,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     ):
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, asked.recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, asked.effects, asked.keep, kept)
+        runs = run_rig(loaded, model, recorders, asked.model.effects, asked.keep, kept)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
             run_folder.write_with_page(result, folder, asked.tolerance)
@@ -63,7 +63,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
         show(runs, target, asked.says_next)
 
 
-def _given(asked: RunOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:
+def _given(asked: ModelOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:
     """The model that is used as it is, the arm that is kept, and the file of the user's own effects, if any."""
     if asked.hand_eye and (asked.effects or asked.arm):
         raise InputError(
