@@ -1,9 +1,8 @@
 """A session folder on disk -> `Session`; every check of input is made here or in the readers it calls."""
 
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,20 +11,16 @@ from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
 from stitch.measurement.session import Mount, Session, View
-from stitch.measurement.thinning import ENOUGH, points_within, thinned_cloud
+from stitch.measurement.thinning import ENOUGH, points_within
 from stitch.reading import scanner_toml, session_toml
-from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
-from stitch.reading.plausible import check_scale, require_near
+from stitch.reading.plausible import check_scale
 from stitch.reading.points_csv import read_points, read_targets
+from stitch.reading.session_scans import read_scans
 from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
 from stitch.reading.views_csv import Row, read_views, row_at
-from stitch.system.threads import parallel
 from stitch.units import METRES
-
-# Fewer points span no surface.
-_FEWEST = 3
 
 
 def load_session(
@@ -54,14 +49,7 @@ def load_session(
     robot = session_toml.robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
-    sightings = _sightings(path, [row.name for row in rows]) if scans else {}
-    if memory is not None:
-        at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
-    within = scanner_toml.within(file, document.get("scanner", {}))
-    cloud = partial(_read, scale=METRES[cloud_unit] / METRES[unit], within=within)
-    read = partial(_cloud, path, read=cloud, metres=METRES[unit], at_most=at_most)
-    clouds = parallel(read, rows, "reading scans") if scans else [None] * len(rows)
-    views = _views(path, rows, clouds, sightings, scans)
+    views = _views(path, document, rows, scans=scans, at_most=at_most, memory=memory)
     cad, cad_unit = session_toml.cad(file, document.get("part", {}))
     session = Session(
         path=path,
@@ -74,7 +62,7 @@ def load_session(
         cad=cad,
         cad_unit=cad_unit,
         views=views,
-        nominal=_nominal(path, sightings),
+        nominal=_nominal(path, views),
         repeatability=session_toml.repeatability(file, document.get("robot")),
     )
     if scans:
@@ -104,19 +92,34 @@ def _sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
     }
 
 
-def _nominal(path: Path, sightings: dict[str, Sighting]) -> Nominal | None:
+def _nominal(path: Path, views: tuple[View, ...]) -> Nominal | None:
     file = path / "targets.csv"
     if not file.is_file():
         return None
     if not (path / "points.csv").is_file():
         raise InputError(f"{file}: there is no points.csv that names its targets; write it, or remove targets.csv")
-    return read_targets(file, sorted({name for s in sightings.values() for name in s.targets}))
+    seen = (view.sighting.targets for view in views if view.sighting is not None)
+    return read_targets(file, sorted({name for names in seen for name in names}))
 
 
 def _views(
-    path: Path, rows: list[Row], clouds: Iterable[Cloud | None], sightings: dict[str, Sighting], scans: bool
+    path: Path,
+    document: dict[str, Any],
+    rows: list[Row],
+    *,
+    scans: bool,
+    at_most: int | None,
+    memory: float | None,
 ) -> tuple[View, ...]:
     """The rows with what was seen."""
+    sightings = _sightings(path, [row.name for row in rows]) if scans else {}
+    if memory is not None:
+        at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
+    within = scanner_toml.within(path / "session.toml", document.get("scanner", {}))
+    unit = document["length_unit"]
+    clouds: Iterable[Cloud | None] = [None] * len(rows)
+    if scans:
+        clouds = read_scans(path, rows, unit, document.get("cloud_unit", unit), within=within, at_most=at_most)
     views = []
     for row, cloud in zip(rows, clouds, strict=True):
         if scans and cloud is None and not sightings:
@@ -137,32 +140,3 @@ def _views(
             )
         )
     return tuple(views)
-
-
-def _cloud(path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, at_most: int | None) -> Cloud | None:
-    if not row.cloud:
-        return None
-    file = path / row.cloud
-    try:
-        cloud = read(file)
-        if len(cloud.points) < _FEWEST:
-            raise InputError(
-                f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
-                "it again"
-            )
-        # Looked at before some are taken: each of them will be fused.
-        require_near(str(file), cloud.points * metres)
-    except InputError as error:
-        raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read, file))
-
-
-def _read(file: Path, scale: float, within: Array | None) -> Cloud:
-    """A scan in length_unit, what counts of it."""
-    cloud = read_cloud(file, scale)
-    if within is None:
-        return cloud
-    inside = cloud.within(within)
-    if not len(inside.points):
-        raise InputError(f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml")
-    return inside

@@ -1,0 +1,65 @@
+"""The scans that a session's views name, read on all cores: what counts of each, in length_unit."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.thinning import thinned_cloud
+from stitch.reading.clouds import read_cloud
+from stitch.reading.plausible import require_near
+from stitch.reading.views_csv import Row
+from stitch.system.threads import parallel
+from stitch.units import METRES
+
+# Fewer points span no surface.
+_FEWEST = 3
+
+
+def read_scans(
+    path: Path, rows: Sequence[Row], length_unit: str, cloud_unit: str, *, within: Array | None, at_most: int | None
+) -> Iterator[Cloud | None]:
+    """The scans of a session folder in the order of its rows, None where a row names none.
+
+    Args:
+        cloud_unit: of the files; the clouds come in length_unit.
+        within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit; None: all counts.
+        at_most: points of a view that stay in memory; None: all.
+
+    Raises:
+        InputError: a file missing, broken, with too few points or in another unit; names the view and its line.
+    """
+    read = partial(_read, scale=METRES[cloud_unit] / METRES[length_unit], within=within)
+    cloud = partial(_cloud, path, read=read, metres=METRES[length_unit], at_most=at_most)
+    return parallel(cloud, rows, "reading scans")
+
+
+def _cloud(path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, at_most: int | None) -> Cloud | None:
+    if not row.cloud:
+        return None
+    file = path / row.cloud
+    try:
+        cloud = read(file)
+        if len(cloud.points) < _FEWEST:
+            raise InputError(
+                f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
+                "it again"
+            )
+        # Looked at before some are taken: each of them will be fused.
+        require_near(str(file), cloud.points * metres)
+    except InputError as error:
+        raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
+    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read, file))
+
+
+def _read(file: Path, scale: float, within: Array | None) -> Cloud:
+    """A scan in length_unit, what counts of it."""
+    cloud = read_cloud(file, scale)
+    if within is None:
+        return cloud
+    inside = cloud.within(within)
+    if not len(inside.points):
+        raise InputError(f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml")
+    return inside
