@@ -71,62 +71,75 @@ def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
     """
     s = own.sightings
     assert s is not None
-    V, S = s.used.shape
-    turns = 3 * (s.rotation is not None)
-    drawn = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
-    B, m = V + drawn, 3 * S + turns
     poses = own.poses(T_mount)
-    placed = frames.transform(poses, s.points)
-    centre = np.asarray(placed[s.used].mean(axis=0))
-    known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
-    left, noise = np.zeros((B, m)), np.zeros((B, m))
-    lever, columns = np.zeros((V, m, 6)), np.zeros((B, m, landmarks.size))
-    left[:V, : 3 * S] = (placed - known).reshape(V, -1)
-    noise[:V, : 3 * S] = np.repeat(np.where(s.used, s.sigma**2, 0.0), 3, axis=1)
-    # At the landmark, not where the view puts it: a turn of all views must look exactly as the same turn of the
-    # landmarks does, or what is left would lend itself to parameters that nothing shows. The normal equations agree.
-    lever[:, : 3 * S, :3] = -frames.skew(known - centre).reshape(V, -1, 3)
-    lever[:, : 3 * S, 3:] = np.tile(np.eye(3), (V, S, 1))
-    for axis in range(3):
-        v, slot = np.nonzero(s.used)
-        columns[v, 3 * slot + axis, 3 * s.target[v, slot] + axis] = -1.0
-    if s.rotation is not None and s.sigma_rotation is not None and landmarks.orientation is not None:
-        left[:V, 3 * S :] = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
-        noise[:V, 3 * S :] = np.where(s.used.any(axis=1), s.sigma_rotation**2, 0.0)[:, None]
-        lever[:, 3 * S :, :3] = np.eye(3)
-        at = landmarks.positions.size
-        columns[:V, 3 * S :, at : at + 3] = -np.eye(3)
+    centre = np.asarray(frames.transform(poses, s.points)[s.used].mean(axis=0))
+    parts = [_coordinates(s, poses, centre, landmarks)]
+    if s.rotation is not None:
+        parts.append(_turns(s, poses, landmarks))
+    left, noise, lever, columns = (np.concatenate(blocks, axis=1) for blocks in zip(*parts, strict=True))
     absent = noise == 0
-    fixed = absent.astype(float)
-    _draw(landmarks, V, left, columns, fixed)
-    left[:V][absent[:V]], lever[absent[:V]], columns[:V][absent[:V]] = 0.0, 0.0, 0.0
-    hand_eye = np.zeros((B, m, 6))
-    hand_eye[:V] = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
+    left[absent], lever[absent], columns[absent] = 0.0, 0.0, 0.0
+    of_drawing, moved_in_drawing, known = _drawn(landmarks, left.shape[1])
+    nothing = np.zeros_like(of_drawing)
+    hand_eye = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
     return Rows(
         capture=own,
         T_mount=T_mount,
         centre=centre,
-        residual=left,
+        residual=np.concatenate([left, of_drawing]),
         lever=lever,
-        hand_eye=hand_eye,
-        landmarks=columns,
-        noise=noise,
-        fixed=fixed,
-        positions=3 * S,
+        hand_eye=np.concatenate([hand_eye, np.repeat(nothing[..., None], 6, axis=2)]),
+        landmarks=np.concatenate([columns, moved_in_drawing]),
+        noise=np.concatenate([noise, nothing]),
+        fixed=np.concatenate([absent.astype(float), known]),
+        positions=3 * s.used.shape[1],
     )
 
 
-def _draw(landmarks: Landmarks, views: int, left: Array, columns: Array, fixed: Array) -> None:
-    """Fill the blocks of nominal targets: the target less its place in the drawing."""
+def _coordinates(s: Sightings, poses: Array, centre: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
+    """What is left (V, 3S), its variance, (V, 3S, 6) per twist of the view and (V, 3S, U) per landmark."""
+    V, S = s.used.shape
+    known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
+    left = (frames.transform(poses, s.points) - known).reshape(V, -1)
+    noise = np.repeat(np.where(s.used, s.sigma**2, 0.0), 3, axis=1)
+    # At the landmark, not where the view puts it: a turn of all views must look exactly as the same turn of the
+    # landmarks does, or what is left would lend itself to parameters that nothing shows. The normal equations agree.
+    turned = -frames.skew(known - centre).reshape(V, -1, 3)
+    lever = np.concatenate([turned, np.tile(np.eye(3), (V, S, 1))], axis=2)
+    columns = np.zeros((V, 3 * S, landmarks.size))
+    v, slot = np.nonzero(s.used)
+    for axis in range(3):
+        columns[v, 3 * slot + axis, 3 * s.target[v, slot] + axis] = -1.0
+    return left, noise, lever, columns
+
+
+def _turns(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
+    """The same of the three rows (rad) of a probe's turn; zeros where nobody knows how it is held."""
+    V, at = len(poses), landmarks.positions.size
+    left, noise, lever, columns = (np.zeros((V, 3, *more)) for more in ((), (), (6,), (landmarks.size,)))
+    if s.rotation is None or s.sigma_rotation is None or landmarks.orientation is None:
+        return left, noise, lever, columns
+    left = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
+    noise[:] = np.where(s.used.any(axis=1), s.sigma_rotation**2, 0.0)[:, None]
+    lever[..., :3] = np.eye(3)
+    columns[..., at : at + 3] = -np.eye(3)
+    return left, noise, lever, columns
+
+
+def _drawn(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
+    """Of D nominal targets less their places in the drawing: what is left (D, m), (D, m, U) per landmark, and the
+    variance (D, m) that is known; three rows each, the others absent."""
+    count = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
+    left, columns, fixed = np.zeros((count, m)), np.zeros((count, m, landmarks.size)), np.ones((count, m))
     if landmarks.drawing is None or landmarks.T_reference_part is None:
-        return
+        return left, columns, fixed
     placed = frames.transform(landmarks.T_reference_part, landmarks.drawing.points)
     for t, (k, p) in enumerate(zip(landmarks.drawing.target, placed, strict=True)):
-        block = views + t
-        left[block, :3] = landmarks.positions[k] - p
-        columns[block, :3, 3 * k : 3 * k + 3] = np.eye(3)
-        columns[block, :3, -6:] = np.hstack([frames.skew(p), -np.eye(3)])
-        fixed[block, :3] = landmarks.drawing.sigma[t] ** 2
+        left[t, :3] = landmarks.positions[k] - p
+        columns[t, :3, 3 * k : 3 * k + 3] = np.eye(3)
+        columns[t, :3, -6:] = np.hstack([frames.skew(p), -np.eye(3)])
+        fixed[t, :3] = landmarks.drawing.sigma[t] ** 2
+    return left, columns, fixed
 
 
 def mixed_model_of_rows(rows: Rows, A: Array) -> MixedModel:
