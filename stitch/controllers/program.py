@@ -64,24 +64,10 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     points = tuple({(p.file, p.pose_at, p.joints_at): p for p in every}.values())
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
-    taught_in = require_one_frame(file, points)
-    if taught_in is not None and taught_in not in NOTHING_IN_FORCE:
-        # A script of a UR has its poses in the base.
-        lacking = [f"--{name}" for name, value in (("frame", frame), ("tool", tool)) if value is None]
-        if reader is universal and "--frame" in lacking:
-            lacking.remove("--frame")
-        if lacking:
-            known = f" ({taught_in})" if taught_in else ""
-            raise InputError(
-                f"{file}: its poses are those of a tool in a frame{known} that the file does not hold; to fix: state "
-                f"{' and '.join(lacking)} as the controller shows them, zeros where none is in force"
-            )
-    moved = next((p for p in points if p.moved_by and p.T_frame_tool is not None), None)
-    if moved is not None:
-        raise InputError(
-            f"{file} line {moved.line}: {moved.name} has {moved.moved_by}; where an external axis carries the arm its "
-            "joint angles cannot be told; to fix: give joint targets"
-        )
+    # A script of a UR has its poses in the base.
+    needed = {"tool": tool} if reader is universal else {"frame": frame, "tool": tool}
+    _require_stated(file, require_one_frame(file, points), [f"--{name}" for name in needed if needed[name] is None])
+    _require_own_motion(file, points)
     files = dict.fromkeys(p.file for p in points if p.file is not None)
     texts = {file: text} | {path: program_text(path) for path in files}
     times = Counter(p.name for p in every)
@@ -96,6 +82,27 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         other=tuple(p.name for p in told if not p.is_target),
         unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(_plain(reader, text))),
     )
+
+
+def _require_stated(file: Path, taught_in: str | None, lacking: list[str]) -> None:
+    """Refuse poses of a frame and a tool that nobody states."""
+    if taught_in is None or taught_in in NOTHING_IN_FORCE or not lacking:
+        return
+    known = f" ({taught_in})" if taught_in else ""
+    raise InputError(
+        f"{file}: its poses are those of a tool in a frame{known} that the file does not hold; to fix: state "
+        f"{' and '.join(lacking)} as the controller shows them, zeros where none is in force"
+    )
+
+
+def _require_own_motion(file: Path, points: Sequence[Taught]) -> None:
+    """Refuse poses that an arm reaches on an external axis."""
+    moved = next((p for p in points if p.moved_by and p.T_frame_tool is not None), None)
+    if moved is not None:
+        raise InputError(
+            f"{file} line {moved.line}: {moved.name} has {moved.moved_by}; where an external axis carries the arm its "
+            "joint angles cannot be told; to fix: give joint targets"
+        )
 
 
 def _plain(reader: ModuleType, text: str) -> str:

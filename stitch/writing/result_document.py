@@ -53,10 +53,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "heldout_rms": run.heldout_rms,
         "noise_floor": run.noise_floor,
         "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
-        "effects": {
-            term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
-            for term in run.terms
-        },
+        "effects": _effects(run),
         "effects_covariance": {
             "parameters": list(run.model.effects_covariance.names),
             "matrix": run.model.effects_covariance.matrix.tolist(),
@@ -66,10 +63,7 @@ def result_document(run: Run) -> dict[str, Any]:
             *(_left_out_view(item) for item in run.left_out),
         ],
         "left_out": [{"view": item.view, "why": item.why} for item in run.left_out],
-        "linkage": {
-            "components": [list(part) for part in run.links.components],
-            "weak": [{"view": v, "partner": w, "directions": "all, through one pair"} for v, w in run.links.weak],
-        },
+        "linkage": _linkage(run),
         "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,
@@ -97,6 +91,21 @@ def ledger(run: Run) -> list[dict[str, Any]]:
         | ({"notes": [asdict(note) for note in s.notes]} if s.notes else {})
         for i, s in enumerate(run.ledger)
     ]
+
+
+def _effects(run: Run) -> dict[str, dict[str, Any]]:
+    return {
+        term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
+        for term in run.terms
+    }
+
+
+def _linkage(run: Run) -> dict[str, Any]:
+    """Groups of views that surfaces connect, and views that hang on a single pair."""
+    return {
+        "components": [list(part) for part in run.links.components],
+        "weak": [{"view": v, "partner": w, "directions": "all, through one pair"} for v, w in run.links.weak],
+    }
 
 
 def _disagreement(run: Run) -> dict[str, Any] | None:

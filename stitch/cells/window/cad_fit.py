@@ -69,9 +69,7 @@ def fit(
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
         spread = spread_of(rest[seen.used], wanted)
         scale = max(spread, 0.5 * scale, noise)
-        weight = seen.used * biweight(rest / (TUKEY * scale))
-        if by_cell:
-            weight *= cell_weights(seen.local, replace(seen.found, distance=rest), seen.used, cad.size / _CELLS, scale)
+        weight = _weights(seen, rest, scale, cad.size / _CELLS if by_cell else None)
         N = _normal_matrix(seen.design, weight, cad)
         shrink, size = ridge(N, numbers, scale, size)
         pull = np.concatenate([np.zeros(6), numbers]) * shrink
@@ -98,6 +96,14 @@ def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
     shift = frames.make(np.eye(3), centre)
     return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
+
+
+def _weights(seen: "_Seen", rest: Array, scale: float, cell: float | None) -> Array:
+    """(N,) by what is left of each point's distance, and of its whole cell's where cells have a size."""
+    by_point = np.asarray(seen.used * biweight(rest / (TUKEY * scale)))
+    if cell is None:
+        return by_point
+    return by_point * cell_weights(seen.local, replace(seen.found, distance=rest), seen.used, cell, scale)
 
 
 def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: Array) -> Array:
