@@ -1,4 +1,4 @@
-"""What every cell's command can hand out beside its result: a Rerun recording, a page, a session folder.
+"""What every cell's command reads and can hand out beside its result: a Rerun recording, a page, a session folder.
 
 Recording and page come from whoever offers them under the entry points `stitch.cell_recordings` and
 `stitch.cell_reports`, by the command's name.
@@ -13,6 +13,8 @@ import typer
 from stitch.errors import InputError
 from stitch.system.whole_file import whole
 
+JobFile = Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
 RecordingOption = Annotated[
     Path | None, typer.Option("--recording", metavar="FILE", help="Write a Rerun recording, .rrd.")
 ]

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption
+from stitch.cells.outputs import JsonOption, RecordingOption, ReportOption, SessionOption
 
 
 def base(
@@ -13,7 +13,7 @@ def base(
     recording: RecordingOption = None,
     report: ReportOption = None,
     session: SessionOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the transform between two robot bases from a stand with a measuring rod.
 

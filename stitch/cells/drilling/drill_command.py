@@ -5,16 +5,16 @@ from typing import Annotated
 
 import typer
 
-from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption
+from stitch.cells.outputs import JobFile, JsonOption, RecordingOption, ReportOption, SessionOption
 
 
 def drill(
-    file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
+    file: JobFile,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the drives.")] = None,
     recording: RecordingOption = None,
     report: ReportOption = None,
     session: SessionOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Correct the drives of holes from reference holes that the robot has seen.
 

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from stitch.cells.outputs import RecordingOption, ReportOption, SessionOption
+from stitch.cells.outputs import JobFile, JsonOption, RecordingOption, ReportOption, SessionOption
 
 
 def fit(
-    file: Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")],
+    file: JobFile,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
     recording: RecordingOption = None,
     report: ReportOption = None,
@@ -20,7 +20,7 @@ def fit(
             metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
 
