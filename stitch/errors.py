@@ -8,7 +8,7 @@ class StitchError(Exception):
 
 
 class InputError(StitchError):
-    """Bad input or usage: the message names the file, line or view, and the mend (exit code 2)."""
+    """Bad input or usage: the message names the file, line or view, and how to fix it (exit code 2)."""
 
     exit_code = 2
 

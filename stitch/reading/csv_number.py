@@ -24,7 +24,7 @@ def number(file: Path, line: int, column: str, cell: str, mend: str = "write a f
     """A finite number.
 
     Raises:
-        InputError: names file, line, column and the mend.
+        InputError: names file, line and column, and how to fix it.
     """
     try:
         value = float(cell)

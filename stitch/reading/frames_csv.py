@@ -32,7 +32,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
     """Read and check frames.csv against the views known from views.csv.
 
     Raises:
-        InputError: names the line and the mend.
+        InputError: names the line and how to fix it.
     """
     require_file(file, f"a frames session needs {','.join(('view', *_POSE))} there")
     header, rows = read_lines(file)

@@ -22,7 +22,7 @@ def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
         known: views of views.csv.
 
     Raises:
-        InputError: names the line and the mend.
+        InputError: names the line and how to fix it.
     """
     allowed = set(known)
     rows: dict[str, list[tuple[str, list[float]]]] = {}
@@ -54,7 +54,7 @@ def read_targets(file: Path, seen: Sequence[str]) -> Nominal:
         seen: targets of points.csv; one of them at least must be here.
 
     Raises:
-        InputError: names the line and the mend.
+        InputError: names the line and how to fix it.
     """
     lines: dict[str, int] = {}
     table = []

@@ -21,7 +21,7 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
     """[scanner]; lengths in length_unit.
 
     Raises:
-        InputError: a value that cannot be, with the mend.
+        InputError: a value that cannot be, and how to fix it.
     """
     axis = table.get("optical_axis", "+z")
     if axis not in tuple(_AXES):

@@ -39,7 +39,7 @@ def load_session(
         start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
 
     Raises:
-        InputError: anything missing, contradictory or implausible; names file, line or view, and the mend.
+        InputError: anything missing, contradictory or implausible; names file, line or view, and how to fix it.
     """
     path = Path(path)
     file = path / "session.toml"

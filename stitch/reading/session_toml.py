@@ -83,7 +83,7 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
     """[robot] by its DH rows or URDF; None without one.
 
     Raises:
-        InputError: a value that cannot be, with the mend.
+        InputError: a value that cannot be, and how to fix it.
     """
     if not table:
         return None

@@ -41,7 +41,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     stand, the reported pose is used and must agree with the joints.
 
     Raises:
-        InputError: with the line, and the mend.
+        InputError: names the line and how to fix it.
     """
     require_file(file, "a session needs a row per scan there")
     header, lines = read_lines(file)

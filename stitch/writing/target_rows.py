@@ -84,7 +84,7 @@ def residual_columns(found: TargetFit, session: Session) -> dict[str, Array]:
 
 
 def as_counted(measurement: Measurement, session: Session, document: dict[str, Any]) -> Measurement:
-    """The chain as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
+    """The measurement as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
     s, outliers = measurement.capture.sightings, document.get("outliers", ())
     if s is None:
         return measurement
