@@ -33,7 +33,7 @@ from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
-from stitch.planning.chances import DRAWS, Court
+from stitch.planning.chances import DRAWS, ExpectedDiagnosis
 from stitch.planning.expected_hand_eye import expected_hand_eye
 from stitch.planning.expected_model import Cell, expected_model, seen
 from stitch.planning.expected_scan import Field
@@ -94,7 +94,7 @@ def planned(measured: Measured, law: str | None, rng: np.random.Generator) -> Ro
     candidates, _ = candidates_of(linear, empirical=False)
     own = next(c for c in candidates if c.name == law)
     shift = np.repeat(_shift(own, measured.hidden[law])[:, None], DRAWS, axis=1)
-    chance = Court(under(linear, told.fitted), candidates).chance(law, shift, rng)
+    chance = ExpectedDiagnosis(under(linear, told.fitted), candidates).chance(law, shift, rng)
     return out | {"detected": chance.detected, "named": chance.named, "misnamed": chance.misnamed}
 
 

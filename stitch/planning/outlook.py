@@ -11,7 +11,7 @@ from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import usual_sizes
-from stitch.planning.chances import Chance, Court, usual_shifts
+from stitch.planning.chances import Chance, ExpectedDiagnosis, usual_shifts
 from stitch.planning.expected_hand_eye import ExpectedHandEye, expected_hand_eye
 from stitch.planning.expected_model import Cell, expected_model, seen
 from stitch.planning.rivals import Pair, pairs_of
@@ -67,15 +67,15 @@ def outlook(
     told = told_sizes(linear, cell.scatter.noise) if told is None else told
     diagnosed = under(linear, told.fitted)
     candidates, missing = candidates_of(linear, empirical=False)
-    court = Court(diagnosed, candidates)
+    expected = ExpectedDiagnosis(diagnosed, candidates)
     at = None if feature is None else in_scanner(found.freed.poses, feature)
     ordinary = _ordinary(told.believed)
     return Outlook(
         views=len(session.views),
         hand_eye=expected_hand_eye(under(linear, told.believed), found, at),
         ordinary=expected_hand_eye(under(linear, ordinary), found, at),
-        effects=_effects(diagnosed, candidates, court, chances),
-        pairs=tuple(pairs_of(diagnosed, court.candidates)),
+        effects=_effects(diagnosed, candidates, expected, chances),
+        pairs=tuple(pairs_of(diagnosed, expected.candidates)),
         not_asked={name: needs for name, needs in missing.items() if name not in linear.model.effects},
         told=told,
     )
@@ -93,13 +93,13 @@ def in_scanner(poses: Array, feature: Array) -> Array:
 
 
 def _effects(
-    linear: LinearModel, candidates: Sequence[Candidate], court: Court, chances: bool
+    linear: LinearModel, candidates: Sequence[Candidate], expected: ExpectedDiagnosis, chances: bool
 ) -> tuple[EffectOutlook, ...]:
-    shown, rng, out = {c.name for c in court.candidates}, np.random.default_rng(0), []
+    shown, rng, out = {c.name for c in expected.candidates}, np.random.default_rng(0), []
     for c in candidates:
-        sizes = smallest_detectable(linear, c, court.tests)
+        sizes = smallest_detectable(linear, c, expected.tests)
         believable = {p.name: sizes[p.name] for p in c.parameters if p.name in sizes and sizes[p.name] < p.limit}
-        chance = court.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None
+        chance = expected.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None
         own = [p for p in c.parameters if not p.grid]
         usual, units = {p.name: p.typical for p in own}, {p.name: p.unit for p in own}
         out.append(EffectOutlook(c.name, c.name in shown, believable, usual=usual, units=units, chance=chance))

@@ -13,7 +13,7 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.diagnosis.candidates import candidates_of
 from stitch.errors import NoResultError
 from stitch.model.model import Model
-from stitch.planning.chances import Court
+from stitch.planning.chances import ExpectedDiagnosis
 from stitch.planning.expected_hand_eye import expected_hand_eye
 from stitch.planning.expected_model import Cell, expected_model, seen
 from stitch.planning.expected_scan import Field
@@ -84,12 +84,12 @@ def test_chances_of_nothing_and_of_what_nobody_can_miss(planned):
     if measured.scene.mount == "eye_in_hand":
         pytest.skip("one mount is enough")
     candidates = candidates_of(linear, empirical=False)[0]
-    court, rng = Court(linear, candidates), np.random.default_rng(0)
-    nothing = court.chance("backlash", np.zeros((linear.mixed.size, 200)), rng)
+    expected, rng = ExpectedDiagnosis(linear, candidates), np.random.default_rng(0)
+    nothing = expected.chance("backlash", np.zeros((linear.mixed.size, 200)), rng)
     assert nothing.detected <= 0.11  # 99.9 % of draws at 5 %
     own = next(c for c in candidates if c.name == "backlash")
     column = own.forms[0].columns @ (30 * own.forms[0].sizes)
-    huge = court.chance("backlash", np.repeat(column[:, None], 50, axis=1), rng)
+    huge = expected.chance("backlash", np.repeat(column[:, None], 50, axis=1), rng)
     assert huge.detected == 1.0 and huge.named > 0.9 and huge.misnamed == 0.0
 
 
