@@ -62,13 +62,13 @@ def export_run(
     """
     _require(to, program, output)
     # Loaded by who runs something: whoever asks for help has it at once.
+    from stitch.cli.actions.exported_program import exported_program
     from stitch.cli.actions.exported_run import exported_run
-    from stitch.cli.export_program import export_program
     from stitch.export.arm_model import arm_of
 
     if program is not None:
         arm = arm_of(run, effects_file, trust)
-        export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
+        exported_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
     else:
         exported_run(run, str(to), output, parent, child, effects_file, trust=trust)
 

@@ -1,4 +1,4 @@
-"""`stitch export RUN --program FILE`: a compensated copy, and the table of its moves."""
+"""What `stitch export --program` does: a compensated copy of a robot program, and the table of its moves."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -27,7 +27,7 @@ _SHOWN = 40
 _NOTHING = 1e-6
 
 
-def export_program(
+def exported_program(
     file: Path,
     arm: ArmModel,
     output: Path | None,
