@@ -133,7 +133,7 @@ def to_quaternion(T: Array) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotation closest to a 3x3 matrix in the Frobenius norm (polar factor by SVD)."""
+    """The rotations (..., 3, 3) closest to matrices (..., 3, 3) in the Frobenius norm (polar factor by SVD)."""
     U, _, Vt = np.linalg.svd(np.asarray(matrix, float))
     sign = np.linalg.det(U @ Vt)
     U = U.copy()
@@ -142,7 +142,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
-    """True if one 4x4 matrix is a proper rigid motion within `tolerance`."""
+    """True if one matrix (4, 4) is a proper rigid motion within `tolerance`."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
@@ -152,7 +152,7 @@ def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
 
 
 def angle_between(T_a: Array, T_b: Array) -> Array:
-    """Rotation angle (rad) between transforms (..., 4, 4)."""
+    """(...,) rotation angle (rad) between transforms (..., 4, 4)."""
     return np.asarray(np.linalg.norm(log(inverse(T_a) @ T_b)[..., :3], axis=-1))
 
 

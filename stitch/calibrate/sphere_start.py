@@ -70,7 +70,7 @@ def decoupled(G: Array, q: Array) -> Array | None:
 
 
 def equal_orientations(G: Array) -> list[Array]:
-    """Views (indices) in groups of one orientation."""
+    """Indices (n,) of views in groups of one orientation."""
     left, groups = np.arange(len(G)), []
     while len(left):
         same = frames.angle_between(np.broadcast_to(G[left[0]], G[left].shape), G[left]) < _EQUAL

@@ -20,7 +20,14 @@ __all__ = ["SOLVERS", "andreff", "axis_spread", "daniilidis", "horaud_dornaika",
 
 
 def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
-    """Log of rotations, orthogonal Procrustes (Park & Martin 1994)."""
+    """X (4, 4) of A·X = X·B from motions (N, 4, 4): logs of rotations, orthogonal Procrustes (Park & Martin 1994).
+
+    Args:
+        weights: (N,) on the squares of each motion, as in all solvers here.
+
+    Raises:
+        NoResultError: no rotation, or rotations about one axis alone; so do all solvers here.
+    """
     require_motion(A)
     alpha, beta, _ = matched_rotations(A, B)
     R = frames.nearest_rotation((roots(A, weights)[:, None] ** 2 * alpha).T @ beta)
@@ -28,7 +35,7 @@ def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
 
 
 def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
-    """Modified Rodrigues vectors, skew(P_A + P_B) P' = P_B − P_A (Tsai & Lenz 1989).
+    """X (4, 4) from modified Rodrigues vectors, skew(P_A + P_B) P' = P_B − P_A (Tsai & Lenz 1989).
 
     P' grows without bound where X turns by π. B is therefore seen from four frames, as it is and
     turned by π about x, y, z: in at least one of them X turns by 120° or less.
@@ -55,7 +62,7 @@ def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
 
 
 def horaud_dornaika(A: Array, B: Array, weights: Array | None = None) -> Array:
-    """Unit quaternion minimising Σ|q n_B − n_A q|² (Horaud & Dornaika 1995)."""
+    """X (4, 4) from the unit quaternion minimising Σ|q n_B − n_A q|² (Horaud & Dornaika 1995)."""
     require_motion(A)
     na, nb, _ = matched_rotations(A, B)
     K = np.zeros((4, 4))

@@ -51,7 +51,7 @@ def _on_sphere(H: Array, g: Array, radius: float) -> Array:
 
 
 def daniilidis(A: Array, B: Array, weights: Array | None = None) -> Array:
-    """Unit dual quaternions, rotation and translation together (Daniilidis 1999)."""
+    """X (4, 4) from unit dual quaternions, rotation and translation together (Daniilidis 1999)."""
     require_motion(A)
     unit = float(np.average(np.linalg.norm(B[:, :3, 3], axis=1), weights=weights)) or 1.0
     sign = matched_rotations(A, B)[2]

@@ -17,7 +17,7 @@ from stitch.frames import Array
 
 
 def require_poses(A: Array) -> None:
-    """Refuse poses whose relative rotations cannot show X and Z.
+    """Refuse poses (V, 4, 4) whose relative rotations cannot show X and Z.
 
     Raises:
         NoResultError: fewer than three poses, no rotation, or rotations about one axis alone.
@@ -30,7 +30,12 @@ def require_poses(A: Array) -> None:
 
 
 def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
-    """X, Z by the Kronecker product: n vec R_X = Σ(R_Bᵀ ⊗ R_Aᵀ) vec R_Z, its first singular pair (Shah 2013).
+    """X, Z (4, 4) of A·X = Z·B from poses (V, 4, 4), by the Kronecker product (Shah 2013).
+
+    n vec R_X = Σ(R_Bᵀ ⊗ R_Aᵀ) vec R_Z: its first singular pair.
+
+    Args:
+        weights: (V,) on the squares of each view.
 
     Raises:
         NoResultError: poses that cannot show both; names the axis they share.

@@ -31,7 +31,7 @@ def axis_spread(A: Array) -> Array:
 
 
 def require_motion(A: Array) -> None:
-    """Refuse motions that cannot show a hand-eye.
+    """Refuse motions (N, 4, 4) that cannot show a hand-eye.
 
     Raises:
         NoResultError: no rotation at all, or all rotations about one axis.

@@ -50,7 +50,7 @@ def zyx(numbers: Array) -> Array:
 
 
 def quaternion_w_first(numbers: Array) -> Array:
-    """ABB x, y, z, q1, q2, q3, q4 (mm): q1 is w.
+    """(4, 4) of ABB x, y, z, q1, q2, q3, q4 (mm): q1 is w.
 
     Raises:
         ValueError: not a unit quaternion.

@@ -40,7 +40,7 @@ class Capture:
 
     @property
     def point_sets(self) -> list[Array]:
-        """The same of the views that show any."""
+        """The same, (N, 3) each, of the views that show any."""
         return [points for points in self.shown if len(points)]
 
     @property

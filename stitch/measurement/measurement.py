@@ -134,7 +134,7 @@ def downwards(robot: Robot | None, T_base_flange: Array, eye_to_hand: bool) -> A
 
 
 def about_part(measurement: Measurement, T_mount: Array) -> Measurement:
-    """The chain with the origin about which a part grows; a coarse hand-eye is enough.
+    """The measurement with the origin about which a part grows; a coarse hand-eye is enough.
 
     On the flange that is the flange, which holds it; in the cell it is the middle of what the views show.
     """

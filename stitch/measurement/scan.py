@@ -102,7 +102,7 @@ def sparse(scan: Scan, at_most: int) -> Scan:
 
 
 def evenly(count: int, at_most: int) -> Indices:
-    """At most `at_most` of `count` indices, evenly from the first to the last."""
+    """(n,) at most `at_most` of `count` indices, evenly from the first to the last."""
     return np.linspace(0, count - 1, min(count, at_most)).astype(np.int64)
 
 

@@ -86,7 +86,7 @@ def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
 
 
 def split(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
-    """The terms with values, and sigmas, of all their parameters in one row."""
+    """The terms with values (P,), and sigmas (P,), of all their parameters in one row."""
     out, at = [], 0
     for term in terms:
         own = slice(at, at + len(term.parameters))

@@ -30,7 +30,7 @@ class Trial(Protocol):
     """A model with some columns, in the linear approximation."""
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """Coefficients by least squares, without some views."""
+        """(k,) coefficients by least squares, without some views."""
         ...
 
     def squares(self, coefficients: Array) -> Array:
@@ -42,7 +42,7 @@ class Trial(Protocol):
         ...
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """Views of which one alone could carry the coefficients."""
+        """(n,) views of which one alone could carry the coefficients (k,)."""
         ...
 
 

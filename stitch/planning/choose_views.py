@@ -69,7 +69,7 @@ def _needed(goals: Sequence[Goal], before: list[int], chosen: list[int], now: fl
 
 
 def in_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
-    """Each the nearest to the one before, beginning at the view `last`."""
+    """Views of joint angles (V, n), each the nearest to the one before, beginning at the view `last`."""
     out, left, at = list[int](), list(chosen), last
     while left:
         at = min(left, key=lambda k: float(np.abs(joints[k] - joints[at]).sum()))

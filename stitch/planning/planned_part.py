@@ -36,7 +36,7 @@ class PlannedPart:
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     def moved(self, T: Array) -> "PlannedPart":
-        """The surface in another frame."""
+        """The surface in another frame, T (4, 4)."""
         return PlannedPart(frames.transform(T, self.points), frames.rotate(T, self.normals))
 
 
@@ -60,7 +60,7 @@ def surface_of_file(file: Path, scale: float) -> PlannedPart:
 
 
 def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> PlannedPart:
-    """At most so many points of a cloud, evenly over their order."""
+    """At most so many points (N, 3) of a cloud with their normals (N, 3), evenly over their order."""
     picked = np.linspace(0, len(points) - 1, min(at_most, len(points))).astype(int)
     return PlannedPart(points[picked], normals[picked])
 

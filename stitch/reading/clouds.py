@@ -87,7 +87,7 @@ def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
 
 
 def read_ply(path: Path) -> dict[str, Array]:
-    """Columns of the vertices of a PLY, as stored."""
+    """Columns (N,) of the vertices of a PLY by name, as stored."""
     from plyfile import PlyData
 
     require_room(path)

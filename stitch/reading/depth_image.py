@@ -71,7 +71,7 @@ def read_depth(path: Path) -> Array:
 
 
 def read_depth_columns(path: Path) -> dict[str, Array]:
-    """x, y, z of all pixels that measured something."""
+    """x, y, z (N,) of all pixels that measured something, scanner frame."""
     points = read_depth(path).reshape(-1, 3)
     return dict(zip("xyz", points[np.isfinite(points[:, 2])].T, strict=True))
 

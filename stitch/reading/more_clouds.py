@@ -19,7 +19,7 @@ _PTX_HEADER = 10
 
 
 def read_mesh(path: Path) -> dict[str, Array]:
-    """Vertices, each once, with the mean normal of the faces around them where there are faces."""
+    """Columns (N,) of the vertices, each once, with the mean normal of the faces around them where there are faces."""
     import trimesh
 
     scene = trimesh.load_scene(str(path))
@@ -52,7 +52,10 @@ def read_array(path: Path) -> dict[str, Array]:
 
 
 def read_ptx(path: Path) -> dict[str, Array]:
-    """Leica's PTX: columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured."""
+    """Columns (N,) of Leica's PTX.
+
+    The file has columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured.
+    """
     lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     count = int(lines[0]) * int(lines[1])
     rows = lines[_PTX_HEADER : _PTX_HEADER + count]
@@ -63,14 +66,14 @@ def read_ptx(path: Path) -> dict[str, Array]:
 
 
 def read_las(path: Path) -> dict[str, Array]:
-    """LAS and LAZ, by laspy."""
+    """Columns (N,) x, y, z and intensity of LAS and LAZ, by laspy."""
     las = package("laspy", path, "formats").read(path)
     xyz = np.asarray(las.xyz, float)
     return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
 
 
 def read_e57(path: Path) -> dict[str, Array]:
-    """The first scan of an E57 in its own frame, by pye57."""
+    """Columns (N,) of the first scan of an E57 in its own frame, by pye57."""
     scan = package("pye57", path, "formats").E57(str(path)).read_scan(0, ignore_missing_fields=True, transform=False)
     columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
     if "intensity" in scan:

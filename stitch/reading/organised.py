@@ -24,7 +24,7 @@ def grid_shape(path: Path) -> tuple[int, int] | None:
 
 
 def measured(columns: dict[str, Array]) -> dict[str, Array]:
-    """The columns without pixels of which x, y and z are NaN."""
+    """The columns (N,) without pixels of which x, y and z are NaN."""
     if not all(axis in columns for axis in "xyz"):
         return columns
     empty = np.isnan(np.asarray([columns[axis] for axis in "xyz"], float)).all(axis=0)

@@ -63,7 +63,7 @@ def _size(points: Array) -> float:
 
 
 def require_near(what: str, points: Array) -> None:
-    """Refuse single points that no sensor measures: one of them would stretch every grid over the cloud."""
+    """Refuse single points (N, 3), m, that no sensor measures: one of them would stretch every grid over the cloud."""
     if np.abs(points).max() > _FARTHEST_M:
         far = np.abs(points).max(axis=1) > _FARTHEST_M
         raise InputError(

@@ -52,7 +52,7 @@ def origin(owner: Element, scale: float, where: str = "") -> Array:
 
 
 def values(element: Element | None, key: str, default: str, where: str) -> Array:
-    """The numbers of an attribute, as many as its default has.
+    """(n,) the numbers of an attribute, as many as its default has.
 
     Raises:
         InputError: other than so many finite numbers.

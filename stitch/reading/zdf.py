@@ -17,7 +17,7 @@ _COLOURS = ("red", "green", "blue")
 
 
 def read_zdf(path: Path) -> dict[str, Array]:
-    """Columns of the measured pixels, with their colours.
+    """Columns (N,) of the measured pixels, with their colours.
 
     Raises:
         InputError: h5py is not installed, or another layout.

@@ -7,11 +7,11 @@ from stitch.frames import Array
 
 
 def log_density(e: Array, spread: Array, freedom: Array) -> Array:
-    """Log density of t = e/spread as one of e, up to a constant."""
+    """(...,) log density of t = e/spread as one of e, up to a constant; `freedom` are the degrees of freedom."""
     told = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - np.log(freedom) / 2 - np.log(spread)
     return np.asarray(told - (freedom + 1) / 2 * np.log1p((e / spread) ** 2 / freedom))
 
 
 def as_normal(t: Array, freedom: Array) -> Array:
-    """Numbers of Student's t as normal numbers of the same probability."""
+    """(...,) numbers of Student's t as normal numbers of the same probability."""
     return np.asarray(-np.sign(t) * ndtri(np.maximum(stdtr(freedom, -np.abs(t)), 1e-300)))

@@ -86,6 +86,6 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
 
 
 def rail_direction(rail: Array) -> Array:
-    """Unit direction of growing slide, in which the points are listed."""
+    """(3,) unit direction of growing slide, in which the points (N, 3) are listed."""
     line = np.linalg.svd(rail - rail.mean(axis=0), full_matrices=False)[2][0]
     return np.asarray(line * np.sign(line @ (rail[-1] - rail[0])))

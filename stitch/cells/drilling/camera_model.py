@@ -67,13 +67,13 @@ class CameraFit:
 
 
 def distort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
-    """Ideal to real image points: away from the centre by k1·(r/corner)² of their distance r."""
+    """Ideal to real image points (..., 2): away from the centre by k1·(r/corner)² of their distance r."""
     arm = uv - centre
     return np.asarray(centre + arm * (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True)))
 
 
 def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
-    """Inverse of `distort` by fixed-point iteration; converges for |k1| well below 1/3."""
+    """Real to ideal image points (..., 2): `distort` inverted by iteration; converges for |k1| well below 1/3."""
     arm = real = uv - centre
     for _ in range(_UNDISTORT_STEPS):
         arm = real / (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True))

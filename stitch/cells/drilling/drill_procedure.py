@@ -61,7 +61,7 @@ def run_group(
 
 
 def turn_upright(measure: Callable[[Array], tuple[Array, Array]], seeing: Seeing, T_base_tool: Array) -> Array:
-    """The pose turned twice by what the rangers see: the second turn takes up what the first one's size left."""
+    """The pose (4, 4) turned twice by what the rangers see: the second turn takes up what the first one's size left."""
     for _ in range(2):
         T_base_tool = upright(T_base_tool, look(seeing, *measure(T_base_tool)).normal)
     return T_base_tool

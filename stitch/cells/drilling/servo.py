@@ -65,7 +65,7 @@ def hole_coordinate(T_base_tool: Array, offset: Array) -> Array:
 
 
 def look(seeing: Seeing, ranges: Array, uv: Array) -> Sight:
-    """One measurement in the flange frame."""
+    """One measurement in the flange frame, from the rangers' readings and an image point (2,)."""
     seen = surface(seeing.rangers, ranges)
     xy = to_plane(seeing.H, np.asarray(uv)[None])[0]
     return Sight(seen.normal, seen.tilt, np.append(xy, seen.height - seeing.height))
@@ -82,7 +82,8 @@ def upright(T_base_tool: Array, normal: Array) -> Array:
 
 
 def place(measure: Measure, seeing: Seeing, T_base_tool: Array) -> Placed:
-    """Tilt, then height, then camera offset, and again until all three are below their thresholds.
+    """Tilt, then height, then camera offset, and again until all three are below their thresholds; starts at a pose
+    (4, 4).
 
     Raises:
         NoResultError: the loop does not converge.

@@ -54,7 +54,7 @@ class RobotModel:
 
 
 def initial_guess(readings: Readings) -> tuple[Array, Array]:
-    """T_world_base and T_flange_contact in closed form: AX = XB over motions from the first pose, then the base.
+    """T_world_base, T_flange_contact (4, 4) in closed form: AX = XB over motions from the first pose, then the base.
 
     Raises:
         NoResultError: too few poses, or motions about one axis only.

@@ -68,7 +68,7 @@ def run_pose(cell: Cell, stage: Stage, targets: Array, T_base_flange: Array) -> 
 def run_shape(
     cell: Cell, stage: Stage, control: ControlPoints, T_base_flange: Array, *, tolerance: float, axes: Array = SHAPING
 ) -> ShapeRun:
-    """Correct until all control points are within the tolerance, mm.
+    """Correct from poses (N, 4, 4) on until all control points are within the tolerance, mm.
 
     Raises:
         NoResultError: they are not after ten corrections.

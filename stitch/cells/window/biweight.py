@@ -9,10 +9,10 @@ TUKEY, MAD = 4.685, 1.4826
 
 
 def biweight(u: Array) -> Array:
-    """Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
+    """(...,) Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
     return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
 
 
 def biweight_slope(u: Array) -> Array:
-    """Change of weight · u with u: what the normal matrix of a robust fit's covariance takes (Huber & Ronchetti)."""
+    """(...,) change of weight · u with u, for the normal matrix of a robust fit's covariance (Huber & Ronchetti)."""
     return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))

@@ -49,7 +49,8 @@ def deviations(
     """Distances of all usable points from the CAD, or from the CAD with its allowance; cells average the noise away.
 
     Args:
-        cell: edge length of the cells.
+        T_base_part: (4, 4) where the part lies.
+        tolerance, cell: of a cell's mean, and its edge length; the CAD's unit.
     """
     T = frames.inverse(T_base_part)
     local = frames.transform(T, scan.points[scan.usable])

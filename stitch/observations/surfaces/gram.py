@@ -82,7 +82,11 @@ def robust_scale(matches: Iterable[Match]) -> float:
 def gram(
     matches: Sequence[Match], views: int, centre: Array, scale: float, weights: Sequence[Array] | None = None
 ) -> Gram:
-    """Accumulate the pairs; Tukey weights at `scale` unless `weights` gives them per match."""
+    """Accumulate the pairs; Tukey weights at `scale` unless `weights` gives them per match, (M,) each.
+
+    Args:
+        centre: (3,) about which twists of the views count, reference frame.
+    """
     rows = [_accumulate(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
     sums = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     pairs = np.array([(m.v, m.w) for m in matches])

@@ -121,14 +121,17 @@ def _inflation(covariance: Array, alone: Array) -> float:
 
 
 def shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
-    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1."""
+    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1.
+
+    The hand-eye is what the first six rows of all these covariances are of.
+    """
     scale = np.sqrt(np.diag(covariance)[:6])
     unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
     return {name: float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6 for name, own in sources.items()}
 
 
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
-    """The repeatability of one capture's poses, whatever its hand-eye."""
+    """The repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
     nothing = np.zeros((6 * len(capture.scans), 0))
     own = CaptureEvidence(capture, freed.overlaps.gram, freed.twists, capture.hand_eye_frames(T_mount), nothing)
     return estimate(own.channel)

@@ -36,7 +36,7 @@ class Match:
 
 
 def sample(scan: Scan, count: int) -> Indices:
-    """Indices of at most `count` usable points, evenly over the scan order; the same every time."""
+    """(n,) indices of at most `count` usable points, evenly over the scan order; the same every time."""
     usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
     if len(usable) <= count:
         return usable
@@ -109,7 +109,13 @@ def match(
 def search(
     scan: Scan, other: Scan, index: Indices, T_scan: Array, T_other: Array, gate: float
 ) -> tuple[Array, Indices, NDArray[np.bool_]]:
-    """Distance (inf where none), index of the partner and whether it may be used."""
+    """Of n points each (n,): distance (inf where none), index of the partner and whether it may be used.
+
+    Args:
+        index: (n,) points of the scan that look for a partner.
+        T_scan, T_other: (4, 4) T_reference_scanner of the two views.
+        gate: farthest partner, length_unit.
+    """
     # The trees stay in their scanner's frame; the queries travel.
     T_other_scan = frames.inverse(T_other) @ T_scan
     query = np.ascontiguousarray(frames.transform(T_other_scan, scan.points[index]))

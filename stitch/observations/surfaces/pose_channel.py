@@ -89,7 +89,7 @@ def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatabilit
 
 
 def scatter_from(variances: Array) -> Repeatability:
-    """Standard deviations and noise factor from the three variances."""
+    """Standard deviations (rad, length_unit) and noise factor from the three variances (3,)."""
     return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
 
 

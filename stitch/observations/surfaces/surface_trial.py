@@ -36,7 +36,7 @@ class SurfaceTrial:
         return fit_columns(white, z)[: self.X.shape[1]]
 
     def squares(self, coefficients: Array) -> Array:
-        """Σ w e² per pair after the model moved; point effects change e itself and do not move the views."""
+        """(pairs,) Σ w e² after the model moved; point effects change e itself and do not move the views."""
         g, points = self.freed.overlaps.gram, self.points
         if not isinstance(points, PointGram):
             return pair_squares(g, self._moved(self.X, coefficients))
@@ -55,7 +55,7 @@ class SurfaceTrial:
         return float(np.sum((own.T @ rest) ** 2))
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """All views."""
+        """(V,) all views."""
         return np.arange(self.freed.overlaps.gram.views, dtype=np.int64)
 
     def _white(self, response: Array) -> Array:

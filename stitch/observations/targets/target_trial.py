@@ -44,7 +44,7 @@ class TargetTrial:
         return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out, : self.rows.positions][own]))
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """The views without which the coefficients would move most, to first order."""
+        """(n,) the views without which the coefficients would move most, to first order."""
         b = self.blocks
         inverse = np.linalg.pinv(b.information * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
         moves = b.pulls(coefficients) * b.scale @ inverse
