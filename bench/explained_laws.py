@@ -92,6 +92,16 @@ def main() -> None:
                 print(
                     f"{a.cell.scene} {a.cell.seed} {name}: {found.found} {found.why} {told} ({took:.1f} s)", flush=True
                 )
+    printed = _table(rows)
+    print(printed)
+    if given.write:
+        text = _PAGE.read_text(encoding="utf-8")
+        before, rest = text.split(_MARKS[0])
+        _PAGE.write_text(f"{before}{_MARKS[0]}\n{printed}\n{_MARKS[1]}{rest.split(_MARKS[1])[1]}", encoding="utf-8")
+
+
+def _table(rows: dict[str, list[tuple[bool, bool]]]) -> str:
+    """A line per hidden law: how often a formula was found, and how often one as good as the truth."""
     lines = ["| hidden | draws | a formula | as good as the truth |", "|---|---:|---:|---:|"]
     for name in ("nothing", "memory", *UNNAMED):
         own = rows[name]
@@ -99,12 +109,7 @@ def main() -> None:
             said, good = (sum(x) for x in zip(*own, strict=True))
             near = _share(good, len(own)) if name in UNNAMED else "–"
             lines.append(f"| {name} | {len(own)} | {_share(said, len(own))} | {near} |")
-    printed = "\n".join(lines)
-    print(printed)
-    if given.write:
-        text = _PAGE.read_text(encoding="utf-8")
-        before, rest = text.split(_MARKS[0])
-        _PAGE.write_text(f"{before}{_MARKS[0]}\n{printed}\n{_MARKS[1]}{rest.split(_MARKS[1])[1]}", encoding="utf-8")
+    return "\n".join(lines)
 
 
 def _share(hits: int, of: int) -> str:
