@@ -16,7 +16,7 @@ _HEADER = """# The [robot] table of session.toml with the offsets and link error
 """
 
 
-def write_robot(run: Run, found: CalibratedRobot, folder: Path) -> None:
+def write_robot(found: CalibratedRobot, folder: Path) -> None:
     """robot.toml (for an arm of DH rows) and robot.urdf."""
     (folder / "robot.urdf").write_text(to_urdf(found.robot), encoding="utf-8")
     table = robot_toml(found)

@@ -90,7 +90,7 @@ def calibrated_arm(session: Path, output: Path | None, *, force: bool, at_most: 
     target = output or Path("runs") / f"{loaded.name}-robot"
     with run_folder.new_folder(target, [session], force) as scratch:
         run_folder.write_with_page(result, scratch)
-        write_robot(result, calibrated(result), scratch)
+        write_robot(calibrated(result), scratch)
         write_diagnosis(diagnosis, state_of(result), scratch)
     document = robot_document(result, lines, diagnosis.sentence)
     if as_json:
