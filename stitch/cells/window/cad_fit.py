@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
+from stitch.cells.window.all_ways import all_ways
 from stitch.cells.window.allowance import Allowance, Wanted, columns
 from stitch.cells.window.allowance_fit import describe, ridge, spread_of, told_apart
 from stitch.cells.window.biweight import TUKEY, biweight, biweight_slope
@@ -14,14 +15,12 @@ from stitch.cells.window.cell_weights import cell_weights
 from stitch.cells.window.joined_scans import Joined
 from stitch.cells.window.regions import Regions
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 
-_POINTS, _FEWEST = 20_000, 50
+_FEWEST = 50
 _ROUNDS = 80
 # A step below this share of the part is none; and cells along the part for the second kind of weight.
 _STILL, _CELLS = 1e-7, 40
-# Normals are sorted into cells of a quarter of their unit length: about 15°.
-_DIRECTIONS = 4
 # A surface that leaves a direction open by this share of the best one fixes no pose.
 _OPEN = 1e-6
 NONE = Wanted()
@@ -52,14 +51,13 @@ def fit(
 
     The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
     beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
-    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn evenly over the
-    directions they look to (normal-space sampling, Rusinkiewicz & Levoy 2001): on a large smooth sheet the few points
-    of its flanks alone hold it in its plane.
+    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn
+    evenly over the directions they look to (`all_ways`).
 
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
     """
-    scan = scan.take(_all_ways(scan, T_base_part))
+    scan = scan.take(all_ways(scan, T_base_part))
     noise = scan.noise if np.isfinite(scan.noise) else 0.0
     scale, by_cell = cad.size / 100, False
     numbers, size = np.zeros(wanted.columns), cad.size / 100
@@ -116,28 +114,6 @@ def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: A
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design) + np.diag(shrink))
     meat = np.einsum("ni,n,nj->ij", design, (weight * rest) ** 2, design) + np.diag(shrink) * scale**2
     return np.asarray(inverse @ meat @ inverse)
-
-
-def _all_ways(scan: Joined, T_base_part: Array) -> Indices:
-    """Indices of at most _POINTS usable points, as many of each direction as there are to share out."""
-    usable = np.flatnonzero(scan.usable)
-    directions = np.round(frames.rotate(frames.inverse(T_base_part), scan.normals[usable]) * _DIRECTIONS)
-    _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
-    quota, bucket = _quota(counts), bucket.ravel()
-    order = np.argsort(bucket, kind="stable")
-    first = np.cumsum(counts) - counts
-    picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]
-    chosen: Indices = usable[np.sort(np.concatenate(picked))] if picked else usable
-    return chosen
-
-
-def _quota(counts: Indices) -> int:
-    """The largest share per direction that keeps the sum within _POINTS."""
-    low, high = 1, _POINTS
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _POINTS else (low, middle - 1)
-    return low
 
 
 @dataclass(frozen=True)
