@@ -4,7 +4,6 @@ The variances are the expected ones and stay as they are, so that a test is a fe
 cost nothing.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,8 +59,8 @@ def candidate_test(linear: LinearModel, candidate: Candidate, tests: int) -> Can
     return CandidateTest(linear, tuple(_form_test(linear, f.columns * f.sizes, float(w), tests) for f, w in forms))
 
 
-def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Sequence[float]) -> tuple[CandidateTest, ...]:
-    """Of errors that have a covariance (n, n) in the channel, times the square of each sigma."""
+def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> tuple[CandidateTest, ...]:
+    """Of errors that have a covariance (n, n) in the channel, times the square of each sigma (s,)."""
     half = _factor(covariance)
     return tuple(CandidateTest(linear, (_form_test(linear, sigma * half, 1.0, 1),)) for sigma in sigmas)
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import SEEN, form_weights
-from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL, PRIOR_UNKNOWN
-from stitch.diagnosis.unknown.joint_laws import TIMES, WIDTH
+from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL
+from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, log_prior
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.planning.candidate_tests import CandidateTest, candidate_test, covariance_tests
@@ -89,17 +89,13 @@ class ExpectedDiagnosis:
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
         """(D,) whether a candidate is ahead of every joint that follows by no law (`joint_laws.py`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
-        linear, errors = own.linear, own.linear.pose_errors
-        if errors is None or errors.of_joints is None or errors.of_ways is None:
-            return np.ones(numbers.shape[1], bool)
-        usual = float(errors.scales[errors.names.index("smooth")])
-        lawless = [smooth.of(p) for smooth in (errors.of_joints, errors.of_ways) for p in range(smooth.count)]
         if k not in self._laws:
-            covariances = [linear.reduce(linear.reduce(covariance).T) for covariance in lawless]
-            sizes = [usual * float(np.sqrt(times)) for times in TIMES]
-            self._laws[k] = tuple(test for C in covariances for test in covariance_tests(linear, C, sizes))
-        found = np.max([law.evaluate(numbers)[0] for law in self._laws[k]], axis=0)
-        rival = found - WIDTH + np.log(PRIOR_UNKNOWN / len(lawless))
+            found = law_covariances(own.linear)
+            self._laws[k] = tuple(test for C in found for test in covariance_tests(own.linear, C, np.sqrt(TIMES)))
+        laws = self._laws[k]
+        if not laws:
+            return np.ones(numbers.shape[1], bool)
+        rival = np.max([law.evaluate(numbers)[0] for law in laws], axis=0) + log_prior(len(laws) // len(TIMES))
         return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:

@@ -47,8 +47,23 @@ def log_posterior(base: LinearModel) -> float:
     (`Ranked`); −∞ where there is none."""
     laws = joint_laws(base)
     laws += _laws(base, None if base.pose_errors is None else base.pose_errors.of_ways)
-    likeliest = max((law.log_bayes_factor for law in laws), default=-np.inf)
-    return likeliest - WIDTH + float(np.log(PRIOR_UNKNOWN / max(len(laws), 1)))
+    return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(len(laws))
+
+
+def log_prior(laws: int) -> float:
+    """What the likeliest of so many laws is charged: its share of the prior, and the width of that of its size."""
+    return float(np.log(PRIOR_UNKNOWN / max(laws, 1))) - WIDTH
+
+
+def law_covariances(base: LinearModel) -> list[Array]:
+    """(n, n) in the channel of the laws of all joints, by the angles and by the way they came, at usual size."""
+    errors = base.pose_errors
+    if errors is None or errors.of_joints is None:
+        return []
+    usual = float(errors.scales[errors.names.index("smooth")])
+    kinds = [smooth for smooth in (errors.of_joints, errors.of_ways) if smooth is not None]
+    every = [smooth.of(k) for smooth in kinds for k in range(smooth.count)]
+    return [usual**2 * base.reduce(base.reduce(law).T) for law in every]
 
 
 def _laws(base: LinearModel, smooth: SmoothErrors | None) -> tuple[JointLaw, ...]:
