@@ -23,6 +23,7 @@ from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
+from stitch.diagnosis.within_overlaps import left_within
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.state import State
@@ -46,6 +47,9 @@ def diagnose_state(state: State) -> Diagnosis:
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
+        within, systematic = left_within(linear, state.session.scanner.noise)
+        if systematic and selection.verdict == "adequate":
+            selection = replace(selection, verdict="unknown_effect")
         unknown = selection.verdict == "unknown_effect"
         unnamed = unnamed_errors(linear) if unknown else ()
         of_field = unknown and follows_field(selection.empirical, unnamed)
@@ -75,6 +79,7 @@ def diagnose_state(state: State) -> Diagnosis:
             implausible=beyond,
             unnamed=unnamed,
             curves=curves,
+            within=within if systematic else 0.0,
             of_field=of_field,
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )

@@ -54,6 +54,7 @@ class Diagnosis:
     unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
     curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, as other joints turn
+    within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
 
     def __repr__(self) -> str:

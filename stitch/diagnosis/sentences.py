@@ -47,7 +47,7 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
 
 
 def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
-    start = f"No effect of the library explains what is left ({now}, noise {floor}): "
+    start = f"No effect of the library explains what is left ({now}, noise {floor}): {_within(d, length_unit)}"
     if d.of_field:
         return (
             f"{start}the scanner errs by where in its field a point is seen, the same in every view; have it "
@@ -70,6 +70,16 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
     return (
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
         f"the same poses, so that those found on one object correct another{_notes(d)}{_lack(d)}."
+    )
+
+
+def _within(d: Diagnosis, length_unit: str) -> str:
+    """What no motion of the views takes away."""
+    if not d.within:
+        return ""
+    return (
+        f"{length_text(d.within, length_unit, 2)} remain however each view is moved, so that the scanner or the part's "
+        "shape is off and not the poses alone; "
     )
 
 

@@ -30,10 +30,14 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
 
 
 def _where(found: Diagnosis) -> str:
-    """The joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
+    """The scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
+    if found.of_field:
+        return ": the scanner errs by where in its field a point is seen"
     joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
     if joints:
         return f": {joints} errs by a law that has no name"
+    if found.within:
+        return ": the scanner or the part's shape is off, and not the poses alone"
     follows = [x.covariate for x in found.depends_on if x.p_value < _FOLLOWS]
     return f": what is left follows {' and '.join(follows[:2])}" if follows else ""
 

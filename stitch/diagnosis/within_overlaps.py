@@ -1,0 +1,26 @@
+"""What remains between the views however each of them is moved: no error of poses, joints or mount leaves that.
+
+A seam or a ripple in the scanner's field, a corner that is off, a part that changes its shape: overlaps show it, and
+the poses that fit best take only a share of it. Only beside the noise can it be seen that it is there.
+"""
+
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.noise_floor import noise_floor
+from stitch.observations.surfaces.surface_model import Surfaces
+
+
+def left_within(linear: LinearModel, stated: float | None = None) -> tuple[float, bool]:
+    """Rms (length_unit) of it beside the noise that the scans show, and whether it is more than that; nothing where no
+    overlap of surfaces was observed.
+
+    The noise is the scatter about the surface within each scan (`noise_floor.py`), whatever a data sheet says.
+
+    Args:
+        stated: noise of the scanner, for scans too small to show their own.
+    """
+    if not isinstance(linear.observation, Surfaces):
+        return 0.0, False
+    surfaces = linear.observation
+    freed, noise = surfaces.freed.overlaps, noise_floor(surfaces.capture, surfaces.freed.overlaps, stated)
+    left = float(max(freed.gram.rms**2 - noise**2, 0.0) ** 0.5)
+    return left, left > noise
