@@ -7,6 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from stitch.errors import InputError
+from stitch.frames import Array
 
 # Clouds or poses that a list may lack: more, and the lists do not belong together.
 _LACKING = 2
@@ -27,17 +28,18 @@ class Pairing:
         return tuple(i for i, row in enumerate(self.rows) if row is not None)
 
 
-def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> list[Pairing]:
+def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None) -> list[Pairing]:
     """Ways to pair, the likely one first; one where the names tell it.
 
     Args:
         clouds: files in their order.
         labels: per row the texts that stand beside it.
+        numbers: (V, C) of the table: a column of it may number the clouds.
 
     Raises:
         InputError: so many more of one than of the other that they do not belong together.
     """
-    named = _by_text(clouds, labels) or _by_number(clouds, labels)
+    named = _by_text(clouds, labels) or _by_number(clouds, labels) or _by_column(clouds, numbers)
     if named is not None:
         return [named]
     N, M = len(clouds), len(labels)
@@ -103,6 +105,17 @@ def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pai
     if not set(own) <= set(theirs):
         return None
     return Pairing(tuple(theirs.index(number) for number in own), "by the numbers in the names", True)
+
+
+def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:
+    """The one column of whole numbers, no two alike, in which the last numbers of the clouds' names stand."""
+    own = [_number(cloud.stem) for cloud in clouds]
+    if numbers is None or None in own or len(set(own)) < len(own):
+        return None
+    counted = [list(c) for c in numbers.T if len(set(c)) == len(c) and {*own} <= {*c}]
+    if len(counted) != 1 or any(x != int(x) for x in counted[0]):
+        return None
+    return Pairing(tuple(counted[0].index(number) for number in own), "by the numbers in a column", True)
 
 
 def _number(name: str) -> int | None:

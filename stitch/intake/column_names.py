@@ -6,12 +6,16 @@ from dataclasses import dataclass, field
 
 # Words that say nothing about which number a column holds.
 _FILLERS = {"pose", "tcp", "robot", "flange", "tool", "tool0", "actual", "target", "base", "in", "of", "the", "coord"}
+_FILLERS |= {"lage", "koordinate", "verschiebung", "roboter", "flansch", "achse", "um", "ist", "soll", "wert"}
 _FILLERS |= {"position", "pos", "translation", "trans", "t", "p", "transform", "vector", "point", "cartesian", "end"}
 _ROTATION = {"rotation", "orientation", "quaternion", "quat", "rot", "euler", "angles", "angle", "rpy", "rotvec", "o"}
+_ROTATION |= {"drehung", "winkel", "orientierung"}
 _LENGTHS = {"mm": "mm", "millimeter": "mm", "millimetre": "mm", "m": "m", "meter": "m", "metre": "m", "cm": "cm"}
 _LENGTHS |= {"inch": "inch", "in": "inch", "inches": "inch"}
 _ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad"}
-_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch)$")
+# In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
+_ANGULAR = {*_ANGLES, "grad"}
+_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
 _JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
 
 # Triples of angles and quadruples of quaternions by name; a rotation stated by its names alone, or None.
@@ -94,7 +98,9 @@ def _plain(name: str) -> tuple[str, str]:
         return f"q{order[int(last)]}", unit
     if last in ("0", "1", "2") and not turned and any(w in words for w in ("position", "pos", "translation", "t")):
         return "xyz"[int(last)], unit
-    return (f"rot{last}" if turned and len(last) == 1 else last), unit
+    # An axis with the unit of an angle is a turn, in whatever language it is named: "Drehung um Z [°]".
+    turned = turned if last in ("w", "0", "1", "2", "3") else last in ("x", "y", "z") and (turned or unit in _ANGULAR)
+    return (f"rot{last}" if turned else last), unit
 
 
 def _rotation(where: dict[str, int], plain: Sequence[str], taken: set[int]) -> tuple[tuple[int, ...], str | None]:

@@ -99,7 +99,9 @@ def decide(
     if first.told or len(pairs) == 1:
         return first
     every = _decided(capture, _of_right_unit(motions(), all_ways(found, pairs, units, directions)), motions())
-    return every if every.told or every.best.misfit < first.best.misfit else first
+    # What is a guess anyway leaves out no view for it.
+    whole = len(every.best.way.pairing.used) >= len(first.best.way.pairing.used)
+    return every if every.told or (whole and every.best.misfit < first.best.misfit) else first
 
 
 def _decided(capture: Capture, ways: Sequence[Way], motions: RelativeScans | None, by_targets: bool = False) -> Decided:

@@ -77,7 +77,7 @@ def first_session(folder: Path, stated: Stated) -> FirstSession:
             raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
-    pairs = pairings(found.clouds, raw.labels)
+    pairs = pairings(found.clouds, raw.labels, raw.numbers)
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     units = open_units(ways_to_read, stated)
     seen, of_targets = targets_of_folder(found, points, CLOUD_UNITS[own_units[0]], stated.targets)

@@ -160,6 +160,12 @@ def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[
     sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
     single = [files for files in alike.values() if len(files) == 1]
     groups = sets or [g for g in single if _says_pose(g[0])] or single
+    if not groups and alike:
+        most = max(alike.values(), key=len)
+        raise InputError(
+            f"{folder}: {clouds} clouds but {len(most)} files that may hold a pose each, {most[0].name} … "
+            f"{most[-1].name}; to fix: leave out what does not belong, or name the file of the poses with --poses FILE"
+        )
     if not groups:
         raise InputError(f"{folder}: no file of poses there; to fix: name it with --poses FILE")
     if len(groups) > 1:

@@ -51,8 +51,9 @@ def layouts(raw: RawPoses) -> list[Layout]:
     tried = {6: _six, 7: _seven, 12: _twelve, 16: _sixteen}
     found_all = tried[count](x) if count in tried else []
     if not found_all:
+        called = "" if raw.header is None else f", called {', '.join(raw.header)},"
         raise InputError(
-            f"{raw.source}: {count} columns of numbers{'' if raw.header is None else ' with names that are not known'} "
+            f"{raw.source}: {raw.numbers.shape[1]} columns of numbers{called} "
             "hold no pose that is known; to fix: name each with --columns, for example --columns x,y,z,rx,ry,rz "
             "(qx,qy,qz,qw for a quaternion, j1,j2 … for joint angles, - for one to leave out)"
         )

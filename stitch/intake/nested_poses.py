@@ -21,7 +21,7 @@ def nested_rows(document: Any) -> list[Row]:
             return direct
     own = _row(document)
     if own is not None:
-        return [((), own)]
+        return [(_texts(document), own)]
     if isinstance(document, list):
         rows: list[Row] = []
         for item in document:
@@ -44,7 +44,9 @@ def _row(value: Any) -> dict[str, float] | None:
         return {str(i): x for i, x in enumerate(data)}
     inner = next((row for v in value.values() if isinstance(v, dict) and (row := _row(v)) is not None), None)
     if inner is not None:
-        return inner  # the pose stands one level deeper, beside a time or a name
+        # The pose stands one level deeper, beside a time, a temperature or a name.
+        unnamed = all(name.isdigit() for name in inner)
+        return inner if unnamed else {k: float(x) for k, x in value.items() if _is_number(x)} | inner
     out = _named(value)
     return out if len(out) >= _SIZES[0] else None
 

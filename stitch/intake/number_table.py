@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.text_file import read_text, shortened
+from stitch.reading.text_file import read_any_text, shortened
 
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -39,7 +39,7 @@ def read_number_table(file: Path) -> NumberTable:
     Raises:
         InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
     """
-    return parse_number_table(file, read_text(file, "name a table of poses", _LARGEST_MB))
+    return parse_number_table(file, read_any_text(file, "name a table of poses", _LARGEST_MB))
 
 
 def parse_number_table(file: Path, told: str) -> NumberTable:

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.clock_times import seconds_of
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
 from stitch.reading.text_file import read_text, require_file, shortened
@@ -32,6 +33,14 @@ class RawPoses:
     labels: tuple[tuple[str, ...], ...]  # per row the texts beside it, such as a view's name or its cloud's
     words: str  # how it was read
 
+    @property
+    def time_s(self) -> Array | None:
+        """Seconds (V,) since the first pose, where one of the texts beside the poses is a time of day."""
+        if len({len(texts) for texts in self.labels}) != 1:
+            return None
+        times = [t for column in zip(*self.labels, strict=True) if (t := seconds_of(column)) is not None]
+        return times[0] if len(times) == 1 else None
+
     def renamed(self, names: Sequence[str]) -> "RawPoses":
         """The same with columns named by a person.
 
@@ -43,7 +52,7 @@ class RawPoses:
                 f"--columns {','.join(names)}: {len(names)} names, {self.source} has {self.numbers.shape[1]} columns "
                 "of numbers; to fix: name each, and - for one to leave out"
             )
-        return RawPoses(self.source, tuple(names), self.numbers, self.labels, f"{self.words}; columns as named")
+        return replace(self, header=tuple(names), words=f"{self.words}; columns as named")
 
 
 def read_raw_poses(files: Sequence[Path]) -> RawPoses:

@@ -59,7 +59,7 @@ def write_draft(folder: Path, first: FirstSession) -> None:
 
 def _points(first: FirstSession) -> dict[str, list[object]]:
     """points.csv of the views that have a pose, in the session's length_unit."""
-    used = first.pairing.used
+    used = _in_order(first)
     names = _views([first.found.clouds[i] for i in used], first.found.folder)
     scale = MM / METRES[length_unit(first)]
     return points_columns(names, [first.sightings[i] for i in used], scale)
@@ -108,7 +108,7 @@ def _name(folder: Path) -> str:
 
 def views_text(folder: Path, first: FirstSession) -> str:
     """views.csv: a row for every cloud that has a pose."""
-    used = first.pairing.used
+    used = _in_order(first)
     clouds = [first.found.clouds[i] for i in used]
     rows = [int(first.pairing.rows[i] or 0) for i in used]
     columns: dict[str, list[str]] = {
@@ -121,12 +121,18 @@ def views_text(folder: Path, first: FirstSession) -> str:
         columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
     if reading.rotation != JOINT_ANGLES:
         columns |= {name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_poses(first, rows)).items()}
-    columns |= covariate_columns(reading.layout, rows)
+    columns |= covariate_columns(reading.layout, rows, first.raw.time_s)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
     return out.getvalue()
+
+
+def _in_order(first: FirstSession) -> tuple[int, ...]:
+    """Clouds that have a pose, in the order of time: a table that names its clouds was written as the robot went."""
+    pairing = first.pairing
+    return tuple(sorted(pairing.used, key=lambda i: pairing.rows[i] or 0)) if pairing.by_name else pairing.used
 
 
 def _poses(first: FirstSession, rows: list[int]) -> Array:

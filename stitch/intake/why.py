@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.frames import Array
+from stitch.intake.covariates import covariate_columns
 from stitch.intake.doctor import Decided, Judged
 from stitch.intake.found_files import Found
 from stitch.intake.guesses import Guess
@@ -57,9 +58,11 @@ def _pairing(decided: Decided) -> Guess:
 
 def _columns(raw: RawPoses, decided: Decided, stated: Stated) -> Guess:
     layout = decided.best.way.reading.layout
+    beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
+    words = f"; beside the poses {', '.join(beside)}" if beside else ""
     if stated.columns:
-        return Guess("columns", ", ".join(stated.columns), "stated with --columns", True, "--columns")
-    reason = "the file names them" if layout.named else "told by their values"
+        return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
+    reason = ("the file names them" if layout.named else "told by their values") + words
     return Guess("columns", layout.words, reason, layout.named or decided.told, "--columns")
 
 

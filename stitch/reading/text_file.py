@@ -1,5 +1,7 @@
 """The text of a file that may be anything: missing, a pipe, a folder, without end, or no text at all."""
 
+import codecs
+from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import InputError
@@ -34,14 +36,37 @@ def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
     Raises:
         InputError: no such file, too large, or not UTF-8.
     """
-    require_file(file, hint)
-    size = file.stat().st_size / 1e6
-    if size > largest_mb:
-        raise InputError(f"{file}: has {size:,.0f} MB, more than {largest_mb:g}; to fix: name the right file")
+    _require_size(file, hint, largest_mb)
     try:
         return file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: not UTF-8 text ({error.reason}); to fix: save it as UTF-8") from None
+
+
+def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
+    """The text of a file that another program wrote: UTF-8, UTF-16 with its mark, else Windows' Western European.
+
+    Spreadsheets write the last two; of a wrong guess only letters in names suffer, digits are the same in all.
+
+    Raises:
+        InputError: no such file, too large, or no text.
+    """
+    _require_size(file, hint, largest_mb)
+    told = file.read_bytes()
+    marked = told.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            text = told.decode(encoding)
+            if "\0" not in text:
+                return text
+    raise InputError(f"{file}: is no text; to fix: save it as UTF-8")
+
+
+def _require_size(file: Path, hint: str, largest_mb: float) -> None:
+    require_file(file, hint)
+    size = file.stat().st_size / 1e6
+    if size > largest_mb:
+        raise InputError(f"{file}: has {size:,.0f} MB, more than {largest_mb:g}; to fix: name the right file")
 
 
 def shortened(value: object, most: int = 80) -> str:
