@@ -61,11 +61,13 @@ def rounded(value: float, sigma: float) -> str:
 
 
 def told_in(unit: str) -> tuple[float, str]:
-    """Factor and unit in which numbers of a unit are read: rad in mrad, rad per something in µrad, growth in ppm."""
+    """Factor and unit in which numbers of a unit are read: rad and m in thousandths, growth and rad per something in ppm."""
     if unit.startswith("rad/"):
         return 1e6, f"µ{unit}"
     if unit in ("1/°C", "1/h"):
         return 1e6, f"ppm{unit[1:]}"
+    if unit == "m" or unit.startswith("m/"):
+        return 1e3, f"m{unit}"
     return (1e3, unit.replace("rad", "mrad")) if "rad" in unit else (1.0, unit)
 
 

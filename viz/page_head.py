@@ -28,6 +28,7 @@ class Head:
     lights: Sequence[Judged] = ()  # against what is allowed, where somebody said what is
     evidence: str = ""
     notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()  # in full, of which the verdict has the beginnings
 
 
 def write_page(path: Path, template: str, head: Head, **content: object) -> None:

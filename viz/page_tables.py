@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stitch.comparison.model_history import ModelHistory, change_of
 from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, amount, known_text
+from stitch.units import MICROMETRES, known_text
 from viz.run_figures import shown_points, view_shifts
 
 # Of more views than this the page lists those to look at first.
@@ -58,14 +58,14 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
         {
             "effect": term.name,
             "name": p.name,
-            "value": told.value.replace("-", "−"),
+            "value": told.value if p.discrete else told.value.replace("-", "−"),
             "sigma": told.sigma.replace("-", "−"),
             "unit": told.unit,
         }
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
-        for told in [amount(p.value, p.sigma if p.fitted else None, p.unit)]
+        for told in [p.told]
     ]
 
 

@@ -43,7 +43,9 @@ class RerunRecorder:
         self.rms = {}
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep the rms of an iteration."""
+        """Keep the rms of an iteration; a stage that begins anew, from another start, counts anew."""
+        if index == 0:
+            self.rms[stage] = []
         self.rms.setdefault(stage, []).append(rms)
 
     def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:

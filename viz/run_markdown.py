@@ -1,7 +1,7 @@
 """What a run found, as Markdown for the recording."""
 
 from stitch.comparison.model_history import ModelHistory
-from stitch.comparison.run_verdict import run_verdict
+from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
@@ -9,7 +9,9 @@ from stitch.writing.plain_effects import in_words
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
     """Verdict, how the error fell, what could not be seen."""
-    lines = [f"# {run.session.name}", "", f"**{run_verdict(run, history)}**", ""]
+    lines = [f"# {run.session.name}", "", f"**{run_headline(run, history)}**", ""]
+    for doubt in run.doubts:
+        lines += [doubt, ""]
     if run.effects:
         lines += [f"In the model: {', '.join(map(in_words, run.effects))}.", ""]
     lines += [run.verdict, ""]

@@ -5,7 +5,7 @@ from typing import Any
 
 from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory, model_history
-from stitch.comparison.run_verdict import run_light, run_verdict
+from stitch.comparison.run_verdict import run_headline, run_light
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
@@ -41,7 +41,8 @@ def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> He
     hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
     return Head(
         title=run.session.name,
-        verdict=run_verdict(run, history),
+        verdict=run_headline(run, history),
+        doubts=run.doubts,
         subjects=[Subject(identity(run))],
         lights=[] if light is None else [light],
         evidence=run.verdict,

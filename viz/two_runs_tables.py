@@ -7,7 +7,7 @@ import numpy as np
 from stitch.comparison.two_runs import Side, TwoRuns
 from stitch.frames import Array
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, amount, known_text, length_text
+from stitch.units import MICROMETRES, known_text, length_text
 
 
 class Fact(NamedTuple):
@@ -112,7 +112,7 @@ def _parameters(run: Run) -> dict[tuple[str, str, str], str]:
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
-        for told in [amount(p.value, p.sigma if p.fitted else None, p.unit)]
+        for told in [p.told]
     }
 
 

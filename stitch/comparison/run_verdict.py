@@ -1,11 +1,15 @@
 """The verdict of any run in plain words, and its light: of surfaces that overlap, or of labelled points alone."""
 
+import re
+
 import numpy as np
 
 from stitch.comparison.model_history import ModelHistory, change_of
 from stitch.comparison.plain_verdict import Judged, judged, plain_verdict
 from stitch.runs.run import Run
 from stitch.units import length_text
+
+_CLAUSE_END = re.compile(r"[:.] ")
 
 
 def run_verdict(run: Run, history: ModelHistory | None) -> str:
@@ -15,6 +19,21 @@ def run_verdict(run: Run, history: ModelHistory | None) -> str:
         history: of this run; None without clouds.
     """
     return " ".join([*run.doubts, _agreement(run, history)])
+
+
+def run_headline(run: Run, history: ModelHistory | None) -> str:
+    """The same, of every doubt no more than its first clause: what it means and what to do stands elsewhere."""
+    return " ".join([*map(_first_clause, run.doubts), _agreement(run, history)])
+
+
+def _first_clause(sentence: str) -> str:
+    """Up to the first colon or full stop outside brackets."""
+    ends = (found.start() for found in _CLAUSE_END.finditer(sentence) if _closed(sentence[: found.start()]))
+    return f"{sentence[: next(ends, len(sentence.rstrip('.')))]}."
+
+
+def _closed(text: str) -> bool:
+    return text.count("(") == text.count(")")
 
 
 def _agreement(run: Run, history: ModelHistory | None) -> str:

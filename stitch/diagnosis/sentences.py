@@ -137,5 +137,5 @@ def amounts_of(ranked: Ranked, at_most: int = 3) -> str:
     order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
     clearest = [(s.form.free[i], s.values[i], s.sigmas[i]) for i in sorted(order)]
     fitted = [f"{p.name} = {amount(v, sigma, p.unit)}" for p, v, sigma in clearest]
-    tried = [f"{p.name} = {amount(p.value, None, p.unit)}" for p in s.form.term.parameters if p.grid]
+    tried = [f"{p.name} = {p.told}" for p in s.form.term.parameters if p.grid]
     return ", ".join(tried + fitted)

@@ -17,6 +17,7 @@ import numpy as np
 
 from stitch.effects.specs import Spec
 from stitch.errors import InputError
+from stitch.units import Amount, amount
 
 PLACES = {
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
@@ -47,11 +48,24 @@ class Parameter:
     value: float = 0.0
     sigma: float = float("nan")  # NaN where the views do not show it: it is held at its value
     kept: bool = False  # of an arm that another run fitted: not fitted again
+    names: tuple[str, ...] = ()  # of the session's views, where it is the number of one
 
     @property
     def discrete(self) -> bool:
         """True for the view of an event: it is tried, never fitted."""
         return self.unit == "view"
+
+    @property
+    def told(self) -> Amount:
+        """As people read it; the view of an event by its name."""
+        name = self.view
+        return Amount(name, "–", "") if name else amount(self.value, self.sigma if self.fitted else None, self.unit)
+
+    @property
+    def view(self) -> str:
+        """Name of the first view after an event; empty where it is no event."""
+        number = int(np.ceil(self.value))
+        return self.names[number] if 0 <= number < len(self.names) else ""
 
     @property
     def held(self) -> bool:

@@ -35,9 +35,8 @@ def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, 
     views = measurement.views
     found = effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
     timed = bool(effect.prefers) and not any(views.has(name) for name in effect.prefers)
-    return tuple(
-        replace(p, grid=_grid(p, views.count), unit=p.unit.replace("°C", "h") if timed else p.unit) for p in found
-    )
+    found = tuple(replace(p, unit=p.unit.replace("°C", "h")) for p in found) if timed else found
+    return tuple(replace(p, grid=_grid(p, views.count), names=views.names if p.discrete else ()) for p in found)
 
 
 def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:

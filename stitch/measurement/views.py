@@ -26,6 +26,7 @@ class Views:
     standoff: float
     first: dict[str, float]  # the covariates at the session's first view
     number: Indices  # (V,) of the view in its session, from 0
+    names: tuple[str, ...] = ()  # of all views of the session, by their number
 
     def sag(self, c: Array) -> Array:
         """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
@@ -129,6 +130,7 @@ def views_of(session: Session) -> Views:
         standoff=standoff,
         first=first,
         number=np.arange(count),
+        names=tuple(session.names),
     )
 
 

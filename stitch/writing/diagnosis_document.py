@@ -67,7 +67,9 @@ def _untested(name: str, needs: tuple[str, ...]) -> dict[str, Any]:
 def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
     r, s, left_out = candidate.ranked, candidate.ranked.score, candidate.cross_validation
     parameters: dict[str, Any] = {
-        p.name: {"value": p.value, "sigma": None, "unit": p.unit} for p in s.form.term.parameters if p.grid
+        p.name: {"value": p.value, "sigma": None, "unit": p.unit} | ({"view": p.view} if p.view else {})
+        for p in s.form.term.parameters
+        if p.grid
     }
     if s.observable and s.fitted:
         parameters |= {

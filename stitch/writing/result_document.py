@@ -95,7 +95,10 @@ def ledger(run: Run) -> list[dict[str, Any]]:
 
 def _effects(run: Run) -> dict[str, dict[str, Any]]:
     return {
-        term.name: {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in term.parameters}
+        term.name: {
+            p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} | ({"view": p.view} if p.view else {})
+            for p in term.parameters
+        }
         for term in run.terms
     }
 

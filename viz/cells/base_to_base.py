@@ -69,7 +69,7 @@ def sentence(stand: Stand, result: BaseResult) -> str:
     x, y, z = T[:3, 3]
     turn = np.degrees(np.linalg.norm(frames.log(T)[:3]))
     return (
-        f"Base 2 stands at {x:.4f}, {y:.4f}, {z:.4f} {stand.length_unit} of base 1, turned by {turn:.3f}°; one sigma "
+        f"Base 2 stands at {x:.4f}, {y:.4f}, {z:.4f} {stand.length_unit} in base 1, turned by {turn:.3f}°; one sigma "
         f"is {sigma[3:].max() * mm:.2f} mm and {np.degrees(sigma[:3]).max():.4f}°."
     )
 

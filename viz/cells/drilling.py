@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.cells.drilling.camera_effects import Trial
 from stitch.cells.drilling.drill_job import Job
 from stitch.cells.drilling.drill_solution import Drive, JobResult
 from stitch.frames import transform
@@ -51,14 +52,17 @@ def sentence(job: Job, result: JobResult) -> str:
     )
 
 
+def _camera(found: Trial, length_unit: str) -> str:
+    """What an effect of the camera is, and its size."""
+    if found.effect == "plate_height":
+        return f"The plate of holes is {known_text(found.value, found.sigma)} {length_unit} off its stated height"
+    size = known_text(100 * found.value, 100 * found.sigma)
+    return f"The lens shifts the image's corners by {size} % of their way from its middle"
+
+
 def _notes(result: JobResult, length_unit: str) -> list[str]:
     found = [t for t in (result.effects.trials if result.effects else ()) if t.accepted]
-    units = {"plate_height": f" {length_unit}"}
-    out = [
-        f"Found and taken out: {t.effect} = {known_text(t.value, t.sigma)}{units.get(t.effect, '')} "
-        f"(p {t.p_value:.1g})."
-        for t in found
-    ]
+    out = [f"{_camera(t, length_unit)} (1 σ; p = {t.p_value:.1g}). That is taken out." for t in found]
     tool = result.tool_axis
     if tool is not None and tool.accepted:
         tilt, sigma = np.degrees([tool.tilt, tool.sigma])

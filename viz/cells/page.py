@@ -14,6 +14,8 @@ from viz.page_parts import png, svg
 
 # Beyond so many marks a drawing of lines is larger than one of pixels.
 _PIXELS = 130
+# Inches of a figure of which a phone shows the numbers.
+_PHONE = 8.0
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,11 @@ class Picture:
     figure: Figure
     caption: str
     pixels: bool = False  # thousands of points: stored as PNG
+
+    @property
+    def wide(self) -> bool:
+        """True if a phone's width would leave nothing to read of it."""
+        return self.figure.get_figwidth() > _PHONE
 
     @property
     def address(self) -> str:

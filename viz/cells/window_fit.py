@@ -14,7 +14,7 @@ from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.cells.window_fit_figures import deviation_map, histogram
+from viz.cells.window_fit_figures import NO_UNIT, deviation_map, histogram
 from viz.colours import signed_colours
 from viz.identity import Row
 
@@ -23,27 +23,34 @@ _RECORDED_POINTS, _WORST = 400_000, 10
 
 def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
     """Sentence, a map and a histogram for each part, poses and the worst cells."""
-    pictures = []
+    pictures, unit = [], job.length_unit or NO_UNIT
+    named = "" if job.length_unit else " Lengths in the unit of the CAD, whose file names none."
     for i, part in enumerate(parts):
         of = f" of part {i + 1}" if len(parts) > 1 else ""
         cad = "the CAD" if part.fit.allowance is None else "the CAD with its allowance"
         caption = (
             "The scan on the CAD, seen along the part's thinnest axis, outer and inner side alike. Red stands outside "
-            f"{cad}, blue inside; full colour is the tolerance of {job.tolerance:g}. Black rings: cells of the map "
-            "whose mean is beyond it. Lengths in the unit of the CAD, whose file names none."
+            f"{cad}, blue inside; full colour is the tolerance of {_told(job, f'{job.tolerance:g}')}. Black rings: "
+            f"cells of the map whose mean is beyond it.{named}"
         )
-        pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations), caption, pixels=True))
+        pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations, unit), caption, pixels=True))
         caption = "All points with a place on the CAD. What lies far out is a deformed place, and did not pull the fit."
-        pictures.append(Picture(f"Distances{of}", histogram(part), caption))
-    words = (sentence(parts), job.file, _about(job))
-    write(Page("Scan onto CAD", *words, pictures, _tables(parts), light=_light(job, parts)), path)
+        pictures.append(Picture(f"Distances{of}", histogram(part, unit), caption))
+    words = (sentence(job, parts), job.file, _about(job))
+    write(Page("Scan onto CAD", *words, pictures, _tables(job, parts), light=_light(job, parts)), path)
+
+
+def _told(job: FitJob, size: str) -> str:
+    """A length with its unit, where that is known."""
+    return f"{size} {job.length_unit}" if job.length_unit else size
 
 
 def _light(job: FitJob, parts: list[Part]) -> Judged:
     bad, cells = (sum(int(x) for x in own) for own in zip(*map(_counts, parts), strict=True))
     if not bad:
-        return Judged("good", f"Within {job.tolerance:g}: all {cells} cells of the map.")
-    return Judged("bad", f"Not within {job.tolerance:g}: {bad} of {cells} cells of the map are beyond it.")
+        return Judged("good", f"Within {_told(job, f'{job.tolerance:g}')}: all {cells} cells of the map.")
+    allowed = _told(job, f"{job.tolerance:g}")
+    return Judged("bad", f"Not within {allowed}: {bad} of {cells} cells of the map are beyond it.")
 
 
 def _counts(part: Part) -> tuple[int, int]:
@@ -54,33 +61,36 @@ def _about(job: FitJob) -> list[Row]:
     return [
         ("Measured", f"{len(job.placed.names)} scans, {len(job.scan.points):,} points"),
         ("Arm", "not stated"),
-        ("Scanner", f"noise {job.scan.noise:.2g} as the scans show it"),
-        ("CAD", f"{job.cad_file.name}, {job.cad.size:.4g} across, {job.instances} in the scan"),
+        ("Scanner", f"noise {_told(job, f'{job.scan.noise:.2g}')} as the scans show it"),
+        ("CAD", f"{job.cad_file.name}, {_told(job, f'{job.cad.size:.4g}')} across"),
+        ("Parts in the scan", str(job.instances)),
     ]
 
 
-def sentence(parts: list[Part]) -> str:
+def sentence(job: FitJob, parts: list[Part]) -> str:
     """What was found and how it compares."""
     sentences = []
     for i, part in enumerate(parts):
         bad, cells = part.deviations.outside, part.deviations.cells
         name = f"Part {i + 1}" if len(parts) > 1 else "The part"
-        where = f"its points lie {part.fit.scale:.3f} (one sigma) about the CAD"
+        where = f"its points scatter about the CAD by {_told(job, f'{part.fit.scale:.3f}')} (1 σ)"
         if bad.any():
             worst = float(cells.mean[int(np.argmax(np.abs(cells.mean)))])
             sentences.append(
-                f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells are out, by {worst:+.2f} at most."
+                f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by "
+                f"{_told(job, f'{worst:+.2f}')} at most."
             )
         else:
             sentences.append(
-                f"{name} is found; {where}, and all {len(bad)} cells are within {part.deviations.tolerance:g}."
+                f"{name} is found; {where}, and all {len(bad)} cells of the map are within "
+                f"{_told(job, f'{part.deviations.tolerance:g}')}."
             )
         if part.fit.allowance is not None:
             sentences.append(allowance_sentence(part.fit.allowance))
     return " ".join(sentences)
 
 
-def _tables(parts: list[Part]) -> list[Table]:
+def _tables(job: FitJob, parts: list[Part]) -> list[Table]:
     poses = []
     for i, part in enumerate(parts):
         sigma = part.fit.sigma
@@ -88,14 +98,17 @@ def _tables(parts: list[Part]) -> list[Table]:
         sizes = f"{sigma[3:].max():.4f}", f"{np.degrees(sigma[:3]).max():.5f}", f"{part.fit.rms:.3f}"
         shares = f"{part.start.share:.0%}", f"{part.start.runner_up:.0%}"
         poses.append((str(i + 1), *place, *sizes, *shares))
-    header = ("part", "x", "y", "z", "σ", "σ (°)", "rms", "meets the CAD", "next best pose")
-    tables = [Table("Where the parts lie", header, poses)]
+    in_unit = f" ({job.length_unit})" if job.length_unit else ""
+    x, y, z = (f"{axis}{in_unit}" for axis in "xyz")
+    distance = (f"σ{in_unit}", "σ (°)", f"distances, rms{in_unit}")
+    header = ("part", x, y, z, *distance, "of the scan on the CAD", "at the next best pose")
+    tables = [Table("Where the parts lie, in the robot's base", header, poses)]
     tables += _allowances(parts)
     for i, part in enumerate(parts):
         worst = np.argsort(-np.abs(part.deviations.cells.mean))[:_WORST]
         rows = [_cell_row(part.deviations, k) for k in worst]
-        title = "Worst cells" + (f" of part {i + 1}" if len(parts) > 1 else "")
-        tables.append(Table(title, ("x", "y", "z", "deviation", "points", "verdict"), rows))
+        title = "Worst cells of the map" + (f" of part {i + 1}" if len(parts) > 1 else "") + ", in the part's frame"
+        tables.append(Table(title, (x, y, z, f"deviation{in_unit}", "points", "verdict"), rows))
     return tables
 
 
@@ -119,7 +132,7 @@ def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:
 def record(job: FitJob, parts: list[Part], path: Path) -> None:
     """Base frame: CAD where it was found, points by deviation, scanners, programmed and corrected path."""
     size = job.cad.size
-    words = f"# Scan onto CAD\n\n{sentence(parts)}\n\n{_LEGEND}"
+    words = f"# Scan onto CAD\n\n{sentence(job, parts)}\n\n{_LEGEND}"
     with stage.stage(path, "Scan onto CAD", words) as recording:
         for name, T in zip(job.placed.names, job.placed.T_base_scanner, strict=True):
             stage.frame(recording, f"scanners/{name}", T, size / 40)

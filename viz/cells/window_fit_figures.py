@@ -8,17 +8,17 @@ from stitch.cells.window.window_solution import Part
 from viz.colours import BLUE, ORANGE, SIGNED
 
 # An STL has no unit.
-UNIT = "unit of the CAD"
+NO_UNIT = "unit of the CAD"
 _MAP_POINTS = 40_000
 # Inches that nine leave for the axes beside their labels and the colour bar.
 _WIDE = 7.2
 
 
-def deviation_map(found: Deviations, unit: str = UNIT) -> Figure:
+def deviation_map(found: Deviations, unit: str) -> Figure:
     """Points along the thinnest axis, coloured by their distance; cells beyond the tolerance ringed.
 
     Args:
-        unit: of all lengths, where somebody knows more than the CAD's file says.
+        unit: of all lengths, `NO_UNIT` where only the CAD's file could name it.
     """
     extent = np.ptp(found.points, axis=0)
     i, j = np.sort(np.argsort(extent)[1:])
@@ -40,7 +40,7 @@ def deviation_map(found: Deviations, unit: str = UNIT) -> Figure:
     return figure
 
 
-def histogram(part: Part) -> Figure:
+def histogram(part: Part, unit: str) -> Figure:
     """Distances of all points, with the tolerance."""
     found = part.deviations
     figure = Figure(figsize=(7, 2.4), layout="constrained")
@@ -49,6 +49,6 @@ def histogram(part: Part) -> Figure:
     ax.hist(np.clip(found.distance, -reach, reach), bins=120, color=BLUE, log=True)
     for side in (-1, 1):
         ax.axvline(side * found.tolerance, color=ORANGE, ls="--", lw=1)
-    ax.set(xlabel=f"distance from the CAD ({UNIT}; dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
+    ax.set(xlabel=f"distance from the CAD ({unit}; dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
     ax.spines[["top", "right"]].set_visible(False)
     return figure

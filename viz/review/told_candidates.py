@@ -57,7 +57,11 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
 
 def _amounts(parameters: dict[str, dict[str, Any]]) -> str:
     """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
-    tried = [f"{name} = {amount(p['value'], None, p['unit'])}" for name, p in parameters.items() if p["sigma"] is None]
+    tried = [
+        f"{name} = {p.get('view') or amount(p['value'], None, p['unit'])}"
+        for name, p in parameters.items()
+        if p["sigma"] is None
+    ]
     fitted = {name: p for name, p in parameters.items() if p["sigma"]}
     clearest = sorted(fitted, key=lambda name: -abs(fitted[name]["value"]) / fitted[name]["sigma"])[:_TOLD]
     told = [f"{name} = {amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest]

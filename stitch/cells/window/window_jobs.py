@@ -21,13 +21,14 @@ from stitch.frames import Array
 
 FIT, SEAM = "stitch-fit/1", "stitch-seam/1"
 _SCANS = {"scans", "session", "hand_eye"}
-_FIT_KEYS = {"format", *_SCANS, "cad", "instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
+_FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
 _SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
 
 
 @dataclass(frozen=True)
 class FitJob:
-    """Scans onto one CAD model; lengths in the CAD's unit."""
+    """Scans onto one CAD model; lengths in the CAD's unit, `length_unit` where somebody says which that is."""
 
     placed: Placed
     scan: Joined  # the same as one cloud
@@ -42,6 +43,7 @@ class FitJob:
     path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
     file: Path | None = None  # that was read
     wanted: Wanted = field(default_factory=Wanted)  # of the stock on the part
+    length_unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,9 @@ def read_fit_job(file: Path | str) -> FitJob:
         raise InputError(f"{file}: instances is {instances!r}; write how many parts are in the scan, 1 or more")
     cad_file = file_beside(file, "cad", document.get("cad"))
     cad, placed = read_cad(cad_file), _scans(file, document)
+    unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
+    if "length_unit" in document:
+        unit = choice(file, "length_unit", document["length_unit"], (unit,) if unit else ("mm", "m"))
     return FitJob(
         placed=placed,
         scan=assemble(placed),
@@ -90,6 +95,7 @@ def read_fit_job(file: Path | str) -> FitJob:
         T_base_part_nominal=nominal,
         path=path,
         file=file,
+        length_unit=unit,
     )
 
 

@@ -8,7 +8,7 @@ from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
 from stitch.model.term import Term
 from stitch.runs.run import Run
 from stitch.system.console import console
-from stitch.units import amount, length_text
+from stitch.units import length_text
 
 
 def show_ledger(result: Run) -> None:
@@ -25,7 +25,7 @@ def show_ledger(result: Run) -> None:
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
             how = "" if p.fitted else " (of those tried, this explains most)"
-            terminal.print(f"  {name}.{p.name} = {amount(p.value, p.sigma, p.unit)}{how}")
+            terminal.print(f"  {name}.{p.name} = {p.told}{how}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
 
