@@ -61,7 +61,7 @@ def rounded(value: float, sigma: float) -> str:
 
 
 def told_in(unit: str) -> tuple[float, str]:
-    """Factor and unit in which numbers of a unit are read: rad and m in thousandths, growth and rad per something in ppm."""
+    """Factor and unit in which numbers are read: mrad, µrad per something, ppm of growth, mm for m."""
     if unit.startswith("rad/"):
         return 1e6, f"µ{unit}"
     if unit in ("1/°C", "1/h"):

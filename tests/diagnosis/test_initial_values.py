@@ -19,4 +19,5 @@ def test_a_slip_that_the_run_is_told_of_is_found_where_it_was():
     assert true != 6  # the middle, where a fit that does not look would begin
     found = run(session_of(measured), effects=["part_slip"])
     (term,) = found.terms
-    assert {p.name: p.value for p in term.parameters}["v"] == true
+    (place,) = (p for p in term.parameters if p.name == "v")
+    assert place.value == true and str(place.told) == session_of(measured).names[int(true)]

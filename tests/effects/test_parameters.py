@@ -1,10 +1,12 @@
 """Parameters of effects: units, and effects that a session cannot have."""
 
+from dataclasses import replace
+
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import known, require
+from stitch.effects.in_session import known, parameters_in, require
 from stitch.errors import InputError
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
@@ -24,6 +26,17 @@ def test_parameters_are_in_the_unit_of_the_session():
     kappa = EFFECTS["part_sag"].parameters(6, (), "m")[0]
     assert kappa.unit == "1/m"
     assert kappa.typical == pytest.approx(1000 * EFFECTS["part_sag"].parameters(6, (), "mm")[0].typical)
+
+
+def test_the_view_of_an_event_is_told_by_its_name(still_cells):
+    measurement = chain_for(still_cells["eye_to_hand"])
+    names = session_of(still_cells["eye_to_hand"]).names
+    (place,) = (p for p in parameters_in(measurement, EFFECTS["part_slip"]) if p.discrete)
+    assert str(replace(place, value=2.0).told) == names[2]
+    # Of the views that are left, numbers and names stay those of the session.
+    (without,) = (p for p in parameters_in(measurement.without([0]), EFFECTS["part_slip"]) if p.discrete)
+    assert str(replace(without, value=2.0).told) == names[2]
+    assert str(replace(place, value=2.0, names=()).told) == "2 view"
 
 
 def test_unknown_and_impossible_effects_are_refused(still_cells):

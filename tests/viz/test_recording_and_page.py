@@ -19,6 +19,7 @@ from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
 from viz.model_timeline import one_above_the_other
+from viz.recording import RerunRecorder
 from viz.run_page import write_report
 
 
@@ -70,6 +71,13 @@ def test_the_recording_is_whole_and_small_and_shows_everything(recorded):
     cell = {"/robot/arm", "/robot/flanges", "/robot/part", "/robot/scanner/scanner", "/robot/names"}
     bars = {"/bars/views", "/bars/moved", "/iterations/correct", "/iterations/register", "/colours/field/ticks"}
     assert parts | cell | bars | {"/stitched", "/displacements", "/now", "/verdict", "/diagnosis/verdict"} <= shown
+
+
+def test_a_stage_that_begins_anew_is_drawn_from_its_last_beginning(tmp_path):
+    recorder = RerunRecorder(tmp_path / "r.rrd")
+    for index, rms in ((0, 9.0), (1, 8.0), (0, 5.0), (1, 4.0), (2, 3.0)):
+        recorder.iteration("fit", index, np.zeros((0, 4, 4)), rms, 1.0)
+    assert recorder.rms == {"fit": [5.0, 4.0, 3.0]}
 
 
 def test_no_name_of_a_view_covers_another():

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -10,6 +11,7 @@ from markupsafe import escape
 
 from stitch.comparison.model_history import model_history
 from stitch.comparison.plain_verdict import judged, plain_verdict
+from stitch.comparison.run_verdict import run_headline
 from stitch.writing.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.filled_templates import render
@@ -67,6 +69,27 @@ def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):
 )
 def test_everybody_can_read_and_reach_it(browser, file, way):
     require_for_everybody(browser, file, way)
+
+
+def test_the_headline_of_a_doubtful_session_is_short_and_what_to_do_is_folded(recorded, tmp_path):
+    """What a wall, a knock that these views do not tell from another, and a torn session make of it."""
+    doubts = (
+        "13% of what the scans show stands still before the scanner: a wall, at 12 places. State within = [[0]], and on.",
+        "From view v4 on the part sits elsewhere (or the scanner: not told. Which?), 5 mm off: no hand-eye holds.",
+        "No arm scatters by 3.2 mm and 0.5 mrad: several rows or scans are wrong.",
+    )
+    run = replace(recorded[0], doubts=doubts)
+    said = run_headline(run, model_history(run))
+    assert said.startswith(
+        "13% of what the scans show stands still before the scanner. From view v4 on the part sits elsewhere (or the "
+        "scanner: not told. Which?), 5 mm off. No arm scatters by 3.2 mm and 0.5 mrad. "
+    )
+    assert said.endswith(plain_verdict(model_history(run), "mm"))
+    write_report(run, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert f'<p class="verdict">{escape(said)}</p>' in page
+    folded = page[page.index('<details class="doubts">') :]
+    assert all(str(escape(doubt)) in folded[: folded.index("</details>")] for doubt in doubts)
 
 
 def test_words_can_be_read_on_light_and_dark():

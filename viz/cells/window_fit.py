@@ -100,9 +100,10 @@ def _tables(job: FitJob, parts: list[Part]) -> list[Table]:
         poses.append((str(i + 1), *place, *sizes, *shares))
     in_unit = f" ({job.length_unit})" if job.length_unit else ""
     x, y, z = (f"{axis}{in_unit}" for axis in "xyz")
-    distance = (f"σ{in_unit}", "σ (°)", f"distances, rms{in_unit}")
-    header = ("part", x, y, z, *distance, "of the scan on the CAD", "at the next best pose")
-    tables = [Table("Where the parts lie, in the robot's base", header, poses)]
+    header = ("part", x, y, z, f"σ{in_unit}", "σ (°)", f"rms{in_unit}", "meets the CAD", "next best pose")
+    tables = [
+        Table("Where the parts lie in the robot's base, and how much of the scan meets the CAD there", header, poses)
+    ]
     tables += _allowances(parts)
     for i, part in enumerate(parts):
         worst = np.argsort(-np.abs(part.deviations.cells.mean))[:_WORST]
