@@ -1,6 +1,7 @@
 """The verdict of any run in plain words, and its light: of surfaces that overlap, or of labelled points alone."""
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,7 +24,14 @@ def run_verdict(run: Run, history: ModelHistory | None) -> str:
 
 def run_headline(run: Run, history: ModelHistory | None) -> str:
     """The same, of every doubt no more than its first clause: what it means and what to do stands elsewhere."""
-    return " ".join([*map(_first_clause, run.doubts), _agreement(run, history)])
+    return headline(run_verdict(run, history), run.doubts)
+
+
+def headline(verdict: str, doubts: Sequence[str]) -> str:
+    """A verdict as result.json has it, of every doubt in it no more than its first clause."""
+    for doubt in doubts:
+        verdict = verdict.replace(doubt, _first_clause(doubt), 1)
+    return verdict
 
 
 def _first_clause(sentence: str) -> str:

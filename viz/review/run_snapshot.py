@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from stitch.comparison.model_history import change_of
+from stitch.comparison.run_verdict import headline
 from stitch.errors import InputError
 from stitch.reading.text_file import shortened
 from stitch.runs.run import LedgerStep
@@ -78,14 +79,15 @@ def _read(run: Path, version: str) -> Snapshot:
     model = version_of(run, ("result.json",))
     # A run without clouds says null; an older one says nothing.
     labelled = result.get("disagreement", {}) is None
+    doubts = result.get("doubts", [])
     state = {
         "version": version,
         "model": model,
         "run": str(run),
         "session": result["session"],
         "name": result.get("name", Path(result["session"]).name),
-        "sentence": result.get("plain") or result["verdict"],
-        "evidence": result["verdict"],
+        "sentence": headline(result.get("plain") or result["verdict"], doubts),
+        "evidence": " ".join([*doubts, result["verdict"]]),
         "length_unit": result["length_unit"],
         "labelled": labelled,
         "carried": result["mount"] == "eye_to_hand",
@@ -126,13 +128,7 @@ def _step(ledger: tuple[LedgerStep, ...], i: int, um: float) -> dict[str, Any]:
 def _effects(result: dict[str, Any]) -> list[dict[str, str]]:
     """Fitted parameters of the effects in use."""
     return [
-        {
-            "effect": effect,
-            "parameter": name,
-            "value": told.value,
-            "sigma": told.sigma,
-            "unit": told.unit,
-        }
+        {"effect": effect, "parameter": name, "value": told.value, "sigma": told.sigma, "unit": told.unit}
         for effect, own in result["effects"].items()
         for name, p in own.items()
         if p.get("sigma") is not None

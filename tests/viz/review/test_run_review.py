@@ -56,6 +56,16 @@ def test_what_is_shown_is_what_the_files_say(run):
     assert {t["name"] for t in found.state["comparison"]} >= {"view", "range", "place on the part"}
 
 
+def test_doubts_stand_in_full_below_a_short_headline(run):
+    file = run / "result.json"
+    result = json.loads(file.read_text(encoding="utf-8"))
+    doubt = "9% of what the scans show stands still before the scanner: a wall. State within, and run again."
+    file.write_text(json.dumps(result | {"doubts": [doubt], "plain": f"{doubt} {result['plain']}"}), encoding="utf-8")
+    state = read_snapshot(run).state
+    assert state["sentence"].startswith("9% of what the scans show stands still before the scanner. ")
+    assert state["sentence"].endswith(result["plain"]) and state["evidence"] == f"{doubt} {result['verdict']}"
+
+
 def test_a_folder_that_is_rewritten_while_it_is_read_is_read_again(run, monkeypatch):
     """The result of one model beside the ledger of another is not shown."""
     read, calls = run_snapshot.read_documents, []
