@@ -11,10 +11,11 @@ _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 
 
 def judged_by_size(session: Session, found: Snooping) -> Snooping:
-    """Suspected views that are off by more than what effects of an arm are believed to do are misplaced."""
+    """Suspected views that are surely off by more than what effects of an arm are believed to do are misplaced."""
 
     def too_far(m: Misplaced) -> bool:
-        return m.rotation > _VIEW_ROTATION or m.distance * METRES[session.length_unit] > _VIEW_M
+        rotation, distance = m.at_least
+        return rotation > _VIEW_ROTATION or distance * METRES[session.length_unit] > _VIEW_M
 
     return found.settled(too_far)
 
@@ -37,7 +38,8 @@ def beyond_any_arm(session: Session, rotation: float, translation: float) -> boo
 
 def stands_off(session: Session, found: Misplaced) -> str:
     """How far a suspected view stands off, in words."""
-    return f"stands off by {found.distance:.3g} {session.length_unit} and {1e3 * found.rotation:.3g} mrad"
+    rotation, distance = found.at_least
+    return f"stands off by at least {distance:.3g} {session.length_unit} and {1e3 * rotation:.3g} mrad"
 
 
 def contradicted_by(session: Session, found: Snooping) -> str:

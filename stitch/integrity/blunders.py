@@ -51,7 +51,7 @@ def find_blunders(model: ViewModel, alone: Sequence[int] = (), steps: Sequence[S
         alone: views that are known to be off: they stay free and are not counted.
         steps: what all views from one on have in common.
     """
-    return _rosner(model, _columns(model, alone, steps), alone)
+    return _rosner(model, columns_of(model, alone, steps), alone)
 
 
 def off_anyway(
@@ -60,14 +60,14 @@ def off_anyway(
     """Of views that no surface links where they should stand, those that the scatter of all others does not explain."""
     out = []
     for v in unlinked:
-        tested, p = left_alone(model, _columns(model, [*alone, *(w for w in unlinked if w != v)], steps), v)
+        tested, p = left_alone(model, columns_of(model, [*alone, *(w for w in unlinked if w != v)], steps), v)
         p = min(1.0, model.count * p)
         if p < FAMILY_WISE:
             out.append(Blunder(v, tested, p))
     return out
 
 
-def _columns(model: ViewModel, alone: Sequence[int], steps: Sequence[Step]) -> Array | None:
+def columns_of(model: ViewModel, alone: Sequence[int], steps: Sequence[Step]) -> Array | None:
     """(n, K) of views that stay free, and of steps."""
     columns = model.columns(alone)
     for step in steps:

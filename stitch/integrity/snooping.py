@@ -16,6 +16,7 @@ from stitch.frames import Array
 from stitch.integrity.blunders import Found, find_blunders
 from stitch.integrity.expected_poses import expected_poses
 from stitch.integrity.homes import Homes, find_homes
+from stitch.integrity.least_displacement import least_displacement
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import judge, place, surface_of
 from stitch.integrity.pose_tests import PoseTests, pose_tests
@@ -36,6 +37,7 @@ class Misplaced:
     distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
     p_value: float  # family-wise, 0 where it is not even linked
     T: Array | None  # (4, 4) T_reference_scanner where the surface puts it
+    at_least: tuple[float, float] = (0.0, 0.0)  # the two of the smallest displacement that is likely, of a suspect
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def snoop(
     return Snooping(
         linkage=homes.linkage,
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
-        suspected=tuple(m for m in standing_out if m.view not in sure),
+        suspected=tuple(_suspect(capture, model, homes, tests, m) for m in standing_out if m.view not in sure),
         steps=tests.steps,
         disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
@@ -144,6 +146,12 @@ def _standing_out(capture: Capture, expected: Array, homes: Homes, tests: PoseTe
     out = [_misplaced(capture, expected[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
     known = {b.view for b in off} | set(homes.homeless)
     return out + [_misplaced(capture, expected[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known]
+
+
+def _suspect(capture: Capture, model: ViewModel, homes: Homes, tests: PoseTests, m: Misplaced) -> Misplaced:
+    others = [v for v in (*tests.alone, *(b.view for b in tests.found.blunders)) if v != m.view]
+    middle = frames.transform(homes.freed.poses[m.view], capture.scans[m.view].points.mean(axis=0)[None])[0]
+    return replace(m, at_least=least_displacement(model, tests.found, others, tests.steps, m.view, middle))
 
 
 def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:

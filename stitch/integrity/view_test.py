@@ -24,6 +24,9 @@ from stitch.statistics.variance_components import VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
 _SEEN = 1e-6
+# A direction of one view's displacement is held if surfaces see this share of it. Where a scan slides along the others
+# it is 0.001 and less, and what little is seen is their noise; elsewhere 0.9.
+_HELD = 0.1
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,13 @@ class ViewModel:
             return MixedModel(self.z[None], A, components, usual)
         every = np.concatenate([components, self.errors.components[:, None]])
         return MixedModel(self.z[None], A, every, usual, scales=self.errors.scales)
+
+    @cached_property
+    def alone(self) -> Array:
+        """(V, n, 6) as `views`, less the directions in which nothing holds a single view."""
+        _, values, vectors = np.linalg.svd(self.views, full_matrices=False)
+        held = vectors * (values**2 > _HELD)[:, :, None]
+        return np.asarray(self.views @ held.transpose(0, 2, 1) @ vectors)
 
     @cached_property
     def _components(self) -> Array:
