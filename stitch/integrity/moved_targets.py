@@ -1,40 +1,49 @@
 """Labelled points that sit elsewhere among the others from some view on: a ball that was bumped, a nest put back wrong.
 
 Distances between the targets of one view are the same whatever the arm and the hand-eye are. Where those from one
-target to the others step between two views, and those of the others among themselves do not, that one has moved; the
-fit would put it half way, and call the misfit of its views errors of the arm.
+target to the others step between two views, or change little by little, and those of the others among themselves do
+not, that one has moved; the fit would put it half way, and call the misfit of its views errors of the arm.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.measurement.session import Session
 from stitch.measurement.sightings import Sightings
-from stitch.observations.targets.outliers import LIMIT_TARGET
+from stitch.observations.targets.distances import MANY, distance_sigma, distances, places_of
+from stitch.observations.targets.mislabelled import mislabelled
+from stitch.observations.targets.outliers import LIMIT_TARGET, outside
+from stitch.statistics.robust import MAD_TO_SIGMA, median_of_known
 from stitch.units import length_text
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
 _SIDE, _TARGETS = 2, 3
-# More targets hold each other, so that one that moved pulls little; to compare all their pairs takes minutes.
-_MANY = 24
-# Standard error of a median over that of a mean, and a standard deviation over the median of its deviations.
-_MEDIAN, _MAD = 1.25, 1.4826
-# Places of a step that are tried at a time, ever closer.
-_TRIED = 50
+# Standard error of a median over that of a mean.
+_MEDIAN = 1.25
+# Targets that are looked at closely, and how far a single distance pulls where all are looked at, in sigmas.
+_LIKELIEST, _CLIPPED = 8, 10.0
+# What creeps leaves so much less about a straight line than about a step.
+_CREEPS = 0.7
 
 
 @dataclass(frozen=True)
 class MovedTarget:
-    """From view `start` on a target sits elsewhere among the others."""
+    """From view `start` on a target sits elsewhere among the others, or wanders off over the whole session."""
 
     target: str
     start: int
     distance: float  # length_unit: by which its distances to the others change at the most
+    creeps: bool = False
 
     def said(self, view: str, length: str) -> str:
         """What happened and what to do, with the name of the view and that distance in words."""
+        if self.creeps:
+            return (
+                f"{self.target} creeps among the targets over the session: its distances to the others change by up to "
+                f"{length}. Leave it out of points.csv, and fix it before you measure again."
+            )
         return (
             f"{self.target} sits elsewhere among the targets from view {view} on: its distances to the others change "
             f"by up to {length}. Give it another name from there on in points.csv, or leave it out."
@@ -42,70 +51,83 @@ class MovedTarget:
 
 
 def said_of_targets(session: Session, sightings: Sightings | None) -> tuple[str, ...]:
-    """Which targets moved, in words; nothing where a session has none."""
+    """Which views have names mixed up and which targets moved, in words; nothing where a session has none."""
     if sightings is None:
         return ()
-    names = session.names
-    found = moved_targets(sightings.everything)
-    return tuple(m.said(names[m.start], length_text(m.distance, session.length_unit)) for m in found)
+    names, every = session.names, sightings.everything
+    mixed_up = mislabelled(every)
+    used = outside(every.used, [m.outlier for m in mixed_up], every.targets, every.target)
+    moved = moved_targets(replace(every, used=used))
+    return (
+        *(m.said(names[m.view]) for m in mixed_up),
+        *(m.said(names[m.start], length_text(m.distance, session.length_unit)) for m in moved),
+    )
 
 
 def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
-    """Targets that moved once, the clearest first; each is asked without those before it; none among more than 24."""
-    if len(sightings.targets) > _MANY:
-        return ()
-    apart, sigma = _distances(sightings), float(np.median(sightings.sigma[sightings.used]))
+    """Targets that moved once, the clearest first; each is asked without those before it."""
+    places, sigma = places_of(sightings), distance_sigma(sightings)
     left, found = list(range(len(sightings.targets))), list[MovedTarget]()
     while len(left) >= _TARGETS:
-        steps = [_step(apart[:, left][:, :, left], k, sigma) for k in range(len(left))]
-        times, start, distance = max(steps)
-        if times < LIMIT_TARGET:
+        steps = {k: _step(places[:, left], k, start, sigma) for k, start in _likeliest(places[:, left], sigma)}
+        k = max(steps, key=lambda k: steps[k][0], default=-1)
+        if k < 0 or steps[k][0] < LIMIT_TARGET:
             break
-        gone = left.pop(steps.index((times, start, distance)))
-        found.append(MovedTarget(sightings.targets[gone], start, distance))
+        found.append(replace(steps[k][1], target=sightings.targets[left.pop(k)]))
     return tuple(found)
 
 
-def _distances(sightings: Sightings) -> Array:
-    """(V, K, K) between targets, NaN where a view does not show both."""
-    V, K = len(sightings.target), len(sightings.targets)
-    places = np.full((V, K, 3), np.nan)
-    view, slot = np.nonzero(sightings.used)
-    places[view, sightings.target[view, slot]] = sightings.points[view, slot]
-    return np.asarray(np.linalg.norm(places[:, :, None] - places[:, None], axis=3))
+def _likeliest(places: Array, sigma: float) -> list[tuple[int, int]]:
+    """The targets (V, K, 3) of which means before and after some view differ most, and that view."""
+    found = []
+    for k in range(places.shape[1]):
+        own = np.linalg.norm(places[:, _partners(places, k)] - places[:, k : k + 1], axis=2)
+        times = _steps_of_means(own - median_of_known(own), sigma)
+        if times.max(initial=0.0) > 0:
+            found.append((float(times.max()), k, int(np.argmax(times))))
+    return [(k, start) for _, k, start in sorted(found, reverse=True)[:_LIKELIEST]]
 
 
-def _step(apart: Array, k: int, sigma: float) -> tuple[float, int, float]:
-    """How many times what is usual the distances (V, K, K) from target k step, from which view on, and the largest."""
-    others = np.arange(apart.shape[1]) != k
-    own, among = apart[:, k, others], apart[:, others][:, :, others][:, *np.triu_indices(others.sum(), 1)]
-    low, high = _SIDE, len(apart) - _SIDE
-    while True:
-        starts = np.unique(np.linspace(low, high, _TRIED).astype(int))
-        gains = [_gain(own, among, int(start)) for start in starts]
-        at = int(np.argmax(gains))
-        if not gains[at] > 0:
-            return 0.0, 0, 0.0
-        if high - low < _TRIED:
-            break
-        low, high = int(starts[max(at - 1, 0)]), int(starts[min(at + 1, len(starts) - 1)])
-    start = int(starts[at])
-    mine, rest = _known(own, start), _known(among, start)
+def _partners(places: Array, k: int) -> Indices:
+    """Other targets that hold one (V, K, 3): of those often seen with it some, all over the list."""
+    seen = np.isfinite(places[:, :, 0])
+    together = seen[:, k].astype(float) @ seen
+    together[k] = 0
+    others = np.flatnonzero(together > together.max() / 2)
+    return np.asarray(others[np.linspace(0, len(others) - 1, min(len(others), MANY - 1)).astype(int)])
+
+
+def _steps_of_means(off: Array, sigma: float) -> Array:
+    """(V,) by how many standard errors distances (V, P) step before each view, rms; 0 where too few are seen."""
+    seen = np.isfinite(off)
+    scatter = max(sigma, MAD_TO_SIGMA * float(np.median(np.abs(off[seen])))) if seen.any() else 1.0
+    clipped = np.where(seen, np.clip(off / scatter, -_CLIPPED, _CLIPPED), 0.0)
+    before, sums = (np.cumsum(x, axis=0) - x for x in (seen.astype(float), clipped))
+    after = seen.sum(axis=0) - before
+    known = (before >= _SIDE) & (after >= _SIDE)
+    n, m = np.where(known, before, 1.0), np.where(known, after, 1.0)
+    squares = known * (sums / n - (clipped.sum(axis=0) - sums) / m) ** 2 / (1 / n + 1 / m)
+    few = known.sum(axis=1) < _TARGETS - 1
+    return np.where(few, 0.0, np.sqrt(squares.mean(axis=1)))
+
+
+def _step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
+    """How many times what is usual the distances from target k step before a view, and the move that this would be."""
+    held = _partners(places, k)
+    among = distances(places[:, held])[:, *np.triu_indices(len(held), 1)]
+    mine, rest = _known(np.linalg.norm(places[:, held] - places[:, k : k + 1], axis=2), start), _known(among, start)
+    if not rest.shape[1]:
+        return 0.0, MovedTarget("", start, 0.0)
     # By the sensor's sigma, or by what is left on both sides: a lens changes distances too, but with every view.
-    left = np.concatenate([np.abs(_level(d, start)[1]).ravel() for d in (mine, rest)])
-    scatter = max(np.sqrt(2) * sigma, _MAD * float(np.nanmedian(left)))
+    left = [d - _levels(d, start) for d in (mine, rest)]
+    scatter = max(sigma, MAD_TO_SIGMA * float(np.nanmedian(np.abs(np.concatenate(left, axis=1)))))
     (steps, times), (_, usual) = (_stepped(d, start, scatter) for d in (mine, rest))
-    return float(np.median(times) / max(np.median(usual), 1.0)), start, float(steps.max())
-
-
-def _gain(own: Array, among: Array, start: int) -> float:
-    """By how much a step before a view brings distances (V, K − 1) nearer to their medians, in sum; 0 where too few are
-    seen on both sides, or none among the others (V, ·)."""
-    mine = _known(own, start)
-    if mine.shape[1] < _TARGETS - 1 or not _known(among, start).shape[1]:
-        return 0.0
-    off = [float(np.nansum(np.abs(d - np.nanmedian(d, axis=0)))) for d in (mine, mine[:start], mine[start:])]
-    return off[0] - off[1] - off[2]
+    line = mine - _lines(mine)
+    creeps = bool(np.nansum(np.abs(line)) < _CREEPS * np.nansum(np.abs(left[0])))
+    distance = float(
+        np.max(np.nanmax(_lines(mine), axis=0) - np.nanmin(_lines(mine), axis=0)) if creeps else steps.max()
+    )
+    return float(np.median(times) / max(np.median(usual), 1.0)), MovedTarget("", start, distance, creeps)
 
 
 def _known(distances: Array, start: int) -> Array:
@@ -114,14 +136,25 @@ def _known(distances: Array, start: int) -> Array:
     return distances[:, (seen[:start].sum(axis=0) >= _SIDE) & (seen[start:].sum(axis=0) >= _SIDE)]
 
 
-def _level(distances: Array, start: int) -> tuple[Array, Array]:
-    """(2, p) medians before and from a view on, and (V, p) what is left."""
-    medians = np.array([np.nanmedian(half, axis=0) for half in (distances[:start], distances[start:])])
-    return medians, distances - np.where(np.arange(len(distances))[:, None] < start, *medians)
+def _levels(distances: Array, start: int) -> Array:
+    """(V, p) medians before and from a view on."""
+    sides = np.arange(len(distances))[:, None] < start
+    return np.where(sides, *(median_of_known(half) for half in (distances[:start], distances[start:])))
+
+
+def _lines(distances: Array) -> Array:
+    """(V, p) straight lines through distances over the session, by least squares."""
+    seen = np.isfinite(distances)
+    order = np.where(seen, np.arange(len(distances))[:, None], np.nan)
+    at = np.where(seen, order - np.nanmean(order, axis=0), 0.0)
+    middle = np.nanmean(distances, axis=0)
+    slope = np.sum(at * np.where(seen, distances - middle, 0.0), axis=0) / np.maximum(np.sum(at**2, axis=0), 1e-300)
+    return np.asarray(np.where(seen, middle + slope * at, np.nan))
 
 
 def _stepped(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:
     """(p,) steps of the medians, in length_unit and in standard errors."""
+    levels = _levels(distances, start)
     before, after = (np.isfinite(half).sum(axis=0) for half in (distances[:start], distances[start:]))
-    steps = np.abs(np.diff(_level(distances, start)[0], axis=0)[0])
+    steps = np.abs(levels[-1] - levels[0])
     return steps, steps / (_MEDIAN * scatter * np.sqrt(1 / before + 1 / after))

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 from stitch.errors import NoResultError
 from stitch.measurement.measurement import Measurement
+from stitch.observations.targets.mislabelled import mislabelled
 from stitch.observations.targets.outliers import Outlier, find_outliers, outside
 from stitch.observations.targets.target_fit import TargetFit
 
@@ -39,7 +40,8 @@ def without_outliers(
         NoResultError: more than a third of the labelled points of a session would have to go.
     """
     measurements = [_with_everything(m) for m in measurements]
-    taken = [list[Outlier]() for _ in measurements]
+    taken = [_mislabelled(m) for m in measurements]
+    measurements = [_taken_out(m, t) if t else m for m, t in zip(measurements, taken, strict=True)]
     found: Found | None = None
     while True:
         found = fit(measurements, found)
@@ -57,6 +59,12 @@ def _with_everything(measurement: Measurement) -> Measurement:
     if s is None:
         return measurement
     return replace(measurement, capture=replace(measurement.capture, sightings=s.everything))
+
+
+def _mislabelled(measurement: Measurement) -> list[Outlier]:
+    """Views whose targets bear each other's names: they would pull the fit to where these lie."""
+    s = measurement.capture.sightings
+    return [] if s is None else [m.outlier for m in mislabelled(s)]
 
 
 def _taken_out(measurement: Measurement, worse: Sequence[Outlier]) -> Measurement:

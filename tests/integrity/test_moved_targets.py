@@ -3,26 +3,8 @@
 import numpy as np
 import pytest
 
-from stitch import frames
 from stitch.integrity.moved_targets import moved_targets
-from stitch.measurement.sightings import Sightings
-
-VIEWS, SIGMA = 14, 0.01
-PLACES = np.array([[0, 0, 0], [120, 10, 0], [0, 90, 30], [80, 70, -20], [40, -60, 50.0]])
-
-
-def sightings(places, seed=0, unseen=()):
-    """What views from anywhere show of targets at places (V, K, 3)."""
-    rng = np.random.default_rng(seed)
-    views, count = places.shape[:2]
-    turned = frames.exp(rng.normal(size=(views, 6)) * np.repeat([1.0, 100.0], 3))
-    points = np.array([frames.transform(T, own) for T, own in zip(turned, places, strict=True)])
-    target = np.tile(np.arange(count), (views, 1))
-    for view, k in unseen:
-        target[view, k] = -1
-    points = points + SIGMA * rng.normal(size=points.shape)
-    names = tuple(f"ball{k + 1}" for k in range(count))
-    return Sightings(names, target, points, np.full(target.shape, SIGMA), target >= 0)
+from tests.integrity.targets import PLACES, SIGMA, VIEWS, sightings
 
 
 def moved(k, start, by, places=PLACES, views=VIEWS):
@@ -68,6 +50,39 @@ def test_what_grows_alike_is_no_target_that_moved():
     """A scanner that warms up lengthens all distances."""
     grown = PLACES * np.linspace(1, 1.002, VIEWS)[:, None, None]
     assert moved_targets(sightings(grown)) == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_of_hundreds_of_targets_is_told(seed):
+    """Every view shows a third of them; all pairs of them would be too many to compare."""
+    rng, views, count = np.random.default_rng([seed, 2]), 40, 150
+    places = rng.uniform(-300, 300, (count, 3))
+    unseen = [(v, int(k)) for v in range(views) for k in rng.permutation(count)[: 2 * count // 3]]
+    (found,) = moved_targets(sightings(moved(31, 18, np.array([0.3, 0.2, -0.3]), places, views), seed, unseen))
+    assert found.target == "ball32" and not found.creeps
+    # Where no view shows it, no view tells when it moved.
+    shown = [v for v in range(views) if (v, 31) not in unseen]
+    assert max([v for v in shown if v < 18]) < found.start <= min(v for v in shown if v >= 18)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_none_of_hundreds_of_targets_that_stay_is_accused(seed):
+    rng = np.random.default_rng([seed, 3])
+    places = np.tile(rng.uniform(-300, 300, (120, 3)), (30, 1, 1))
+    unseen = [(v, int(k)) for v in range(30) for k in rng.permutation(120)[:60]]
+    assert moved_targets(sightings(places, seed, unseen)) == ()
+
+
+def test_a_target_that_creeps_is_told_from_one_that_was_bumped():
+    places = np.tile(PLACES, (VIEWS, 1, 1))
+    places[:, 2] += np.linspace(0, 1, VIEWS)[:, None] * np.array([0.6, 0.0, 0.8])
+    (found,) = moved_targets(sightings(places))
+    others = np.delete(PLACES, 2, axis=0)
+    change = np.linalg.norm(places[-1, 2] - others, axis=1) - np.linalg.norm(places[0, 2] - others, axis=1)
+    assert found.target == "ball3" and found.creeps and "creeps" in found.said("v007", "1 mm")
+    assert found.distance == pytest.approx(np.abs(change).max(), abs=3 * SIGMA)
+    (bumped,) = moved_targets(sightings(moved(2, VIEWS // 2, np.array([0.6, 0, 0.8]))))
+    assert not bumped.creeps
 
 
 def test_one_wrong_reading_is_left_to_the_search_for_outliers():
