@@ -16,13 +16,13 @@ from stitch.integrity.arm_limits import (
 )
 from stitch.integrity.deep_check import deep_check
 from stitch.integrity.doubts import doubts_of
-from stitch.integrity.moved_targets import said_of_targets
 from stitch.integrity.pairing import explain
 from stitch.integrity.problems import Problem
 from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.steps import MANY_VIEWS
+from stitch.integrity.target_faults import said_of_targets
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_names import listed

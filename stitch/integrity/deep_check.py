@@ -6,6 +6,7 @@ from dataclasses import replace
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import contradicted_by, contradicts, judged_by_size, stands_off
+from stitch.integrity.background import background
 from stitch.integrity.conventions import explained, verdict
 from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.linkage import only
@@ -16,14 +17,17 @@ from stitch.integrity.relative_scans import relative_scans
 from stitch.integrity.robot_lengths import length_problem
 from stitch.integrity.snooping import Misplaced, Snooping, snoop
 from stitch.integrity.surface_verdict import surface_verdict
+from stitch.integrity.target_faults import target_faults
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
+from stitch.measurement.sightings import sightings_of
 from stitch.measurement.thinning import thinned
 from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.targets.mislabelled import named_right
 from stitch.stages.coarse import coarse
 from stitch.stages.correct import close_in
 
@@ -40,9 +44,13 @@ def deep_check(session: Session) -> list[Problem]:
     Raises:
         NoResultError: the views do not overlap under any hand-eye, and no mistake explains it.
     """
-    if not session.has_clouds:
-        return check_targets(session)
+    found = _of_clouds(session) if session.has_clouds else check_targets(session)
+    return [*found, *target_faults(session, sightings_of(session))]
+
+
+def _of_clouds(session: Session) -> list[Problem]:
     session, capture = thinned(session, _POINTS)
+    capture = replace(capture, sightings=named_right(capture.sightings))
     found = explained(session, relative_scans(capture))
     named = verdict(found)
     if named and named[0].hypothesis.kind != "exchanged":
@@ -70,7 +78,8 @@ def _of_views(session: Session, capture: Capture, found: Sequence[Explained]) ->
     contradicted = contradicts(session, snooped) and not any(p.kind == "disconnected" for p in problems)
     if contradicted:
         problems.append(_unexplained(session, snooped))
-    return problems + [_suspected(session, m) for m in snooped.suspected], contradicted
+    problems += [_suspected(session, m) for m in snooped.suspected]
+    return problems + background(session, capture, T_mount, snooped), contradicted
 
 
 def _rivalled(found: Sequence[Explained]) -> bool:

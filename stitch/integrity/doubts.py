@@ -5,25 +5,24 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.arm_limits import contradicted_by, doubtful
+from stitch.integrity.background import background
 from stitch.integrity.snooping import Snooping
-from stitch.integrity.standing_still import standing_still
 from stitch.integrity.three_views import three_views
-from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.capture import Capture
 from stitch.measurement.session import Session
 
 _LISTED = 3
 
 
 def doubts_of(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """What stands still before the scanner, steps, and poses that contradict the scans as no arm of use does.
+    """What is no part, steps, and poses that contradict the scans as no arm of use does.
 
     Args:
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
     names = session.names
-    still = standing_still(own.scans, own.poses(T_mount), found.tolerance, part_size([own]))
-    background = () if still is None else (still.said(session.length_unit),)
-    said = (*background, *(step.said(names, session.length_unit) for step in found.steps))
+    beside = (problem.fix for problem in background(session, own, T_mount, found))
+    said = (*beside, *(step.said(names, session.length_unit) for step in found.steps))
     if not doubtful(session, found):
         few = three_views(session, found)
         return said if few is None else (few, *said)

@@ -10,13 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.frames import Array, Indices
-from stitch.measurement.session import Session
 from stitch.measurement.sightings import Sightings
 from stitch.observations.targets.distances import MANY, distance_sigma, distances, places_of
-from stitch.observations.targets.mislabelled import mislabelled
-from stitch.observations.targets.outliers import LIMIT_TARGET, outside
+from stitch.observations.targets.outliers import LIMIT_TARGET
 from stitch.statistics.robust import MAD_TO_SIGMA, median_of_known
-from stitch.units import length_text
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
 _SIDE, _TARGETS = 2, 3
@@ -48,20 +45,6 @@ class MovedTarget:
             f"{self.target} sits elsewhere among the targets from view {view} on: its distances to the others change "
             f"by up to {length}. Give it another name from there on in points.csv, or leave it out."
         )
-
-
-def said_of_targets(session: Session, sightings: Sightings | None) -> tuple[str, ...]:
-    """Which views have names mixed up and which targets moved, in words; nothing where a session has none."""
-    if sightings is None:
-        return ()
-    names, every = session.names, sightings.everything
-    mixed_up = mislabelled(every)
-    used = outside(every.used, [m.outlier for m in mixed_up], every.targets, every.target)
-    moved = moved_targets(replace(every, used=used))
-    return (
-        *(m.said(names[m.view]) for m in mixed_up),
-        *(m.said(names[m.start], length_text(m.distance, session.length_unit)) for m in moved),
-    )
 
 
 def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:

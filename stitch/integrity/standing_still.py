@@ -35,7 +35,7 @@ class StandingStill:
     """What stands still before the scanner."""
 
     share: float  # of the points of all scans
-    views: int  # scans that show it
+    views: tuple[int, ...]  # that show it
     box: Array  # (2, 3) lowest and highest corner, scanner frame
     within: Array | None  # (2, 3) corners of a box with the part and without it, where one side of a box parts them
 
@@ -48,7 +48,7 @@ class StandingStill:
             mend = f"State within = [[{low}], [{high}]] under [scanner] in session.toml"
         return (
             f"{self.share:.0%} of what the scans show stands still before the scanner whatever the arm did: a wall, a "
-            f"table or a bracket, which is in the stitched cloud at {self.views} places. {mend}, and run again."
+            f"table or a bracket, which is in the stitched cloud at {len(self.views)} places. {mend}, and run again."
         )
 
 
@@ -75,7 +75,7 @@ def standing_still(scans: Sequence[Scan], poses: Array, tolerance: float, size: 
     every = np.concatenate(points)
     return StandingStill(
         share=float(np.mean(still & ~on_part)),
-        views=sum(bool(own.any()) for own in stays),
+        views=tuple(v for v, own in enumerate(stays) if own.any()),
         box=_box(every[still & ~on_part]),
         within=_parted(every[on_part & ~still], every[still & ~on_part], _box(every), size),
     )

@@ -102,7 +102,10 @@ def _searched(model: ViewModel, first: Array | None, chance: float) -> tuple[lis
     """
     picked, significant = list[_Pick](), 0
     while model.count >= _FEWEST and len(picked) < significant + _MOST and len(_starts(picked)) < _MOST:
-        picked.append(_next(model, _beside(first, picked), _starts(picked)))
+        pick = _next(model, _beside(first, picked), _starts(picked))
+        if pick is None:
+            break
+        picked.append(pick)
         significant = len(picked) if picked[-1].p_value < chance else significant
     picked = picked[:significant]
     steps = []
@@ -124,13 +127,15 @@ def _beside(first: Array | None, picked: Sequence[_Pick]) -> Array | None:
     return first
 
 
-def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, int]]) -> _Pick:
-    """The likeliest step, or the single view that is off, beside some columns."""
+def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, int]]) -> _Pick | None:
+    """The likeliest step, or the single view that is off, beside some columns; None where these leave no view."""
     under = projector(model, model.fit(columns), columns)
     starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in [k for own in taken for k in own.values()]]
     tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in _BOTH for k in starts}
     mean = model.mixed(columns).A[0]
     alone = {v: test(under, own) for v, own in enumerate(model.views) if not _held(own, mean)}
+    if not alone:
+        return None
     view = min(alone, key=lambda v: (alone[v].p_value, -alone[v].statistic))
     likelier = min(tests, key=lambda at: (tests[at].p_value, -tests[at].statistic))
     if (alone[view].p_value, -alone[view].statistic) < (tests[likelier].p_value, -tests[likelier].statistic):

@@ -96,6 +96,11 @@ def test_half_of_the_views_let_go_explain_a_step_no_better_than_the_step():
     assert found.start == 9
 
 
+def test_where_every_view_stands_free_no_step_is_sought():
+    """Left out and let go until nothing was left to be tested: the search ended in an error."""
+    assert find_steps(direct(10), direct(10).columns(range(VIEWS - 1)), (None, 0), 0.01) == ()
+
+
 def test_what_a_view_is_off_by_beside_a_step_is_its_own():
     model = off(stepped(direct(12), 9), 4, times=50.0)
     tests = PoseTests([], [], find_blunders(replace(model, errors=None), [4], steps(model)), steps(model))

@@ -5,14 +5,14 @@ beside clouds it holds the scan in a wrong place, so that the scan is blamed.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch.frames import Array
 from stitch.measurement.sightings import Sightings
 from stitch.observations.targets.distances import MANY, distance_sigma, distances, places_of
-from stitch.observations.targets.outliers import LIMIT_TARGET, Outlier
+from stitch.observations.targets.outliers import LIMIT_TARGET, Outlier, outside
 from stitch.statistics.robust import MAD_TO_SIGMA
 
 # Targets of a view whose distances tell names apart, and views that say how far two targets lie apart.
@@ -72,6 +72,14 @@ def mislabelled(sightings: Sightings) -> tuple[Mislabelled, ...]:
             mixed = tuple((a, b) for a, b in zip(names, right, strict=True) if a != b)
             found.append(Mislabelled(v, mixed if len(fits) == 1 else (), worst, worst / scatter))
     return tuple(found)
+
+
+def named_right(sightings: Sightings | None) -> Sightings | None:
+    """The sightings without those of views whose names are mixed up."""
+    if sightings is None:
+        return None
+    mixed_up = [m.outlier for m in mislabelled(sightings)]
+    return replace(sightings, used=outside(sightings.used, mixed_up, sightings.targets, sightings.target))
 
 
 def _other_names(own: Array, usual: Array, within: float) -> Iterator[list[int]]:

@@ -1,0 +1,79 @@
+"""What one scan shows where others look through and see nothing: a cable, an arm, a box that stood there for a while.
+
+It belongs neither to the part nor to the scanner, stands elsewhere in every view, and is in the stitched cloud at every
+place where it was seen.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch import frames
+from stitch.frames import Array, Mask
+from stitch.integrity.view_names import listed
+from stitch.measurement.scan import Scan
+from stitch.observations.surfaces.match import sample
+
+# Points of a scan that are asked, and other scans, evenly over the session, that are asked for each.
+_PROBES, _ASKED = 400, 20
+# Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
+# through. Where poses err or an edge is seen aslant, scans differ by less.
+_APART = 0.03
+# Share of a scan's points that is worth a word; scans of good sessions had 0.0025 at the most.
+_WORTH = 0.01
+
+
+@dataclass(frozen=True)
+class InTheWay:
+    """What stands where others look through."""
+
+    views: tuple[int, ...]
+    share: float  # of the points of these views, at least: where no other scan looks, nobody can say
+
+    def said(self, names: Sequence[str]) -> str:
+        """In words, and what to do."""
+        where, verb = listed([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
+        return (
+            f"At least {self.share:.0%} of what {where} {verb} stands where other scans look through and see none of it: "
+            "something was in the way, a cable, an arm or a clamp, or these are stray points. It is in the stitched "
+            "cloud: cut it out of the scan, or scan again."
+        )
+
+
+def in_the_way(scans: Sequence[Scan], poses: Array, size: float, without: Collection[int] = ()) -> InTheWay | None:
+    """What single scans show where others look through, if that is worth a word.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
+        size: of the part, length_unit.
+        without: views that do not belong: neither asked nor told.
+    """
+    views = [v for v, scan in enumerate(scans) if v not in without and len(scan.points)]
+    looks = {v: KDTree(_directions(scans[v].points)) for v in views}
+    shares = {}
+    for v in views:
+        others = [w for w in views if w != v]
+        asked = [others[i] for i in np.linspace(0, len(others) - 1, min(len(others), _ASKED)).astype(int)]
+        points = scans[v].points[sample(scans[v], _PROBES)]
+        shown, through = np.zeros((2, len(points)), bool)
+        for w in asked:
+            there = np.ascontiguousarray(frames.transform(frames.inverse(poses[w]) @ poses[v], points))
+            shown |= scans[w].tree.query(there, k=1)[0] < _APART * size
+            through |= _looks_through(scans[w], looks[w], there, _APART * size)
+        shares[v] = float(np.mean(through & ~shown)) if len(points) else 0.0
+    told = tuple(v for v, share in shares.items() if share > _WORTH)
+    return InTheWay(told, float(np.mean([shares[v] for v in told]))) if told else None
+
+
+def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
+    """(n,) points in the frame of a scan in whose direction it sees something that is farther away."""
+    away = np.linalg.norm(points, axis=1)
+    beside, partner = look.query(np.ascontiguousarray(_directions(points)), k=1)
+    seen = np.linalg.norm(scan.points[partner.astype(int)], axis=1)
+    return np.asarray((beside * away < 2 * scan.spacing) & (seen > away + behind))
+
+
+def _directions(points: Array) -> Array:
+    return np.asarray(points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300))

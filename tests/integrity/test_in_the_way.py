@@ -1,0 +1,67 @@
+"""What one scan shows and others look through: squares of known place among simulated scans of a part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch import frames
+from stitch.integrity.deep_check import deep_check
+from stitch.integrity.in_the_way import in_the_way
+from stitch.measurement.capture import capture, part_size
+from stitch.measurement.cloud import Cloud
+from stitch.pipeline import run
+
+VIEWS, SIDE, COUNT = 10, 8.0, 300
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return measured_blade(21, views=VIEWS, pixels=80)
+
+
+def with_squares(measured, shown_by):
+    """Some scans with a square before the part, on the way to another scanner; in each before another one."""
+    session, T = session_of(measured), measured.T_reference_scanner
+    rng, views = np.random.default_rng(3), list(session.views)
+    for v in shown_by:
+        other = (v + VIEWS // 2) % VIEWS
+        flat = np.column_stack([rng.uniform(-SIDE / 2, SIDE / 2, (COUNT, 2)), np.zeros(COUNT)])
+        square = 0.8 * session.views[other].cloud.points.mean(axis=0) + flat
+        here = frames.transform(frames.inverse(T[v]) @ T[other], square)
+        views[v] = replace(views[v], cloud=Cloud(np.concatenate([views[v].cloud.points, here])))
+    return replace(session, views=tuple(views))
+
+
+def found_in(measured, session):
+    own = capture(session)
+    return in_the_way(own.scans, measured.T_reference_scanner, part_size([own]))
+
+
+def test_nothing_is_in_the_way_of_a_good_session(measured):
+    assert found_in(measured, session_of(measured)) is None
+
+
+@pytest.mark.parametrize("shown_by", [(4,), (1, 6), range(VIEWS)])
+def test_what_others_look_through_is_said_with_the_views_and_its_share(measured, shown_by):
+    session = with_squares(measured, shown_by)
+    found = found_in(measured, session)
+    # A square that its scan sees from the edge has no normals, and does not count.
+    assert set(found.views) <= set(shown_by) and len(found.views) >= 0.5 * len(shown_by)
+    shares = [COUNT / len(session.views[v].cloud.points) for v in shown_by]
+    # Only what has the part behind it is looked through.
+    assert 0.3 * np.mean(shares) < found.share < 1.3 * np.mean(shares)
+
+
+def test_a_view_that_does_not_belong_is_not_told(measured):
+    own = capture(with_squares(measured, (4,)))
+    assert in_the_way(own.scans, measured.T_reference_scanner, part_size([own]), without=(4,)) is None
+
+
+def test_a_run_and_a_deep_check_say_it_alike(measured):
+    session = with_squares(measured, (4,))
+    (said,) = run(session).doubts
+    assert "of what v004 shows stands where other scans look through" in said
+    assert [(p.kind, p.views) for p in deep_check(session)] == [("foreign", ("v004",))]
