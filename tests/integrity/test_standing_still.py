@@ -10,6 +10,7 @@ from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
+from stitch.integrity.deep_check import deep_check
 from stitch.integrity.standing_still import standing_still
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.cloud import Cloud
@@ -44,6 +45,13 @@ def before_wall(session, width, behind):
 def cut(session, box):
     views = [replace(view, cloud=view.cloud.within(np.array(box))) for view in session.views]
     return replace(session, views=tuple(views))
+
+
+def test_check_deep_says_of_a_wall_what_a_run_says(measured):
+    session, _ = before_wall(session_of(measured), 40.0, 25.0)
+    (found,) = deep_check(session)
+    assert found.kind == "foreign" and len(found.views) == 12
+    assert "stands still before the scanner" in found.fix and "State within = [[" in found.fix
 
 
 def test_a_wall_behind_the_part_is_said_first_with_the_box_that_leaves_it_out(measured):
