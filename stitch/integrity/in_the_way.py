@@ -37,8 +37,8 @@ class InTheWay:
         where, verb = listed([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
         return (
             f"At least {self.share:.0%} of what {where} {verb} stands where other scans look through and see none of "
-            "it: something was in the way, a cable, an arm or a clamp, or these are stray points. It is in the stitched "
-            "cloud: cut it out of the scan, or scan again."
+            "it: something was in the way, a cable, an arm or a clamp, or these are stray points. It is in the "
+            "stitched cloud: cut it out of the scan, or scan again."
         )
 
 

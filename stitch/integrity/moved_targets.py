@@ -62,13 +62,25 @@ def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
 
 def _likeliest(places: Array, sigma: float) -> list[tuple[int, int]]:
     """The targets (V, K, 3) of which means before and after some view differ most, and that view."""
+    some = np.linspace(0, places.shape[1] - 1, min(places.shape[1], MANY)).astype(int)
+    scatter = max(sigma, MAD_TO_SIGMA * float(np.median([_usual(_apart_from_median(places, k)) for k in some])))
     found = []
     for k in range(places.shape[1]):
-        own = np.linalg.norm(places[:, _partners(places, k)] - places[:, k : k + 1], axis=2)
-        times = _steps_of_means(own - median_of_known(own), sigma)
+        times = _steps_of_means(_apart_from_median(places, k) / scatter)
         if times.max(initial=0.0) > 0:
             found.append((float(times.max()), k, int(np.argmax(times))))
     return [(k, start) for _, k, start in sorted(found, reverse=True)[:_LIKELIEST]]
+
+
+def _apart_from_median(places: Array, k: int) -> Array:
+    """(V, P) distances from target k to its partners, less the median of each."""
+    own = np.linalg.norm(places[:, _partners(places, k)] - places[:, k : k + 1], axis=2)
+    return np.asarray(own - median_of_known(own))
+
+
+def _usual(off: Array) -> float:
+    seen = np.isfinite(off)
+    return float(np.median(np.abs(off[seen]))) if seen.any() else 0.0
 
 
 def _partners(places: Array, k: int) -> Indices:
@@ -80,11 +92,10 @@ def _partners(places: Array, k: int) -> Indices:
     return np.asarray(others[np.linspace(0, len(others) - 1, min(len(others), MANY - 1)).astype(int)])
 
 
-def _steps_of_means(off: Array, sigma: float) -> Array:
-    """(V,) by how many standard errors distances (V, P) step before each view, rms; 0 where too few are seen."""
+def _steps_of_means(off: Array) -> Array:
+    """(V,) standard errors by which distances (V, P), in sigmas, step before each view, rms; 0 where few are seen."""
     seen = np.isfinite(off)
-    scatter = max(sigma, MAD_TO_SIGMA * float(np.median(np.abs(off[seen])))) if seen.any() else 1.0
-    clipped = np.where(seen, np.clip(off / scatter, -_CLIPPED, _CLIPPED), 0.0)
+    clipped = np.where(seen, np.clip(off, -_CLIPPED, _CLIPPED), 0.0)
     before, sums = (np.cumsum(x, axis=0) - x for x in (seen.astype(float), clipped))
     after = seen.sum(axis=0) - before
     known = (before >= _SIDE) & (after >= _SIDE)

@@ -52,6 +52,14 @@ def test_what_grows_alike_is_no_target_that_moved():
     assert moved_targets(sightings(grown)) == ()
 
 
+@pytest.mark.parametrize("k", range(12))
+def test_among_a_dozen_a_large_move_is_told_whichever_it_is(k):
+    """What it does to its own scatter does not put it behind those whose distance to it alone changes."""
+    places = np.random.default_rng(5).uniform(-300, 300, (12, 3))
+    (found,) = moved_targets(sightings(moved(k, 7, np.array([8.0, -12.0, 10.0]), places)))
+    assert (found.target, found.start) == (f"ball{k + 1}", 7)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_one_of_hundreds_of_targets_is_told(seed):
     """Every view shows a third of them; all pairs of them would be too many to compare."""
