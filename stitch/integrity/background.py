@@ -20,9 +20,11 @@ def background(session: Session, own: Capture, T_mount: Array, found: Snooping) 
     still = standing_still(own.scans, own.poses(T_mount), found.tolerance, size)
     if still is not None:
         out.append(Problem("foreign", tuple(only(still.views, names)), still.said(session.length_unit)))
-        # What stands still before the scanner stands elsewhere on the part in every view: said once.
+    if out or found.left_out or found.steps:
+        # What stands still stands elsewhere on the part in every view, and so does the part itself where a view is off;
+        # without that view it is asked again.
         return out
-    stray = in_the_way(own.scans, found.freed.poses, size, found.left_out)
+    stray = in_the_way(own.scans, found.freed.poses, size)
     if stray is not None:
         out.append(Problem("foreign", tuple(only(stray.views, names)), stray.said(names)))
     return out

@@ -4,7 +4,7 @@ It belongs neither to the part nor to the scanner, stands elsewhere in every vie
 place where it was seen.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,15 +42,14 @@ class InTheWay:
         )
 
 
-def in_the_way(scans: Sequence[Scan], poses: Array, size: float, without: Collection[int] = ()) -> InTheWay | None:
+def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | None:
     """What single scans show where others look through, if that is worth a word.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
         size: of the part, length_unit.
-        without: views that do not belong: neither asked nor told.
     """
-    views = [v for v, scan in enumerate(scans) if v not in without and len(scan.points)]
+    views = [v for v, scan in enumerate(scans) if len(scan.points)]
     looks = {v: KDTree(_directions(scans[v].points)) for v in views}
     shares = {}
     for v in views:

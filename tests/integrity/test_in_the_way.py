@@ -55,11 +55,6 @@ def test_what_others_look_through_is_said_with_the_views_and_its_share(measured,
     assert 0.3 * np.mean(shares) < found.share < 1.3 * np.mean(shares)
 
 
-def test_a_view_that_does_not_belong_is_not_told(measured):
-    own = capture(with_squares(measured, (4,)))
-    assert in_the_way(own.scans, measured.T_reference_scanner, part_size([own]), without=(4,)) is None
-
-
 def test_a_run_and_a_deep_check_say_it_alike(measured):
     session = with_squares(measured, (4,))
     (said,) = run(session).doubts

@@ -53,11 +53,10 @@ def mislabelled(sightings: Sightings) -> tuple[Mislabelled, ...]:
     few = np.isfinite(apart).sum(axis=0) < _VIEWS
     usual = np.where(few, np.nan, np.nanmedian(np.where(few, 0.0, apart), axis=0))
     off = np.abs(apart - usual)
-    if not np.isfinite(off).any():
+    between = off[:, ~np.eye(len(usual), dtype=bool)]
+    if not np.isfinite(between).any():
         return ()
-    scatter = max(
-        distance_sigma(sightings), MAD_TO_SIGMA * float(np.nanmedian(off[:, ~np.eye(len(usual), dtype=bool)]))
-    )
+    scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * float(np.nanmedian(between)))
     found = []
     for v in range(len(apart)):
         stated = np.flatnonzero(np.isfinite(np.diagonal(apart[v])))
