@@ -19,10 +19,10 @@ from stitch.observations.surfaces.match import sample
 # Points of a scan that are asked, and other scans, evenly over the session, that are asked for each.
 _PROBES, _ASKED = 400, 20
 # Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
-# through. Where poses err or an edge is seen aslant, scans differ by less.
-_APART = 0.03
-# Share of a scan's points that is worth a word; scans of good sessions had 0.0025 at the most.
-_WORTH = 0.01
+# through. Where poses err or an edge is seen aslant, scans differ by less; so do those whose points lie as far apart.
+_APART, _SPACINGS = 0.03, 2.0
+# Share of a scan's points that is worth a word, and how many; scans of good sessions had 0.0025 at the most.
+_WORTH, _FEWEST = 0.01, 5
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,11 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
         shown, through = np.zeros((2, len(points)), bool)
         for w in asked:
             there = np.ascontiguousarray(frames.transform(frames.inverse(poses[w]) @ poses[v], points))
-            shown |= scans[w].tree.query(there, k=1)[0] < _APART * size
-            through |= _looks_through(scans[w], looks[w], there, _APART * size)
-        shares[v] = float(np.mean(through & ~shown)) if len(points) else 0.0
+            apart = max(_APART * size, _SPACINGS * scans[w].spacing)
+            shown |= scans[w].tree.query(there, k=1)[0] < apart
+            through |= _looks_through(scans[w], looks[w], there, apart)
+        found = through & ~shown
+        shares[v] = float(found.mean()) if found.sum() >= _FEWEST else 0.0
     told = tuple(v for v, share in shares.items() if share > _WORTH)
     return InTheWay(told, float(np.mean([shares[v] for v in told]))) if told else None
 
@@ -71,7 +73,7 @@ def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Ma
     away = np.linalg.norm(points, axis=1)
     beside, partner = look.query(np.ascontiguousarray(_directions(points)), k=1)
     seen = np.linalg.norm(scan.points[partner.astype(int)], axis=1)
-    return np.asarray((beside * away < 2 * scan.spacing) & (seen > away + behind))
+    return np.asarray((beside * away < _SPACINGS * scan.spacing) & (seen > away + behind))
 
 
 def _directions(points: Array) -> Array:

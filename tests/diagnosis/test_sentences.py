@@ -19,6 +19,8 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "depends_on": (),
         "implausible": False,
         "unnamed": (),
+        "within": 0.0,
+        "of_field": False,
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = sentence_of(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
