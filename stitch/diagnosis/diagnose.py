@@ -28,8 +28,12 @@ from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.state import State
 from stitch.stages.course import linearise
+from stitch.system.heap import return_large_arrays
 from stitch.system.steps import steps
 from stitch.system.threads import library_threads_off
+
+# From so many on, columns of candidates take a megabyte each.
+_MANY_POSES = 1000
 
 
 def diagnose_state(state: State) -> Diagnosis:
@@ -39,6 +43,8 @@ def diagnose_state(state: State) -> Diagnosis:
         NoResultError: no two views overlap.
     """
     unit, limit = state.session.length_unit, scatter_limit(state.session)
+    if len(state.session.views) > _MANY_POSES:
+        return_large_arrays()
     with library_threads_off():
         linear = linear_model_of(state)
         candidates, missing = candidates_of(linear)

@@ -1,0 +1,119 @@
+"""A scanner that errs by laws of no library: what is said, with clouds simulated, run and diagnosed.
+
+Usage: python bench/scanner_laws.py FILE [--seeds 9100 9102] [--parts blade,curved_drill_plate]
+
+Rows are appended to FILE (a JSON line each) as they come; what stands there already is not computed again; at the end
+the table by law. Seeds below 9100 were used while the code was written.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from integrity_cells import MOUNTS, PARTS, measured
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import Measured
+from stitch.diagnosis.diagnose import diagnose_state
+from stitch.errors import StitchError
+from stitch.pipeline import run
+from stitch.runs.state import state_of
+from stitch.system.threads import library_threads_off
+
+Law = Callable[[np.ndarray], np.ndarray]
+
+
+def along(error: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> Law:
+    """Along the ray by a function (mm) of the place in the field, −1 … 1 both ways, and of the range (mm)."""
+
+    def law(points: np.ndarray) -> np.ndarray:
+        range_mm = np.linalg.norm(points, axis=1)
+        field = points[:, :2] / points[:, 2:]
+        a, b = (field / np.quantile(np.abs(field), 0.98)).T
+        return points + points / range_mm[:, None] * error(a, b, range_mm)[:, None]
+
+    return law
+
+
+LAWS: dict[str, Law] = {
+    "nothing": lambda p: p,
+    "z longer by 0.3 %": lambda p: p * [1, 1, 1.003],
+    "x longer by 0.3 %": lambda p: p * [1.003, 1, 1],
+    "x and y askew by 3 mrad": lambda p: p + 0.003 * p[:, [1]] * [1, 0, 0],
+    "focus tilted, 80 µm": along(lambda a, b, r: 0.08 * a * b),
+    "coma, 60 µm": along(lambda a, b, r: 0.06 * a**3),
+    "seam in the field, ±60 µm": along(lambda a, b, r: 0.06 * np.sign(a)),
+    "ripple over the field, 40 µm": along(lambda a, b, r: 0.04 * np.sin(5 * np.pi * a)),
+    "ripple over the range, 40 µm": along(lambda a, b, r: 0.04 * np.sin(2 * np.pi * r / 12)),
+    "one corner off, 150 µm": along(lambda a, b, r: 0.15 * np.exp(-((a - 0.6) ** 2 + (b - 0.5) ** 2) / 0.08)),
+}
+
+
+def said(m: Measured, law: Law) -> dict[str, Any]:
+    """Verdict and names for one cell."""
+    clouds = [replace(c, points=law(c.points)) for c in m.clouds]
+    try:
+        found = diagnose_state(state_of(run(session_of(replace(m, clouds=clouds)))))
+    except StitchError as error:
+        return {"verdict": "refused", "names": [], "said": str(error)}
+    kept = {
+        "field": found.of_field,
+        "within": bool(found.within),
+        "rms": found.residual_rms,
+        "noise": found.noise_floor,
+    }
+    return {"verdict": found.verdict, "names": list(found.effects)} | kept
+
+
+def rows(parts: list[str], seeds: range, known: set[str]) -> Iterator[dict[str, Any]]:
+    """All cells in turn."""
+    for seed in seeds:
+        for part in parts:
+            for mount in MOUNTS:
+                m = None
+                for name, law in LAWS.items():
+                    if (key := f"{part} {mount} {seed} {name}") not in known:
+                        m = m or measured(part, mount, seed)
+                        yield {"key": key, "law": name} | said(m, law)
+
+
+def table(found: list[dict[str, Any]]) -> Iterator[str]:
+    """By law: what was said."""
+    by_law = defaultdict(list)
+    for row in found:
+        by_law[row["law"]].append(row)
+    yield "| the scanner errs by | cells | adequate | unknown | … the field said | one name | a group | refused |"
+    yield "|---|---:|---:|---:|---:|---:|---:|---:|"
+    for law, own in by_law.items():
+        counts = [
+            sum(r["verdict"] == "adequate" for r in own),
+            sum(r["verdict"] == "unknown_effect" for r in own),
+            sum(bool(r.get("field")) for r in own),
+            *(sum(r["verdict"] == v for r in own) for v in ("missing_effect", "cannot_tell", "refused")),
+        ]
+        yield f"| {law} | {len(own)} | " + " | ".join(map(str, counts)) + " |"
+
+
+def main() -> None:
+    """Run what is not there yet, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--seeds", type=int, nargs=2, default=(9100, 9102))
+    parser.add_argument("--parts", default=",".join(PARTS))
+    asked = parser.parse_args()
+    found = [json.loads(line) for line in asked.file.read_text().splitlines()] if asked.file.exists() else []
+    with library_threads_off(), asked.file.open("a") as out:
+        for row in rows(asked.parts.split(","), range(*asked.seeds), {row["key"] for row in found}):
+            print(row["key"], row["verdict"], *row["names"], flush=True)
+            print(json.dumps(row), file=out, flush=True)
+            found.append(row)
+    print("\n".join(table(found)))
+
+
+if __name__ == "__main__":
+    main()
