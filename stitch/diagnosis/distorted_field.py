@@ -23,4 +23,4 @@ def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[Unnamed]) -> bo
     if best is None or best.name != FIELD or best.adjusted >= ALPHA_UNKNOWN:
         return False
     others = [r.score.log_bayes_factor for r in empirical[1:2]] + [u.log_bayes_factor for u in unnamed]
-    return best.score.log_bayes_factor > max([0.0, *others]) + ODDS
+    return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)

@@ -23,4 +23,4 @@ def left_within(linear: LinearModel, stated: float | None = None) -> tuple[float
     surfaces = linear.observation
     freed, noise = surfaces.freed.overlaps, noise_floor(surfaces.capture, surfaces.freed.overlaps, stated)
     left = float(max(freed.gram.rms**2 - noise**2, 0.0) ** 0.5)
-    return left, left > noise
+    return left, bool(left > noise)
