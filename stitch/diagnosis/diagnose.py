@@ -19,7 +19,7 @@ from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, 
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
@@ -53,27 +53,23 @@ def diagnose_state(state: State) -> Diagnosis:
         examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
         left_out = {e.name: e.cross_validation for e in examined}
         selection, notes = _held(linear, selection, left_out, limit)
-        within, systematic = left_within(linear, state.session.scanner.noise)
-        if systematic and selection.verdict == "adequate":
+        within = left_within(linear, state.session.scanner.noise)
+        if within and selection.verdict == "adequate":
             selection = replace(selection, verdict="unknown_effect")
         unknown = selection.verdict == "unknown_effect"
         unnamed = unnamed_errors(linear) if unknown else ()
         of_field = unknown and follows_field(selection.empirical, unnamed)
         curves = joint_curves([law for kind in unnamed for law in kind.laws])
         beyond = implausible(linear, limit)
-        # Where it is said what repeats, scatter is the rest; else all of it.
-        rest = linear.scatter_only.null
-        if unnamed and (curves or not beyond):
-            rest = unnamed[0].rest or linear.null
-        rotation, translation = np.sqrt(rest.variances[:2])
+        rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
         found = Diagnosis(
             verdict=selection.verdict,
             effects=tuple(r.name for r in selection.named),
             sentence="",
             residual_rms=state.residual_rms,
             noise_floor=state.noise_floor,
-            rotation=float(rotation),
-            translation=float(translation),
+            rotation=rotation,
+            translation=translation,
             candidates=tuple(examined),
             matrix=matrix,
             depends_on=tuple(dependences(linear, selection.empirical)),
@@ -85,11 +81,18 @@ def diagnose_state(state: State) -> Diagnosis:
             implausible=beyond,
             unnamed=unnamed,
             curves=curves,
-            within=within if systematic else 0.0,
+            within=within,
             of_field=of_field,
             budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
         )
         return replace(found, sentence=sentence_of(found, unit, selection.second))
+
+
+def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:
+    """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
+    null = (said[0].rest or linear.null) if said else linear.scatter_only.null
+    rotation, translation = np.sqrt(null.variances[:2])
+    return float(rotation), float(translation)
 
 
 def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:

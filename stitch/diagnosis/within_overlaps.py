@@ -9,8 +9,8 @@ from stitch.observations.surfaces.noise_floor import noise_floor
 from stitch.observations.surfaces.surface_model import Surfaces
 
 
-def left_within(linear: LinearModel, stated: float | None = None) -> tuple[float, bool]:
-    """Rms (length_unit) of it beside the noise that the scans show, and whether it is more than that; nothing where no
+def left_within(linear: LinearModel, stated: float | None = None) -> float:
+    """Rms (length_unit) of it beside the noise that the scans show, where it is more than that; else 0, and where no
     overlap of surfaces was observed.
 
     The noise is the scatter about the surface within each scan (`noise_floor.py`), whatever a data sheet says.
@@ -19,8 +19,8 @@ def left_within(linear: LinearModel, stated: float | None = None) -> tuple[float
         stated: noise of the scanner, for scans too small to show their own.
     """
     if not isinstance(linear.observation, Surfaces):
-        return 0.0, False
+        return 0.0
     surfaces = linear.observation
     freed, noise = surfaces.freed.overlaps, noise_floor(surfaces.capture, surfaces.freed.overlaps, stated)
     left = float(max(freed.gram.rms**2 - noise**2, 0.0) ** 0.5)
-    return left, bool(left > noise)
+    return left if left > noise else 0.0
