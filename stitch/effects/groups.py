@@ -25,7 +25,7 @@ def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list
 
 def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
     """The smallest parts that can be true without the others."""
-    if effect.place == "links":
-        # One row of a table seldom is wrong altogether.
+    if effect.place == "links" or effect.tier == "empirical":
+        # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
         return [[i] for i in range(len(parameters))]
     return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]

@@ -25,9 +25,23 @@ def measured():
     return measured_blade(4, views=12, pixels=60)
 
 
-@pytest.mark.parametrize("axes", [np.diag([1, 1, 1.01]), np.eye(3) + 0.01 * np.eye(3, k=1)], ids=["longer", "askew"])
-def test_a_scanner_of_bad_axes_gets_no_name(measured, axes):
-    found = said_of(measured, lambda points: points @ axes.T)
+def tilted(points):
+    """A focus that is bent to two corners: 0.3 mm along the ray at them."""
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    field = points[:, :2] / points[:, 2:]
+    return points + 0.3 * np.prod(field / np.abs(field).max(axis=0), axis=1, keepdims=True) * ray
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        pytest.param(lambda points: points * [1, 1, 1.01], id="longer"),
+        pytest.param(lambda points: points + 0.01 * points[:, [1]] * [1, 0, 0], id="askew"),
+        pytest.param(tilted, id="tilted"),
+    ],
+)
+def test_a_scanner_of_bad_axes_or_focus_gets_no_name(measured, seen):
+    found = said_of(measured, seen)
     assert found.verdict == "unknown_effect" and not found.effects
     assert "the scanner errs by where in its field a point is seen" in found.sentence
     assert "pose errors dominate" not in found.sentence
