@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from stitch.effects.contract import EFFECTS, Effect, Parameter
-from stitch.effects.empirical import FIELD, empirical_effects
+from stitch.effects.empirical import empirical_effects
 from stitch.effects.groups import by_joint, one_by_one, without_offset
 from stitch.effects.in_session import lacking, parameters_in
 from stitch.frames import Array, Mask
@@ -130,8 +130,8 @@ def free_masks(term: Term) -> list[Mask]:
 
 
 def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Parameters of one joint, or all but an offset; links in single numbers too, and a field in these alone."""
-    if effect.name == FIELD:
+    """Parameters of one joint, or all but an offset; links in single numbers too, and shapes over points in these."""
+    if effect.tier == "empirical" and effect.place == "sensor":
         return one_by_one(effect, parameters)
     joints = by_joint(effect, parameters) or without_offset(effect, parameters)
     single = effect.place == "links" and len(effect.specs) > 1
