@@ -6,7 +6,8 @@ unknown is at work.
 """
 
 from collections.abc import Callable
-from itertools import product
+from itertools import combinations_with_replacement
+from math import prod
 
 import numpy as np
 
@@ -18,10 +19,10 @@ from stitch.measurement.views import ScanView, Views
 # A distortion of the scanner's field by no law.
 FIELD = "distortion_over_field"
 _HARMONICS = (1, 2, 3, 4)
-# Monomials of the place in the scanner's field, a = x/z, b = y/z and r/r₀ − 1, up to the second degree.
-_PLACES = [powers for powers in product(range(3), repeat=3) if 0 < sum(powers) <= 2]
-# Where a scanner sees, a and b reach so far, and the range r from its standoff r₀.
-_FIELD = (0.3, 0.3, 0.1)
+# Where a scanner sees, a = x/z and b = y/z reach so far, and the range r from its standoff r₀, d = r/r₀ − 1.
+_REACH = {"a": 0.3, "b": 0.3, "d": 0.1}
+# Monomials of these three, of the first and the second degree.
+_MONOMIALS = [factors for degree in (1, 2) for factors in combinations_with_replacement(_REACH, degree)]
 
 
 def empirical_effects(views: Views) -> list[Effect]:
@@ -58,19 +59,20 @@ def _harmonic(joint: int, order: int) -> Effect:
 
 def _field() -> Effect:
     """Points move in all three directions by a function of where they are seen; 0.1 mm at the edge is usual."""
-    terms = {f"c{axis}_{i}{j}{k}": (axis, (i, j, k)) for axis in range(3) for i, j, k in _PLACES}
+    terms = {f"c{axis}_{''.join(factors)}": (axis, factors) for axis in range(3) for factors in _MONOMIALS}
 
     def distort(points: Array, view: ScanView, **c: float) -> Array:
         """x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"""
-        ray = np.sqrt(np.einsum("ij,ij->i", points, points))
-        at = np.column_stack([points[:, :2] / points[:, 2:], ray / view.views.standoff - 1])
+        x, y, z = points.T
+        ray = np.sqrt(x * x + y * y + z * z)
+        at = {"a": x / z, "b": y / z, "d": ray / view.views.standoff - 1}
         moved = points.copy()
         for name in (name for name in terms if c[name]):
-            axis, powers = terms[name]
-            moved[:, axis] += c[name] * (at**powers).prod(axis=1)
+            axis, factors = terms[name]
+            moved[:, axis] += c[name] * prod(at[factor] for factor in factors)
         return moved
 
-    sizes = {name: 0.1 / float(np.prod(np.power(_FIELD, powers))) for name, (_, powers) in terms.items()}
+    sizes = {name: 0.1 / prod(_REACH[factor] for factor in factors) for name, (_, factors) in terms.items()}
     specs = {name: number("mm", size, 50 * size) for name, size in sizes.items()}
     return _effect("the scanner's field", FIELD, "sensor", distort, ("optics",), **specs)
 

@@ -70,10 +70,15 @@ def shift(measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, 
     Args:
         pose: (4, 4) T_reference_scanner of the view.
     """
+    points, view = seen_points(measurement, v, index)
+    return undone(terms, points, view, pose)
+
+
+def seen_points(measurement: Measurement, v: int, index: Indices | slice) -> tuple[Array, ScanView]:
+    """Some points (N, 3) of view v, scanner frame, and what effects may know of them."""
     view = measurement.scan_views[v]
     intensity = None if view.intensity is None else view.intensity[index]
-    view = replace(view, cosine=view.cosine[index], intensity=intensity)
-    return undone(terms, measurement.capture.scans[v].points[index], view, pose)
+    return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
 def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array) -> Array:

@@ -1,22 +1,22 @@
-"""How poses and points answer to the parameters of a term, by central differences about a model."""
+"""How poses answer to the parameters of a term, by central differences about a model."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.measurement.imperfect_arm import FlangeSlopes, Links, flange_slopes
 from stitch.measurement.measurement import Measurement
-from stitch.model.forward import ChainErrors, chain_errors, moves_arm, perturbed_frames, shift, shift_targets
+from stitch.model.forward import ChainErrors, chain_errors, moves_arm, perturbed_frames
 from stitch.model.model import Model
 from stitch.model.term import Term
 
 # Step as a share of the plausible size: errors of third order stay far below the noise. A time constant is stepped
 # less, since the effect is not linear in it.
-_STEP, _STEP_GRIDDED = 0.1, 0.005
+STEP, _STEP_GRIDDED = 0.1, 0.005
 
 
 def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
@@ -40,8 +40,8 @@ def _slope(measurement: Measurement, about: Model, term: Term, i: int, chain: "_
     parameter = term.parameters[i]
     if parameter.discrete:
         return np.zeros((measurement.views.count, 6))
-    size = (_STEP_GRIDDED if parameter.grid else _STEP) * parameter.typical
-    up, down = (chain_errors(measurement, about.with_term(t).terms) for t in _stepped(term, i, size))
+    size = (_STEP_GRIDDED if parameter.grid else STEP) * parameter.typical
+    up, down = (chain_errors(measurement, about.with_term(t).terms) for t in stepped(term, i, size))
     return chain.twists(up, down, moves_arm(term)) / (2 * size)
 
 
@@ -105,29 +105,7 @@ def _applied(matrix: Array, vectors: Array) -> Array:
     return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
-def shifts(measurement: Measurement, model: Model, term: Term, *, v: int, pose: Array, index: Indices | slice) -> Array:
-    """(P, N, 3) slopes of `shift` for each parameter of `term`, scanner frame."""
-    return _slopes(model, term, lambda terms: shift(measurement, terms, v, pose, index))
-
-
-def target_shifts(measurement: Measurement, model: Model, term: Term, poses: Array) -> Array:
-    """(P, V, S, 3) slopes of `shift_targets` for each parameter of `term`, sensor frame."""
-    return _slopes(model, term, lambda terms: shift_targets(measurement, terms, poses))
-
-
-def _slopes(model: Model, term: Term, moved: Callable[[Sequence[Term]], Array]) -> Array:
-    """Central differences of `moved` in each parameter of `term`."""
-    out = []
-    for i, parameter in enumerate(term.parameters):
-        if parameter.discrete:
-            out.append(np.zeros_like(moved(model.with_term(term).terms)))
-            continue
-        both = [moved(model.with_term(t).terms) for t in _stepped(term, i, _STEP * parameter.typical)]
-        out.append((both[0] - both[1]) / (2 * _STEP * parameter.typical))
-    return np.array(out)
-
-
-def _stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:
-    """The term with one parameter larger and smaller by a step."""
+def stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:
+    """The term with parameter i larger and smaller by a step."""
     step = size * np.eye(len(term.parameters))[i]
     return term.at(term.values + step), term.at(term.values - step)

@@ -12,8 +12,9 @@ from stitch.effects.in_session import lacking, parameters_in
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import perturbed_frames
-from stitch.model.jacobian import shifts, twists
+from stitch.model.jacobian import twists
 from stitch.model.model import Model
+from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term, term_of
 
 
@@ -64,7 +65,7 @@ def test_point_slopes_are_minus_what_nature_does(still_cells, name):
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
     zero = Term(effect, parameters_in(measurement, effect))
-    slopes = shifts(measurement, Model(np.eye(4)), zero, v=2, pose=pose, index=index)
+    slopes = PointSlopes.of(measurement, Model(np.eye(4)), [zero]).at(2, pose, index)
     view = measurement.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
     points = measurement.capture.scans[2].points[index]

@@ -12,8 +12,8 @@ from stitch.effects.in_session import lacking
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import corrected, shift_targets
-from stitch.model.jacobian import target_shifts
 from stitch.model.model import Model
+from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import term_of
 from stitch.observations.targets.closed_form import closed_form
 from stitch.observations.targets.effect_rows import effect_rows
@@ -84,4 +84,6 @@ def test_slopes_of_shifts_are_linear_in_small_steps():
     term = term_of(measurement, EFFECTS["range_scale"])
     poses = measurement.capture.poses(T_mount)
     moved = shift_targets(measurement, [term.at([1e-4])], poses)
-    np.testing.assert_allclose(moved, 1e-4 * target_shifts(measurement, Model(T_mount), term, poses)[0], rtol=1e-3)
+    np.testing.assert_allclose(
+        moved, 1e-4 * PointSlopes.of(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
+    )

@@ -11,8 +11,9 @@ import numpy as np
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import moves_points
-from stitch.model.jacobian import shifts, target_shifts, twists
+from stitch.model.jacobian import twists
 from stitch.model.model import Model
+from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term
 from stitch.observations.response import Response
 from stitch.observations.surfaces.free_poses import FreePoses
@@ -47,11 +48,12 @@ def view_columns(measurement: Measurement, model: Model, freed: FreePoses) -> Ar
 def _point_gram(measurement: Measurement, model: Model, terms: Sequence[Term], freed: FreePoses) -> PointGram:
     """Sums over the correspondences for all parameters of point effects."""
 
+    slopes = PointSlopes.of(measurement, model, terms)
+
     def of_points(v: int, index: Indices) -> Array:
-        pose = freed.poses[v]
-        return np.concatenate([shifts(measurement, model, term, v=v, pose=pose, index=index) for term in terms])
+        return slopes.at(v, freed.poses[v], index)
 
     def of_targets() -> Array:
-        return np.concatenate([target_shifts(measurement, model, term, freed.poses) for term in terms])
+        return slopes.at_targets(freed.poses)
 
     return streamed(freed, measurement.capture.noise_factor, of_points, of_targets)

@@ -8,8 +8,9 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import moves_points
-from stitch.model.jacobian import target_shifts, twists
+from stitch.model.jacobian import twists
 from stitch.model.model import Model
+from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term
 from stitch.observations.targets.rows import Rows
 
@@ -30,7 +31,7 @@ def effect_rows(rows: Rows, measurement: Measurement, model: Model, terms: Seque
 def _point_rows(rows: Rows, measurement: Measurement, model: Model, term: Term) -> Array:
     """(B, m, P) of an effect that changes the points."""
     poses = rows.capture.poses(rows.T_mount)
-    slopes = frames.rotate(poses, target_shifts(measurement, model, term, poses))  # (P, V, S, 3)
+    slopes = frames.rotate(poses, PointSlopes.of(measurement, model, [term]).at_targets(poses))  # (P, V, S, 3)
     out = np.zeros((*rows.residual.shape, len(slopes)))
     out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
     out[: len(poses)][~rows.used] = 0.0
