@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.form_trial import FormTrial, gain_at_null, residuals, try_form
+from stitch.diagnosis.form_trial import LONG, FormTrial, gain_at_null, residuals, try_form
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
@@ -29,8 +29,6 @@ _FAR = 6.0
 # With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do, and a
 # wide prior in place of that of plausible sizes moves the variances not at all.
 _REFITTED, _AMONG_MANY = 20_000, 2
-# With many components of the pose errors a fit among more numbers than this takes half a second.
-_LONG = 250
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     gained, shown = zip(*(_quick(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array(gained).T, any(shown)
     likely = quick.max(axis=1)
-    least = _HOPELESS if base.pose_errors is None else max(_HOPELESS_ANYWHERE, likely.max() - _FAR)
+    least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [
         try_form(base, form, starts[int(quick[i].argmax())].null.variances)
@@ -97,7 +95,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
 def _refitted(linear: LinearModel) -> int:
     """How many forms of a candidate are worth a fit of their own."""
     size = linear.mixed.size
-    if linear.pose_errors is not None and size > _LONG:
+    if linear.pose_errors is not None and size > LONG:
         return 1
     return _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
 

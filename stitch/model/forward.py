@@ -81,14 +81,18 @@ def seen_points(measurement: Measurement, v: int, index: Indices | slice) -> tup
     return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
-def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array) -> Array:
-    """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects."""
+def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:
+    """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects.
+
+    Args:
+        steps: of fixed point. Corrections are thousandths of the range: the first leaves thousandths of them, which is
+            enough for a slope, the second millionths.
+    """
     true = points
     for term in (t for t in terms if t.effect.place == "sensor"):
-        arguments = term.arguments
-        # Corrections are thousandths of the range: one fixed-point step leaves millionths.
-        first = true - (term.effect.function(true, view, **arguments) - true)
-        true = true - (term.effect.function(first, view, **arguments) - first)
+        arguments, reported = term.arguments, true
+        for _ in range(steps):
+            true = reported - (term.effect.function(true, view, **arguments) - true)
     for term in (t for t in terms if t.effect.place == "shape"):
         in_reference = frames.transform(pose, true)
         moved = term.effect.function(in_reference, view, **term.arguments) - in_reference

@@ -28,7 +28,7 @@ class PointSlopes:
     def at(self, v: int, pose: Array, index: Indices | slice) -> Array:
         """(P, N, 3) for some points of view v, which stands at `pose` (4, 4) T_reference_scanner."""
         points, view = seen_points(self.measurement, v, index)
-        return self._differences(lambda terms: undone(terms, points, view, pose))
+        return self._differences(lambda terms: undone(terms, points, view, pose, steps=1))
 
     def at_targets(self, poses: Array) -> Array:
         """(P, V, S, 3) for the labelled points of all views."""

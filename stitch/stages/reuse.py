@@ -17,6 +17,8 @@ from stitch.stages.correction import Correction
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
 _TIGHTENINGS = 4
+# Of all views together.
+_QUERIES = 60_000
 
 
 def reuse(captures: Sequence[Capture], model: Model) -> Correction:
@@ -51,8 +53,18 @@ def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlap
         NoResultError: no two views overlap.
     """
     samples = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses = capture.poses(T_mount)
+    return collect(capture, capture.poses(T_mount), converged_gate(capture, T_mount, gate), samples)
+
+
+def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
+    """The distance that partners may have, from one that is too large; a scale needs no more queries with more views.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    samples = [sample(scan, min(FINE_SAMPLES, _QUERIES // len(capture.scans))) for scan in capture.scans]
+    poses, overlaps = capture.poses(T_mount), None
     for _ in range(_TIGHTENINGS):
-        overlaps = collect(capture, poses, gate, samples)
+        overlaps = collect(capture, poses, gate, samples, overlaps)
         gate = float(np.minimum(gate, next_gate(overlaps, capture)))
-    return collect(capture, poses, gate, samples)
+    return gate

@@ -13,7 +13,7 @@ from stitch.model.forward import corrected
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LeftOut, ViewLinks
 from stitch.runs.state import State
-from stitch.stages.reuse import REUSE_GATE, converged_overlaps
+from stitch.stages.reuse import REUSE_GATE, converged_gate
 from stitch.stored.run_documents import read_documents
 from stitch.stored.trusted_model import trusted_model
 from stitch.system.threads import library_threads_off
@@ -44,7 +44,7 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
         model = bound(file, measurement)
         measurement = as_counted(measurement, session, document)
         own = corrected(measurement, model)
-        gate = converged_overlaps(own, model.T_mount, REUSE_GATE * part_size([own])).gate if own.scans else float("nan")
+        gate = converged_gate(own, model.T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
     return State(
         session=session,
         measurement=measurement,

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import chain
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -20,6 +21,8 @@ Result = TypeVar("Result")
 
 
 _processes = 1
+# Of a long loop: enough of them to keep all cores busy to its end.
+_PORTIONS = 100
 
 
 def share_cores(processes: int) -> None:
@@ -42,10 +45,13 @@ def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: s
     Args:
         label: what the items are, for whoever watches a long loop.
     """
-    if not label:
-        return _pool().map(function, items)
-    every = list(items)
-    return steps(label, _pool().map(function, every), len(every))
+    pool, every = _pool(), list(items)
+    if label:
+        return steps(label, pool.map(function, every), len(every))
+    # Thousands of small items would spend as long in being handed out.
+    size = max(len(every) // _PORTIONS, 1)
+    portions = (every[start : start + size] for start in range(0, len(every), size))
+    return chain.from_iterable(pool.map(lambda portion: [function(item) for item in portion], portions))
 
 
 def library_threads_off() -> Any:

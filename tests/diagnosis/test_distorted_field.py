@@ -70,7 +70,7 @@ def test_points_move_by_the_polynomial_that_is_stated(measured):
     field = next(e for e in empirical_effects(view.views) if e.name == FIELD)
     points, r0 = np.array([[30.0, -40.0, 400.0], [0.0, 0.0, 500.0]]), view.views.standoff
     zero = dict.fromkeys(field.specs, 0.0)
-    moved = field.function(points, view, **zero | {"c2_110": 2.0, "c0_002": 3.0}) - points
+    moved = field.function(points, view, **zero | {"c2_ab": 2.0, "c0_dd": 3.0}) - points
     r = np.linalg.norm(points, axis=1)
     assert moved[:, 2] == pytest.approx(2.0 * points[:, 0] * points[:, 1] / points[:, 2] ** 2)
     assert moved[:, 0] == pytest.approx(3.0 * (r / r0 - 1) ** 2)

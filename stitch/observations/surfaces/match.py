@@ -34,6 +34,10 @@ class Match:
     index_v: Indices  # (M,) point of view v
     index_w: Indices  # (M,) point of view w
 
+    def part(self, at: slice) -> "Match":
+        """Some of them."""
+        return Match(self.v, self.w, *(value[at] for value in list(vars(self).values())[2:]))
+
 
 def sample(scan: Scan, count: int) -> Indices:
     """(n,) indices of at most `count` usable points, evenly over the scan order; the same every time."""

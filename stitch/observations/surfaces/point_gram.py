@@ -1,6 +1,6 @@
 """What changes of the points themselves do to the sums over pairs, streamed: memory never grows with the points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,12 @@ from stitch.observations.surfaces.free_poses import FreePoses, answer
 from stitch.observations.surfaces.match import Match
 from stitch.observations.surfaces.target_pairs import by_pair
 from stitch.statistics.robust import tukey
-from stitch.system.threads import parallel
 
-# Correspondences whose slopes are held at a time: a few megabytes a thread, whatever the session's size.
-_BLOCK = 10_000
+# Correspondences whose slopes are held at a time: some megabytes, whatever the session's size. One block after the
+# other: threads that take turns at so many small calls need longer than one.
+_BLOCK = 20_000
+# Pairs are asked in squares of so many views by so many, so that a view of many is asked for many pairs at once.
+_SQUARE = 8
 
 
 @dataclass(frozen=True)
@@ -47,21 +49,55 @@ def streamed(
         own = frames.rotate(frames.inverse(freed.poses[v]), normal)
         return np.asarray(np.einsum("kni,ni->nk", of_points(v, index), own))
 
-    def of_pair(m: Match) -> tuple[Array, Array, Array]:
-        weight = m.weight * tukey(m.residual, g.scale)
-        parts = []
-        for start in range(0, len(m.residual), _BLOCK):
-            at = slice(start, start + _BLOCK)
-            normal = m.normal[at]
-            change = slopes(m.v, m.index_v[at], normal) - slopes(m.w, m.index_w[at], normal)
-            weighted = change * weight[at, None]
-            B = np.concatenate([np.cross(m.middle[at] - g.centre, normal), normal], axis=1)
-            parts.append((B.T @ weighted, weighted.T @ m.residual[at], weighted.T @ change))
-        vector, residual, square = (sum(p) for p in zip(*parts, strict=True))
-        return vector, residual, square
+    def of_block(block: Sequence[tuple[int, Match]]) -> list[tuple[Array, Array, Array]]:
+        out, end = [], 0
+        changes = _changes([m for _, m in block], slopes)
+        for _, m in block:
+            start, end = end, end + len(m.residual)
+            change, weight = changes[start:end], m.weight * tukey(m.residual, g.scale)
+            weighted = change * weight[:, None]
+            B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)
+            out.append((B.T @ weighted, weighted.T @ m.residual, weighted.T @ change))
+        return out
 
-    sums = [*parallel(of_pair, freed.overlaps.matches), *_of_targets(freed, noise_factor, of_targets)]
-    return PointGram(*(np.array([s[i] for s in sums]) for i in range(3)))
+    sums = dict[int, tuple[Array, ...]]()
+    for block in _blocks(freed.overlaps.matches):
+        for (pair, _), more in zip(block, of_block(block), strict=True):
+            sums[pair] = tuple(map(np.add, sums[pair], more)) if pair in sums else more
+    every = [*(sums[pair] for pair in sorted(sums)), *_of_targets(freed, noise_factor, of_targets)]
+    return PointGram(*(np.array([s[i] for s in every]) for i in range(3)))
+
+
+def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
+    """Pairs and their numbers, square by square, as many at a time as fill a block; a larger one in parts."""
+    block, rows = list[tuple[int, Match]](), 0
+    for pair, m in sorted(enumerate(matches), key=lambda item: (item[1].v // _SQUARE, item[1].w // _SQUARE, item[0])):
+        for start in range(0, len(m.residual), _BLOCK):
+            part = m.part(slice(start, start + _BLOCK))
+            if block and rows + len(part.residual) > _BLOCK:
+                yield block
+                block, rows = [], 0
+            block.append((pair, part))
+            rows += len(part.residual)
+    if block:
+        yield block
+
+
+def _changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
+    """(N, K) how the distances of all N correspondences of some pairs change; each view is asked once."""
+    ends = np.cumsum([len(m.residual) for m in matches])
+    rows = [np.arange(end - len(m.residual), end) for m, end in zip(matches, ends, strict=True)]
+    normal = np.concatenate([m.normal for m in matches])
+    sides = [(m.v, m.index_v, own, 1.0) for m, own in zip(matches, rows, strict=True)]
+    sides += [(m.w, m.index_w, own, -1.0) for m, own in zip(matches, rows, strict=True)]
+    out = np.zeros((len(normal), 0))
+    for view in sorted({side[0] for side in sides}):
+        index, at = (np.concatenate([side[i] for side in sides if side[0] == view]) for i in (1, 2))
+        sign = np.concatenate([np.full(len(side[2]), side[3]) for side in sides if side[0] == view])
+        moved = slopes(view, index, normal[at])
+        out = out if out.shape[1] else np.zeros((len(normal), moved.shape[1]))
+        out[at] += sign[:, None] * moved
+    return out
 
 
 def _of_targets(freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array]) -> list[tuple[Array, ...]]:
