@@ -50,7 +50,7 @@ def _judged(session: Session, wrong: list[int]) -> dict[str, Any]:
         return {"ended": "refused", "said": str(error), "silent": False, "seconds": time.perf_counter() - start}
     out = {item.view for item in found.left_out}
     # Of two groups that each fit, one is left out: which is right nobody can say from half of the views.
-    rest = {view.name for view in session.views} - names
+    rest = set(session.names) - names
     doubted = any(doubt.startswith("No arm scatters") for doubt in found.doubts)
     mixed = [] if rest <= out else sorted(names - out)
     return {

@@ -55,7 +55,7 @@ def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Arr
     return ModelScene(
         history=history,
         surface=surface,
-        names=tuple(view.name for view in run.session.views),
+        names=tuple(run.session.names),
         um=MICROMETRES[run.session.length_unit],
         limit=full_colour(first),
         centre=centre,

@@ -25,7 +25,7 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
         (N, 3) some points of the cell, base frame.
     """
     flange = np.array([view.T_base_flange for view in run.session.views])
-    colours, names = view_colours(len(flange)), [view.name for view in run.session.views]
+    colours, names = view_colours(len(flange)), run.session.names
     recording.log("robot", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     arm = _log_arm(recording, run, flange)
     corners = _frustum(run)

@@ -35,7 +35,7 @@ def per_view(run: Run) -> Figure:
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     um = MICROMETRES[run.session.length_unit]
-    names = [view.name for view in run.session.views]
+    names = run.session.names
     left.bar(names, np.linalg.norm(view_shifts(run), axis=1) * um, color=BLUE)
     left.set_ylabel("moved by register (µm)")
     right.bar(names, run.view_rms * um, color=GREEN)

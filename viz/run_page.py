@@ -77,7 +77,7 @@ def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
     um, steps = MICROMETRES[run.session.length_unit], history.steps
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
-    names = [view.name for view in run.session.views]
+    names = run.session.names
     data = part_data(surface, camera, history, names, run.session.length_unit)
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in steps[1:]]

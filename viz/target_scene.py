@@ -71,5 +71,5 @@ def _told(run: Run, steps: tuple[TargetStep, ...], values: list[Array], limit: f
 def _names(run: Run, marks: Marks) -> list[list[str | None]]:
     """View and target of every mark, null where it stands for all of them; both null where it counts nothing."""
     assert run.targets is not None
-    views, targets = [view.name for view in run.session.views], run.targets.rows.sightings.targets
+    views, targets = run.session.names, run.targets.rows.sightings.targets
     return [[None if v < 0 else views[v], None if k < 0 else targets[k]] for v, k in marks.counted.tolist()]

@@ -107,7 +107,7 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
         cameras[1] = cameras[0]
     extents = _extents(surfaces, cameras, both.same_data)
     data = [
-        part_data(surface, camera, own, [v.name for v in side.run.session.views], side.run.session.length_unit, extent)
+        part_data(surface, camera, own, side.run.session.names, side.run.session.length_unit, extent)
         for surface, camera, own, side, extent in zip(surfaces, cameras, histories, sides, extents, strict=True)
     ]
     limit = max(full_colour(own.models[0].field) for own in histories) * um

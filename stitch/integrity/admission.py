@@ -161,7 +161,7 @@ def _scanned(view: View) -> int:
 
 
 def _links(session: Session, found: Snooping) -> ViewLinks:
-    names = [view.name for view in session.views]
+    names = session.names
     return ViewLinks(
         components=tuple(tuple(names[v] for v in part) for part in found.linkage.components),
         weak=tuple((names[v], names[w]) for v, w in found.linkage.single),

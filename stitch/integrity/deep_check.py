@@ -135,8 +135,7 @@ def _named(session: Session, best: Hypothesis, fixes: Sequence[str]) -> Problem:
     """The problem of a hypothesis, with what is as likely."""
     fixes = list(dict.fromkeys(fixes))
     fix = fixes[0] + (f"; as likely: {'; '.join(fixes[1:3])}" if len(fixes) > 1 else "")
-    names = [view.name for view in session.views]
-    return Problem(best.kind, tuple(only(best.rows, names)), fix)
+    return Problem(best.kind, tuple(only(best.rows, session.names)), fix)
 
 
 def _suspected(session: Session, found: Misplaced) -> Problem:
@@ -150,4 +149,4 @@ def _unexplained(session: Session, found: Snooping) -> Problem:
         f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and "
         "clouds belong together and how the poses were converted"
     )
-    return Problem("displaced", tuple(view.name for view in session.views), fix)
+    return Problem("displaced", tuple(session.names), fix)

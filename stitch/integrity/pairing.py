@@ -35,7 +35,7 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
         session, capture: with the same views.
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
-    names = [view.name for view in session.views]
+    names = session.names
     poses = capture.poses(T_mount)
     out, told = [], set[int]()
     for v, w in copies(capture):
@@ -107,7 +107,7 @@ def _exchange(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence
 def _single(
     session: Session, capture: Capture, T_mount: Array, found: Snooping, m: Misplaced, same: Sequence[tuple[int, int]]
 ) -> Problem:
-    names = [view.name for view in session.views]
+    names = session.names
     own = (names[m.view],)
     fault = _fault(capture, T_mount, found, m)
     if fault is not None:

@@ -48,7 +48,7 @@ def check_targets(session: Session) -> list[Problem]:
     if stated is not None and stated.off < limit:
         return []
     fits = [fit for h in _tried(session, capture, limit) if (fit := _fit(capture, h)) is not None]
-    names = [view.name for view in session.views]
+    names = session.names
     best = min(fits, key=lambda fit: fit.off, default=None)
     before = np.inf if stated is None else stated.off
     if best is None or best.off > max(_CLEARER * before, 0.0) or best.off > limit:
