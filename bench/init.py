@@ -23,7 +23,7 @@ from stitch.intake.doctor import decide
 from stitch.intake.first_session import all_readings, capture_of, open_units
 from stitch.intake.mounting import mounting
 from stitch.intake.raw_poses import RawPoses
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedTable
 from stitch.integrity.misread_rotations import ORDERS
 from stitch.integrity.relative_scans import relative_scans
 from stitch.measurement.capture import Capture
@@ -69,9 +69,9 @@ class Cell:
         """ "right", "cannot be told" or "wrong", and what was said."""
         numbers = np.round(table_of(self.T, convention), 7)
         raw = RawPoses("table", None, numbers, ((),) * len(numbers), "")
-        found = all_readings(raw, None, Stated())
+        found = all_readings(raw, None, StatedTable())
         pairs = pairings(self.clouds, raw.labels)
-        decided = decide(self.capture, self.motions, found, pairs, open_units(found, Stated()))
+        decided = decide(self.capture, self.motions, found, pairs, open_units(found, StatedTable()))
         settled = mounting(decided, None, None, False)
         way = decided.best.way
         said = f"{way.reading.words}, {way.length_unit}, {settled.mount}{', inverted' * settled.inverted}"

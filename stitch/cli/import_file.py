@@ -58,9 +58,7 @@ def import_command(
     require_new(output)
     # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.cli.actions.imported_points import imported_points
-    from stitch.intake.stated import Stated
+    from stitch.intake.stated import StatedTable
 
-    stated = Stated(
-        None, names_in(columns), rotation, angle_unit=angles, length_unit=file_unit, inverse=inverse or None
-    )
+    stated = StatedTable(names_in(columns), rotation, angles, length_unit=file_unit, inverse=inverse or None)
     imported_points(file, output, unit, stated, frame=frame, tool=tool)

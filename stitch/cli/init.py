@@ -7,7 +7,6 @@ import typer
 
 from stitch.cli.options import names_in
 from stitch.cli.target_options import BallOption, BoardOption
-from stitch.errors import InputError
 
 _Folder = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP.")
@@ -66,25 +65,19 @@ def init(
       stitch init drive.mcap --topic /points
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.first_folder import of_bag, of_scans
+    from stitch.cli.actions.first_folder import first_folder
     from stitch.cli.actions.looked_for import looked_for
-    from stitch.intake.bag_messages import is_bag
-    from stitch.intake.stated import Stated
+    from stitch.intake.stated import StatedFolder
 
-    if is_bag(folder):
-        of_bag(folder, output, topic, frames, as_json)
-        return
-    if topic or frames:
-        raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
-    stated = Stated(
-        poses,
+    stated = StatedFolder(
         names_in(columns),
         rotation,
-        angle_unit=angles,
+        angles,
         length_unit=unit,
+        inverse=inverse,
+        poses=poses,
         cloud_unit=cloud_unit,
         mount=mount,
-        inverse=inverse,
         targets=looked_for(board, ball),
     )
-    of_scans(folder, output, stated, yes, as_json)
+    first_folder(folder, output, stated, topic=topic, frames=frames, yes=yes, as_json=as_json)

@@ -60,7 +60,7 @@ def read_names(header: Sequence[str]) -> Named:
         where.setdefault(name, i)
     joints = _joints(header)
     position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
-    rotation, convention = _rotation(where, plain, set(position) | set(joints))
+    rotation, convention = _rotation(where, set(position) | set(joints))
     matrix = _matrix(header) if not rotation else ()
     if matrix:
         rotation, position, convention = matrix, (), None
@@ -103,7 +103,7 @@ def _plain(name: str) -> tuple[str, str]:
     return (f"rot{last}" if turned else last), unit
 
 
-def _rotation(where: dict[str, int], plain: Sequence[str], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
+def _rotation(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
     for names, convention in sorted(_NAMED.items(), key=lambda item: -len(item[0])):
         index = [where.get(name, -1) for name in names]
         # Angles by place: the triple counts in the order in which its columns stand.

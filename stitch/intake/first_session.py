@@ -24,7 +24,7 @@ from stitch.intake.number_table import parse_number_table
 from stitch.intake.plausible_units import CLOUD_UNITS, cloud_units, pose_units
 from stitch.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, readings
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder, StatedTable
 from stitch.intake.target_motions import target_motions
 from stitch.intake.targets_of_folder import targets_of_folder
 from stitch.intake.ways import MM
@@ -61,7 +61,7 @@ class FirstSession:
         return self.decided.best.way.pairing
 
 
-def first_session(folder: Path, stated: Stated) -> FirstSession:
+def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     """Find, read and judge.
 
     Raises:
@@ -100,7 +100,7 @@ def _raw(found: Found) -> RawPoses:
     return read_raw_poses(found.poses)
 
 
-def all_readings(raw: RawPoses, urdf: Path | None, stated: Stated) -> list[Reading]:
+def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:
     """Every reading of a table that is not ruled out by what a person states.
 
     Args:
@@ -120,7 +120,7 @@ def all_readings(raw: RawPoses, urdf: Path | None, stated: Stated) -> list[Readi
     return out
 
 
-def open_units(found: Sequence[Reading], stated: Stated) -> list[str]:
+def open_units(found: Sequence[Reading], stated: StatedTable) -> list[str]:
     """Units that positions can have of which the file does not say it: stated, or plausible."""
     if stated.length_unit:
         return [stated.length_unit]

@@ -16,7 +16,7 @@ from stitch.intake.number_table import read_number_table
 from stitch.intake.plausible_units import POSE_UNITS, pose_units
 from stitch.intake.raw_poses import STRUCTURED, RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, angle_units, readings
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedTable
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.units import METRES
 
@@ -41,7 +41,7 @@ def is_table_of_poses(file: Path) -> bool:
     return not universal.is_recording(told) and not all(axis in names for axis in "xyz")
 
 
-def import_table(file: Path, unit: str, stated: Stated) -> Imported:
+def import_table(file: Path, unit: str, stated: StatedTable) -> Imported:
     """Read a table of poses, or of joint angles, or of both.
 
     Args:
@@ -97,7 +97,7 @@ def _clouds(raw: RawPoses) -> list[str] | None:
     return None
 
 
-def _reading(file: Path, layout: Layout, stated: Stated) -> Reading:
+def _reading(file: Path, layout: Layout, stated: StatedTable) -> Reading:
     found = readings(layout, stated.rotation, stated.angle_unit)
     if len({r.rotation for r in found}) > 1:
         usual = ", ".join(dict.fromkeys(r.rotation for r in found[:4]))
@@ -110,7 +110,7 @@ def _reading(file: Path, layout: Layout, stated: Stated) -> Reading:
     return found[0]
 
 
-def _joints(file: Path, layout: Layout, stated: Stated) -> np.ndarray:
+def _joints(file: Path, layout: Layout, stated: StatedTable) -> np.ndarray:
     assert layout.joints is not None
     units: Sequence[str] = angle_units(layout.joints, stated.angle_unit or layout.angle_unit)
     if len(units) > 1:
@@ -120,7 +120,7 @@ def _joints(file: Path, layout: Layout, stated: Stated) -> np.ndarray:
     return np.asarray(layout.joints if units[0] == "deg" else np.degrees(layout.joints))
 
 
-def _unit(file: Path, layout: Layout, stated: Stated) -> str:
+def _unit(file: Path, layout: Layout, stated: StatedTable) -> str:
     if stated.length_unit or layout.length_unit:
         return str(stated.length_unit or layout.length_unit)
     found = pose_units(layout.position)

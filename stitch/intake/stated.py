@@ -1,5 +1,6 @@
-"""What a person states about a folder, with flags; None where nothing is stated."""
+"""What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,18 +13,14 @@ _MOUNTS = ("eye_in_hand", "eye_to_hand")
 
 
 @dataclass(frozen=True)
-class Stated:
-    """Flags of `stitch init`, checked."""
+class StatedTable:
+    """How a table of poses is to be read, checked."""
 
-    poses: Path | None = None
     columns: tuple[str, ...] = ()
     rotation: str | None = None
     angle_unit: str | None = None
     length_unit: str | None = None  # of the poses
-    cloud_unit: str | None = None
-    mount: str | None = None
     inverse: bool | None = None  # the table holds T_flange_base
-    targets: LookedFor = field(default_factory=LookedFor)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
         """Refuse words that mean nothing.
@@ -31,15 +28,25 @@ class Stated:
         Raises:
             InputError: names the flag and what it knows.
         """
-        for flag, value, known in (
-            ("--rotation", self.rotation, conventions()),
-            ("--angles", self.angle_unit, ("deg", "rad")),
-            ("--unit, --file-unit", self.length_unit, tuple(POSE_UNITS)),
-            ("--cloud-unit", self.cloud_unit, tuple(CLOUD_UNITS)),
-            ("--mount", self.mount, _MOUNTS),
-        ):
-            if value is not None and value not in known:
-                raise InputError(f"{flag} {value}: use {', '.join(known)}")
+        _known("--rotation", self.rotation, conventions())
+        _known("--angles", self.angle_unit, ("deg", "rad"))
+        _known("--unit, --file-unit", self.length_unit, POSE_UNITS)
+
+
+@dataclass(frozen=True)
+class StatedFolder(StatedTable):
+    """And what its folder holds beside it, checked."""
+
+    poses: Path | None = None
+    cloud_unit: str | None = None
+    mount: str | None = None
+    targets: LookedFor = field(default_factory=LookedFor)  # boards and balls in the scans
+
+    def __post_init__(self) -> None:
+        """As of the table."""
+        super().__post_init__()
+        _known("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
+        _known("--mount", self.mount, _MOUNTS)
 
     @property
     def carries(self) -> bool | None:
@@ -47,3 +54,8 @@ class Stated:
         if self.mount is None or self.inverse is None:
             return None
         return (self.mount == "eye_in_hand") != self.inverse
+
+
+def _known(flag: str, value: str | None, known: Collection[str]) -> None:
+    if value is not None and value not in known:
+        raise InputError(f"{flag} {value}: use {', '.join(known)}")

@@ -11,7 +11,7 @@ from stitch.intake.found_files import Found
 from stitch.intake.guesses import Guess
 from stitch.intake.plausible_units import POSE_UNITS, size_words
 from stitch.intake.raw_poses import RawPoses
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder
 
 
 def guesses_of(
@@ -20,7 +20,7 @@ def guesses_of(
     decided: Decided,
     clouds: Sequence[Array],
     own_units: Sequence[str],
-    stated: Stated,
+    stated: StatedFolder,
 ) -> tuple[Guess, ...]:
     """What was found and how it is read; of the mount speaks `mounting.py`."""
     return (
@@ -56,7 +56,7 @@ def _pairing(decided: Decided) -> Guess:
     return Guess("pairing", pairing.words, reason, decided.told, "a column with the cloud's file name")
 
 
-def _columns(raw: RawPoses, decided: Decided, stated: Stated) -> Guess:
+def _columns(raw: RawPoses, decided: Decided, stated: StatedFolder) -> Guess:
     layout = decided.best.way.reading.layout
     beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
     words = f"; beside the poses {', '.join(beside)}" if beside else ""
@@ -66,7 +66,7 @@ def _columns(raw: RawPoses, decided: Decided, stated: Stated) -> Guess:
     return Guess("columns", layout.words, reason, layout.named or decided.told, "--columns")
 
 
-def _rotation(decided: Decided, stated: Stated) -> Guess:
+def _rotation(decided: Decided, stated: StatedFolder) -> Guess:
     best = decided.best.way.reading
     if stated.rotation:
         return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
@@ -85,7 +85,7 @@ def _direction(judged: Judged) -> str:
     return "poses as they are" if judged.way.carries else "poses inverted"
 
 
-def _unit(decided: Decided, stated: Stated) -> Guess:
+def _unit(decided: Decided, stated: StatedFolder) -> Guess:
     way = decided.best.way
     reach = float(np.linalg.norm(way.reading.T[:, :3, 3], axis=1).max())
     if stated.length_unit:
@@ -97,7 +97,7 @@ def _unit(decided: Decided, stated: Stated) -> Guess:
     return Guess("length_unit", way.length_unit, reason, decided.told, "--unit")
 
 
-def _cloud_unit(clouds: Sequence[Array], own_units: Sequence[str], stated: Stated) -> Guess:
+def _cloud_unit(clouds: Sequence[Array], own_units: Sequence[str], stated: StatedFolder) -> Guess:
     if stated.cloud_unit:
         return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
     other = own_units[1] if len(own_units) > 1 else None

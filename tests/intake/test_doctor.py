@@ -11,7 +11,7 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.intake.first_session import first_session
 from stitch.intake.session_draft import write_draft
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder
 from stitch.reading.session_folder import load_session
 
 OBJECTS = ("david", "cone", "sphere", "rubik", "gripperopen")
@@ -34,7 +34,7 @@ def cells(tmp_path_factory):
 
 def as_read(session, folder):
     """Poses of a session, mm, and those of the session written of its raw form."""
-    first = first_session(folder, Stated())
+    first = first_session(folder, StatedFolder())
     write_draft(folder, first)
     read = load_session(folder)
     scale = {"mm": 1.0, "m": 1000.0}[read.length_unit]
@@ -87,7 +87,7 @@ def test_what_scans_cannot_tell_is_said(still_cells, tmp_path):
     table = folder / "RobotPoses.dat"
     rng = np.random.default_rng(0)
     np.savetxt(table, np.hstack([rng.uniform(-1, 1, (4, 3)), rng.uniform(300, 600, (4, 3))]), delimiter=",")
-    first = first_session(folder, Stated())
+    first = first_session(folder, StatedFolder())
     assert not first.decided.told
     assert {g.what for g in first.guesses if not g.told} >= {"rotation", "mount"}
 

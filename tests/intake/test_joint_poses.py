@@ -10,7 +10,7 @@ from stitch.errors import InputError
 from stitch.intake.first_session import all_readings, first_session
 from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.session_draft import write_draft
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder, StatedTable
 from stitch.reading.session_folder import load_session
 from stitch.writing.urdf_file import to_urdf
 
@@ -38,15 +38,15 @@ def cell(still_cells, tmp_path_factory):
 def test_joint_angles_give_the_poses_that_the_arm_reported(cell):
     session, raw = cell
     table = read_raw_poses([raw / "joint_states.csv"])
-    (reading,) = all_readings(table, raw / "arm.urdf", Stated(angle_unit="rad"))
+    (reading,) = all_readings(table, raw / "arm.urdf", StatedTable(angle_unit="rad"))
     assert np.abs(reading.T - [v.T_base_flange for v in session.views]).max() < 1e-3
     with pytest.raises(InputError, match="URDF"):
-        all_readings(table, None, Stated())
+        all_readings(table, None, StatedTable())
 
 
 def test_the_scans_tell_the_unit_of_joint_angles_and_the_mount(cell, tmp_path):
     session, raw = cell
-    first = first_session(raw, Stated())
+    first = first_session(raw, StatedFolder())
     write_draft(tmp_path / "made", first)
     made = load_session(tmp_path / "made")
     assert made.mount == "eye_in_hand" and first.decided.told

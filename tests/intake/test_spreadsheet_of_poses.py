@@ -15,7 +15,7 @@ from stitch.intake.found_files import look_into
 from stitch.intake.layouts import layouts
 from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.session_draft import write_draft
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder
 from stitch.reading.session_folder import load_session
 
 HEADER = (
@@ -115,7 +115,7 @@ def test_inverted_poses_of_scans_named_by_no_order(still_cells, tmp_path):
     for table in folder.glob("*.dat"):
         table.unlink()
     (folder / "Posen.csv").write_bytes("\r\n".join(lines).encode("cp1252"))
-    first = first_session(folder, Stated())
+    first = first_session(folder, StatedFolder())
     write_draft(folder, first)
     read = load_session(folder)
     assert first.decided.told and [v.name[-1] for v in read.views] == list("dbca")

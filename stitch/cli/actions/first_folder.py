@@ -12,23 +12,42 @@ import typer
 from stitch.cli.options import names_in
 from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
+from stitch.intake.bag_messages import is_bag
 from stitch.intake.bag_session import write_bag_session
 from stitch.intake.first_session import FirstSession, first_session
 from stitch.intake.guesses import Guess
 from stitch.intake.session_draft import require_free, write_draft
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder
 
-# Guesses that are asked for one by one; the fields of `Stated` bear the same names.
+# Guesses that are asked for one by one; the fields of `StatedFolder` bear the same names.
 _ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
 
 
-def of_scans(folder: Path, output: Path | None, stated: Stated, yes: bool, as_json: bool) -> None:
-    """A session of scans and poses, in their folder if nowhere else; what they do not tell is asked on a terminal, or
-    guessed with `yes`.
+def first_folder(
+    folder: Path,
+    output: Path | None,
+    stated: StatedFolder,
+    *,
+    topic: str | None,
+    frames: str | None,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """A session of a bag, of which topic and frames may be stated, or of scans and poses.
 
     Raises:
         InputError, NoResultError: as `stitch init` ends.
     """
+    if is_bag(folder):
+        _of_bag(folder, output, topic, frames, as_json)
+        return
+    if topic or frames:
+        raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
+    _of_scans(folder, output, stated, yes, as_json)
+
+
+def _of_scans(folder: Path, output: Path | None, stated: StatedFolder, yes: bool, as_json: bool) -> None:
+    """In their folder if nowhere else; what they do not tell is asked on a terminal, or guessed with `yes`."""
     out = folder if output is None else output
     require_free(out, not stated.targets.nothing)
     first = first_session(folder, stated)
@@ -39,12 +58,8 @@ def of_scans(folder: Path, output: Path | None, stated: Stated, yes: bool, as_js
     _end(out, len(first.pairing.used), first.guesses, as_json)
 
 
-def of_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
-    """A session of a bag, beside it if nowhere else; what its messages do not say is not asked, flags state it.
-
-    Raises:
-        InputError, NoResultError: as `stitch init` ends.
-    """
+def _of_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
+    """Beside it if nowhere else; what its messages do not say is not asked, flags state it."""
     out = output or bag.with_name(f"{bag.stem}-session")
     frames = names_in(named)
     if named and len(frames) not in (2, 3):
@@ -66,7 +81,7 @@ def _tell(guesses: Sequence[Guess]) -> None:
         print(f"{'' if guess.told else '? '}{guess.line}", file=sys.stderr)
 
 
-def _asked(folder: Path, out: Path, first: FirstSession, stated: Stated) -> FirstSession:
+def _asked(folder: Path, out: Path, first: FirstSession, stated: StatedFolder) -> FirstSession:
     """On a terminal what cannot be told is asked, and judged anew; elsewhere it is refused.
 
     Raises:

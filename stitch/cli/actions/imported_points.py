@@ -6,19 +6,19 @@ from pathlib import Path
 from stitch.cli.terminal.streams import results
 from stitch.controllers.importer import import_file
 from stitch.intake.import_table import import_table, is_table_of_poses
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedTable
 from stitch.system.whole_file import whole
 
 
 def imported_points(
-    file: Path, output: Path | None, unit: str, stated: Stated, *, frame: str | None, tool: str | None
+    file: Path, output: Path | None, unit: str, stated: StatedTable, *, frame: str | None, tool: str | None
 ) -> None:
     """Read a file as a table of poses, where it is one or anything is stated of one, else as a controller's.
 
     Raises:
         InputError, NoResultError: as `stitch import` ends.
     """
-    if stated != Stated() or is_table_of_poses(file):
+    if stated != StatedTable() or is_table_of_poses(file):
         imported = import_table(file, unit, stated)
     else:
         imported = import_file(file, unit, frame, tool)
