@@ -42,50 +42,58 @@ def diagnose_state(state: State) -> Diagnosis:
     Raises:
         NoResultError: no two views overlap.
     """
-    unit, limit = state.session.length_unit, scatter_limit(state.session)
     if len(state.session.views) > _MANY_POSES:
         return_large_arrays()
     with library_threads_off():
-        linear = linear_model_of(state)
-        candidates, missing = candidates_of(linear)
-        selection = select(linear, candidates, limit)
-        matrix = alias_matrix(linear, [r.score for r in selection.ranked])
-        examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
-        left_out = {e.name: e.cross_validation for e in examined}
-        selection, notes = _held(linear, selection, left_out, limit)
-        within = left_within(linear, state.session.scanner.noise)
-        if within and selection.verdict == "adequate":
-            selection = replace(selection, verdict="unknown_effect")
-        unknown = selection.verdict == "unknown_effect"
-        unnamed = unnamed_errors(linear) if unknown else ()
-        of_field = unknown and follows_field(selection.empirical, unnamed)
-        curves = joint_curves([law for kind in unnamed for law in kind.laws])
-        beyond = implausible(linear, limit)
-        rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
-        found = Diagnosis(
-            verdict=selection.verdict,
-            effects=tuple(r.name for r in selection.named),
-            sentence="",
-            residual_rms=state.residual_rms,
-            noise_floor=state.noise_floor,
-            rotation=rotation,
-            translation=translation,
-            candidates=tuple(examined),
-            matrix=matrix,
-            depends_on=tuple(dependences(linear, selection.empirical)),
-            next=tuple(propose(linear, selection)),
-            missing=missing,
-            linear=linear,
-            notes=notes,
-            scatter_limit=limit,
-            implausible=beyond,
-            unnamed=unnamed,
-            curves=curves,
-            within=within,
-            of_field=of_field,
-            budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
-        )
-        return replace(found, sentence=sentence_of(found, unit, selection.second))
+        return _diagnosed(state)
+
+
+def _diagnosed(state: State) -> Diagnosis:
+    linear, limit = linear_model_of(state), scatter_limit(state.session)
+    candidates, missing = candidates_of(linear)
+    selection = select(linear, candidates, limit)
+    matrix = alias_matrix(linear, [r.score for r in selection.ranked])
+    examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
+    left_out = {e.name: e.cross_validation for e in examined}
+    selection, notes = _held(linear, selection, left_out, limit)
+    within = left_within(linear, state.session.scanner.noise)
+    if within and selection.verdict == "adequate":
+        selection = replace(selection, verdict="unknown_effect")
+    unknown = selection.verdict == "unknown_effect"
+    unnamed = _unnamed(linear, selection) if unknown else ()
+    of_field = unknown and follows_field(selection.empirical, unnamed)
+    curves = joint_curves([law for kind in unnamed for law in kind.laws])
+    beyond = implausible(linear, limit)
+    rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
+    found = Diagnosis(
+        verdict=selection.verdict,
+        effects=tuple(r.name for r in selection.named),
+        sentence="",
+        residual_rms=state.residual_rms,
+        noise_floor=state.noise_floor,
+        rotation=rotation,
+        translation=translation,
+        candidates=tuple(examined),
+        matrix=matrix,
+        depends_on=tuple(dependences(linear, selection.empirical)),
+        next=tuple(propose(linear, selection)),
+        missing=missing,
+        linear=linear,
+        notes=notes,
+        scatter_limit=limit,
+        implausible=beyond,
+        unnamed=unnamed,
+        curves=curves,
+        within=within,
+        of_field=of_field,
+        budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
+    )
+    return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
+
+
+def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:
+    """What repeats without a name, asked only where the verdict did not rest on it."""
+    return unnamed_errors(linear) if selection.unnamed is None else selection.unnamed
 
 
 def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:

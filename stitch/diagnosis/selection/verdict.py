@@ -18,7 +18,7 @@ from stitch.diagnosis.thresholds import (
     PRIOR_PHYSICAL,
 )
 from stitch.diagnosis.unknown import joint_laws, unnamed_courses
-from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.observations.linear_model import LinearModel
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
@@ -36,6 +36,7 @@ class Selection:
     empirical: tuple[Ranked, ...]  # best first
     second: Ranked | None = None  # a further effect that the views show beside the first
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
+    unnamed: tuple[Unnamed, ...] | None = None  # what repeats without a name; None where the verdict asked for none
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
@@ -45,10 +46,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     adequate = Selection("adequate", (), ranked, empirical)
     unknown = replace(adequate, verdict="unknown_effect")
     if stray is None and not any(certain(r) for r in ranked):
-        group = wanted_group(linear, candidates, len(ranked))
-        if group:
-            return replace(adequate, verdict="cannot_tell", named=group)
-        return unknown if implausible(linear, limit) or unnamed_errors(linear) else adequate
+        return _none_alone(linear, candidates, limit, adequate)
     contenders, base = contest(linear, [r for r in ranked if contends(r)])
     if not contenders:
         return unknown
@@ -84,6 +82,18 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
     verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
     return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
+
+
+def _none_alone(
+    linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit, adequate: Selection
+) -> Selection:
+    """Where no effect is certain by itself: several of which some are wanted, errors without a name, or nothing."""
+    group = wanted_group(linear, candidates, len(adequate.ranked))
+    if group:
+        return replace(adequate, verdict="cannot_tell", named=group)
+    unnamed = unnamed_errors(linear)
+    verdict = "unknown_effect" if unnamed or implausible(linear, limit) else "adequate"
+    return replace(adequate, verdict=verdict, unnamed=unnamed)
 
 
 def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
