@@ -30,7 +30,9 @@ import stitch
 from stitch import frames
 from stitch.diagnosis import candidates
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.selection.ranking import ranked_all
+from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.selection.verdict import select
+from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
@@ -59,7 +61,9 @@ assert np.isfinite(off).all() and np.abs(off).max() < 4, off
 plate = np.array([[60., 10, 30], [-40, 55, 30], [-20, -60, 30], [10, 5, 30], [-70, -10, 30], [50, -50, 30]])
 cell, T_mount, _ = labelled_cell(1, views=30, offset=np.array([0, 0, 1.5e-3, 0, 0, 0]), targets=plate)
 linear = plate_model(measurement_of(cell, capture(cell)), Model(T_mount))
-best = ranked_all(linear, candidates_of(linear)[0])[0][0]
+selection = select(linear, candidates_of(linear)[0], ScatterLimit(*IMPLAUSIBLE))
+assert selection.verdict == "missing_effect", selection.verdict
+(best,) = selection.named
 found = {p.name: (v, s) for p, v, s in zip(best.score.form.free, best.score.values, best.score.sigmas)}
 assert best.name == "joint_offset" and list(found) == ["d3"], found
 assert abs(found["d3"][0] - 1.5e-3) < 3 * found["d3"][1] < 3e-4, found
