@@ -1,6 +1,6 @@
-"""Nonlinear least squares for A·X = Z·B and A·X = X·B, with covariance in views.
+"""Nonlinear least squares for A·X = Z·B, with covariance in views.
 
-Residual of a view: the twist log((A X)⁻¹ Z B), of a motion: the same with Z = X, in the probe's frame.
+Residual of a view: the twist log((A X)⁻¹ Z B) in the probe's frame.
 Rotations and translations scatter by σ_r and σ_t, both found from the residuals unless given.
 """
 
@@ -10,9 +10,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.calibrate.view_jackknife import jackknife
-from stitch.closed_form.axxb import park_martin
 from stitch.closed_form.axzb import require_poses, shah
-from stitch.closed_form.relative_motions import require_motion, roots
+from stitch.closed_form.relative_motions import roots
 from stitch.frames import Array
 from stitch.statistics.robust import mad_sigma
 
@@ -21,14 +20,16 @@ _STEPS = 30
 _SMALL = 1e-6
 # Beyond this many sigmas a robust fit counts a residual by its size, not its square (Huber).
 _HUBER = 2.0
+# Numbers of X and Z.
+_UNKNOWNS = 12
 
 
 @dataclass(frozen=True)
 class Refined:
-    """One or two transforms; the covariance is of their right perturbations T·exp(ξ), rotation first."""
+    """Both transforms; the covariance is of their right perturbations T·exp(ξ), rotation first."""
 
-    transforms: tuple[Array, ...]  # X, or X and Z, (4, 4) each
-    covariance: Array  # (6, 6) or (12, 12): X, then Z
+    transforms: tuple[Array, Array]  # X and Z, (4, 4) each
+    covariance: Array  # (12, 12): X, then Z
     inflation: float  # what leaving views out put on the covariance, ≥ 1
     residual: Array  # (V, 6) twists
     heldout: Array  # (V, 6) the same, each view predicted without itself
@@ -43,7 +44,7 @@ def refine_axzb(
     robust: bool = False,
     groups: Array | None = None,
 ) -> Refined:
-    """X, Z of A·X = Z·B from Shah's start.
+    """X, Z of A·X = Z·B by Gauss–Newton from Shah's start; every step whitens by the scatter that it starts from.
 
     Args:
         A, B: (V, 4, 4) poses.
@@ -56,66 +57,39 @@ def refine_axzb(
         NoResultError: poses that cannot show both; names the axis they share.
     """
     require_poses(A)
-    return _refine(A, B, shah(A, B, weights), sigma=sigma, weights=weights, robust=robust, groups=groups)
-
-
-def refine_axxb(
-    A: Array, B: Array, sigma: tuple[float, float] | None = None, weights: Array | None = None, robust: bool = False
-) -> Refined:
-    """X of A·X = X·B from Park and Martin's start; arguments as in `refine_axzb`, motions for poses.
-
-    The covariance takes the motions as independent. Motions between all pairs of views are not: where the
-    views' own poses are known, `refine_axzb` uses each of them once.
-
-    Raises:
-        NoResultError: motions that cannot show X; names the axis they share.
-    """
-    require_motion(A)
-    return _refine(A, B, (park_martin(A, B, weights),), sigma=sigma, weights=weights, robust=robust)
-
-
-def _refine(
-    A: Array,
-    B: Array,
-    at: tuple[Array, ...],
-    *,
-    sigma: tuple[float, float] | None,
-    weights: Array | None,
-    robust: bool,
-    groups: Array | None = None,
-) -> Refined:
-    """Gauss–Newton; every step whitens by the scatter of the residuals it starts from."""
-    n, root = 6 * len(at), roots(A, weights)[:, None]
+    X, Z = shah(A, B, weights)
+    root = roots(A, weights)[:, None]
     for step in range(_STEPS + 1):
-        e, jacobian = _linearise(A, B, at)
-        scatter = np.array(sigma or _scatter(e * root, n, robust))
+        e, jacobian = _linearise(A, B, X, Z)
+        scatter = np.array(sigma or _scatter(e * root, robust))
         white = root / np.repeat(scatter, 3)
         information, gradient = _normal_equations(jacobian * white[..., None], e * white, robust)
         total = information.sum(axis=0)
         xi = -np.linalg.solve(total, gradient.sum(axis=0))
         if step == _STEPS or np.sqrt(xi @ total @ xi) < _SMALL:
             break
-        at = tuple(T @ frames.exp(x) for T, x in zip(at, xi.reshape(-1, 6), strict=True))
-    model = np.linalg.inv(total) * (_student(e.size - n) if sigma is None else 1.0)
+        X, Z = X @ frames.exp(xi[:6]), Z @ frames.exp(xi[6:])
+    model = np.linalg.inv(total) * (_student(e.size - _UNKNOWNS) if sigma is None else 1.0)
     statistics = jackknife(information, gradient, model)
     heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(statistics.steps)])
     if groups is not None:
         member = groups == np.unique(groups)[:, None]
         statistics = jackknife(np.tensordot(member, information, 1), member @ gradient, model)
-    return Refined(at, statistics.covariance, statistics.inflation, e, heldout, (float(scatter[0]), float(scatter[1])))
+    spread = float(scatter[0]), float(scatter[1])
+    return Refined((X, Z), statistics.covariance, statistics.inflation, e, heldout, spread)
 
 
-def _linearise(A: Array, B: Array, at: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Residual twists (V, 6) and their Jacobian (V, 6, 6 or 12) at X, or at X and Z.
+def _linearise(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+    """Residual twists (V, 6) and their Jacobian (V, 6, 12) at X and Z.
 
     With the left and right inverse Jacobians of SE(3) at small twists, to first order (Barfoot 7.84).
     """
-    e = frames.log(frames.inverse(A @ at[0]) @ at[-1] @ B)
+    e = frames.log(frames.inverse(A @ X) @ Z @ B)
     half = np.zeros((len(e), 6, 6))
     half[:, :3, :3] = half[:, 3:, 3:] = 0.5 * frames.skew(e[:, :3])
     half[:, 3:, :3] = 0.5 * frames.skew(e[:, 3:])
     by_x, by_z = half - np.eye(6), (np.eye(6) + half) @ frames.adjoint(frames.inverse(B))
-    return e, by_x + by_z if len(at) == 1 else np.concatenate([by_x, by_z], axis=2)
+    return e, np.concatenate([by_x, by_z], axis=2)
 
 
 def _student(free: int) -> float:
@@ -131,9 +105,9 @@ def _normal_equations(jacobian: Array, e: Array, robust: bool) -> tuple[Array, A
     return np.asarray(information), np.einsum("vij,vi->vj", weighted, e)
 
 
-def _scatter(e: Array, n: int, robust: bool) -> tuple[float, float]:
-    """σ of rotations and of translations; each half of the residuals pays for half of the n unknowns."""
-    free = max(1 - n / e.size, 1 / e.size)
+def _scatter(e: Array, robust: bool) -> tuple[float, float]:
+    """σ of rotations and of translations; each half of the residuals pays for half of the unknowns."""
+    free = max(1 - _UNKNOWNS / e.size, 1 / e.size)
     rotation, translation = (mad_sigma(half) if robust else _rms(half) for half in (e[:, :3], e[:, 3:]))
     # Exact data have no scatter; what rounding leaves of lengths keeps the weights finite.
     return max(rotation / np.sqrt(free), 1e-12), max(translation / np.sqrt(free), 1e-9)
