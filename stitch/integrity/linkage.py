@@ -44,7 +44,6 @@ class Linkage:
     views: int
     links: tuple[Link, ...]
     components: tuple[tuple[int, ...], ...]
-    cut_views: tuple[int, ...]  # without one of these the others fall apart
     single: tuple[tuple[int, int], ...]  # (view, partner): held by this one pair alone
 
     @property
@@ -65,7 +64,7 @@ class Linkage:
 
 
 def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
-    """Components, cut views and views held by a single pair, from the correspondences at the poses of `overlaps`.
+    """Components, and views held by a single pair, from the correspondences at the poses of `overlaps`.
 
     Args:
         holding_nothing: views whose scans hold no pose, however well they lie on the others.
@@ -90,9 +89,8 @@ def of_links(views: int, links: Sequence[Link]) -> Linkage:
     near = np.zeros((views, views), bool)
     for link in links:
         near[link.v, link.w] = near[link.w, link.v] = link.holds
-    parts = _parts(near)
     single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
-    return Linkage(views, tuple(links), parts, tuple(v for v in range(views) if _cuts(near, v)), tuple(single))
+    return Linkage(views, tuple(links), _parts(near), tuple(single))
 
 
 def _parts(near: Mask) -> tuple[tuple[int, ...], ...]:
@@ -100,14 +98,6 @@ def _parts(near: Mask) -> tuple[tuple[int, ...], ...]:
     count, label = connected_components(coo_array(near), directed=False)
     parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]
     return tuple(sorted(parts, key=lambda part: (-len(part), part)))
-
-
-def _cuts(near: Mask, view: int) -> bool:
-    """True if the neighbours of a view fall apart without it."""
-    rest = np.delete(np.delete(near, view, axis=0), view, axis=1)
-    neighbours = np.flatnonzero(np.delete(near[view], view))
-    _, label = connected_components(coo_array(rest), directed=False)
-    return len(set(label[neighbours])) > 1
 
 
 def only(indices: Indices | Sequence[int], names: Sequence[str]) -> list[str]:

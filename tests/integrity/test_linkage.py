@@ -7,16 +7,15 @@ def links(*pairs, share=1.0, count=100):
     return [Link(v, w, count, share) for v, w in pairs]
 
 
-def test_a_chain_is_one_component_and_every_inner_view_cuts_it():
+def test_a_chain_is_one_component_and_its_ends_hang_by_one_pair():
     found = of_links(5, links((0, 1), (1, 2), (2, 3), (3, 4)))
     assert found.components == ((0, 1, 2, 3, 4),)
-    assert found.cut_views == (1, 2, 3)
     assert found.single == ((0, 1), (4, 3))
 
 
-def test_a_ring_has_no_cut_view_and_nothing_hangs_by_one_pair():
+def test_in_a_ring_nothing_hangs_by_one_pair():
     found = of_links(6, links(*((v, (v + 1) % 6) for v in range(6))))
-    assert (found.cut_views, found.single, found.unlinked) == ((), (), ())
+    assert (found.single, found.unlinked) == ((), ())
 
 
 def test_two_rings_are_two_groups():
