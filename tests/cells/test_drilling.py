@@ -20,7 +20,7 @@ from stitch.cells.drilling.drill_job import read_job
 from stitch.cells.drilling.drill_procedure import calibrate, run_group
 from stitch.cells.drilling.drill_solution import solve_job
 from stitch.cells.drilling.hole_frame import drive_pose, euler_zyx, hole_rotation
-from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_image, to_plane
+from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
 from stitch.cells.drilling.rangers import Rangers, fit_ranger, surface
 from stitch.cells.drilling.servo import Seeing, place, upright
 from stitch.cli.main import main
@@ -107,6 +107,11 @@ def test_surface_of_a_tilted_plane():
     seen = surface(Rangers(origins, directions), d)
     assert seen.height == pytest.approx(186, abs=1e-9)
     assert seen.tilt == pytest.approx(np.arccos(np.cos(0.03) * np.cos(0.05)), abs=1e-9)
+
+
+def to_image(H, xy):
+    seen = np.column_stack([xy, np.ones(len(xy))]) @ H.T
+    return seen[:, :2] / seen[:, 2:]
 
 
 def test_homography_is_exact_and_agrees_with_opencv():

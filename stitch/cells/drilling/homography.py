@@ -40,11 +40,6 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     return np.asarray(H / H[2, 2])
 
 
-def to_image(H: Array, xy: Array) -> Array:
-    """Image points (..., N, 2) in pixels of work-plane points (..., N, 2)."""
-    return _apply(H, np.asarray(xy, float))
-
-
 def to_plane(H: Array, uv: Array) -> Array:
     """Work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
     return _apply(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
