@@ -17,7 +17,10 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
 
     In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
     scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
-    no prediction. In the order of the matches to which the views were freed. None without clouds.
+    no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
+    independently than beside all that an arm may do, and that one `add` reaches.
+
+    In the order of the matches to which the views were freed. None without clouds.
     """
     surfaces = linear.observation
     if not isinstance(surfaces, Surfaces):
