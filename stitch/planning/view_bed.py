@@ -13,7 +13,7 @@ from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.model.term import sizes_of, term_of
 from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.capture_evidence import jacobian
+from stitch.observations.surfaces.pose_channel import jacobian
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.view_responses import view_columns, view_responses
 from stitch.planning.expected_model import Cell, Seen, seen

@@ -15,13 +15,12 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.model.model import Model
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import assemble
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
-from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.surfaces.pose_channel import Repeatability, jacobian
 from stitch.runs.recorder import Recorder, Silent
 from stitch.stages.correction import Correction
 from stitch.statistics.least_squares import least_squares
@@ -35,7 +34,7 @@ _CONVERGED = 2e-3
 
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
     """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
-    D, b, moved = np.zeros((6, 6)), np.zeros(6), []
+    D, b = np.zeros((6, 6)), np.zeros(6)
     jacobians = [jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
     for J, o in zip(jacobians, overlaps, strict=True):
         # Sessions of different noise count by their own variance.
@@ -122,10 +121,7 @@ def correct(
     first = fit_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [weighing(c, scatter) for c, scatter in zip(captures, first.repeatability, strict=True)]
-    freed = tuple(
-        f.seen_from(c.poses(first.T_mount)) if c.sightings is None else free_poses(c, c.poses(first.T_mount), o.gate)
-        for c, f, o in zip(captures, freed, overlaps, strict=True)
-    )
+    freed = _freed_again(captures, freed, overlaps, first.T_mount)
     common = None if repeating is None else repeating(freed)
     errors = None if erring is None else erring(freed, first.T_mount)
     hand_eye = fit_hand_eye(captures, freed, first.T_mount, repeating=common, errors=errors)
@@ -140,6 +136,16 @@ def correct(
         freed=freed,
         history=(*history, *fine, pooled_rms(final)),
         captures=tuple(captures),
+    )
+
+
+def _freed_again(
+    captures: Sequence[Capture], freed: Sequence[FreePoses], overlaps: Sequence[Overlaps], T_mount: Array
+) -> tuple[FreePoses, ...]:
+    """The freed views against another hand-eye; where clouds now weigh otherwise beside labelled points, freed anew."""
+    return tuple(
+        f.seen_from(c.poses(T_mount)) if c.sightings is None else free_poses(c, c.poses(T_mount), o.gate)
+        for c, f, o in zip(captures, freed, overlaps, strict=True)
     )
 
 

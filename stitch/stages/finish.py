@@ -71,17 +71,16 @@ def finish_surfaces(
         InputError: a scan changed on disk since it was read.
     """
     clock = Clock()
-    own, overlaps = correction.captures[index], correction.overlaps[index]
+    model, own, overlaps = correction.model, correction.captures[index], correction.overlaps[index]
     scatter = correction.hand_eye.repeatability[index]
-    poses_model = own.poses(correction.model.T_mount)
-    g, note = overlaps.gram, correct_note(before.rms, overlaps.gram.rms)
-    corrected = StageResult("correct", g.rms, int(g.count.sum()), len(correction.history), seconds, note)
+    poses_model = own.poses(model.T_mount)
+    note = correct_note(before.rms, overlaps.gram.rms)
+    corrected = _of_overlaps("correct", overlaps, len(correction.history), seconds, note)
     show(recorder, corrected, own, poses_model)
     clock.lap()
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index].poses)
-    final, iterations = registration.overlaps.gram, len(registration.history)
-    registered = StageResult("register", final.rms, int(final.count.sum()), iterations, clock.lap())
-    fused = fuse_every_point(Registered(session, measurement, correction.model, own, registration.poses))
+    registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap())
+    fused = fuse_every_point(Registered(session, measurement, model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
     show(recorder, registered, own, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
@@ -91,16 +90,20 @@ def finish_surfaces(
         poses_model=poses_model,
         poses=registration.poses,
         view_rms=per_view_rms(registration.overlaps, len(own.scans)),
-        residual_rms=g.rms,
-        heldout_rms=g.rms * correction.hand_eye.heldout_ratio,
+        residual_rms=corrected.rms,
+        heldout_rms=corrected.rms * correction.hand_eye.heldout_ratio,
         noise_floor=floor,
         fused=fused,
         repeatability=scatter,
-        verdict=surface_sentence(g.rms, final.rms, floor, scatter, session.length_unit, correction.model.effects),
+        verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
         overlaps=overlaps,
         registered=registration.overlaps,
     )
+
+
+def _of_overlaps(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str = "") -> StageResult:
+    return StageResult(name, overlaps.gram.rms, int(overlaps.gram.count.sum()), iterations, seconds, note)
 
 
 def finish_targets(

@@ -8,12 +8,12 @@ from scipy.spatial import cKDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.gram import assemble, gram, pair_squares
 from stitch.observations.surfaces.hand_eye import scatter_of
 from stitch.observations.surfaces.match import match, overlapping_pairs, sample
 from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.pose_channel import jacobian
 
 
 @pytest.fixture(scope="module")

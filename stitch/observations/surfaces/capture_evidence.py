@@ -6,17 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, pair_squares
-from stitch.observations.surfaces.pose_channel import PoseChannel, pose_channel
+from stitch.observations.surfaces.pose_channel import PoseChannel, jacobian, pose_channel
 from stitch.statistics.folds import grouped_folds
-
-
-def jacobian(hand_eye_frames: Array, centre: Array) -> Array:
-    """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
-    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
 
 
 @dataclass(frozen=True)

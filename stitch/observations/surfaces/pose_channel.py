@@ -46,6 +46,11 @@ class Repeatability:
     noise_factor: float
 
 
+def jacobian(hand_eye_frames: Array, centre: Array) -> Array:
+    """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
+    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
+
+
 def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> PoseChannel:
     """Reduce per-view twists to the directions that the overlaps see.
 
@@ -59,7 +64,7 @@ def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
     values, vectors, scale = visible_directions(g)
     left = vectors.T / scale[None, :]
     to_centre = frames.make(np.eye(3), -g.centre)
-    response = left @ np.concatenate(list(frames.adjoint(to_centre @ hand_eye_frames)))
+    response = left @ jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ T_reference_flange)
     rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
     return PoseChannel(left, left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))

@@ -14,9 +14,8 @@ from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import pose_errors
 from stitch.observations.response import PointSums, Prior, Response
-from stitch.observations.surfaces.capture_evidence import jacobian
 from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.pose_channel import PoseChannel, mixed_model, pose_channel
+from stitch.observations.surfaces.pose_channel import PoseChannel, jacobian, mixed_model, pose_channel
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.surface_trial import SurfaceTrial
 from stitch.observations.surfaces.view_responses import view_columns, view_responses
