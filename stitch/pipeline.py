@@ -60,7 +60,7 @@ def run_rig(
     require_same_rig(sessions, model)
     recorders = recorders or [Silent() for _ in sessions]
     with library_threads_off():
-        clock, kind = Clock(), course_of(sessions[0])
+        clock, course = Clock(), course_of(sessions[0])
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
         measurements = [measurement_of(session, capture(session)) for session in sessions]
@@ -68,19 +68,19 @@ def run_rig(
         model = in_unit(model, sessions[0].length_unit) if model else None
         arm = in_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
-        begun = kind.start(sessions, measurements, model)
+        begun = course.start(sessions, measurements, model)
         measurements = [about_part(m, begun.T_mount) for m in measurements]
         seconds = clock.lap()
         before = []
         for session, measurement, recorder in zip(sessions, measurements, recorders, strict=True):
             with mistakes_named(session):
-                before.append(kind.begin(measurement, begun, seconds, recorder))
+                before.append(course.begin(measurement, begun, seconds, recorder))
         clock.lap()
         if model:
-            fit = partial(kind.apply, file=model)
+            fit = partial(course.apply, file=model)
         else:
             begin_at = partial(_with_effects, sessions[0], effects, arm) if effects or arm else None
-            fit = partial(kind.fit, begun=begun, begin_at=begin_at, recorder=recorders[0])
+            fit = partial(course.fit, begun=begun, begin_at=begin_at, recorder=recorders[0])
         found = admitted_fit(sessions, measurements, fit, keep)
         end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
         runs = []
@@ -128,7 +128,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
     """
     recorder = recorder or Silent()
     with library_threads_off():
-        clock, kind = Clock(), course_of(state.session)
+        clock, course = Clock(), course_of(state.session)
         session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
         recorder.start(session)
         require_effects([measurement], effects)
@@ -137,9 +137,9 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         model = model.with_terms([term for term in model.terms if term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
         begun = Coarse(state.T_mount_coarse, gate, "of the first run", ())
-        before = kind.begin(measurement, begun, clock.lap(), recorder)
+        before = course.begin(measurement, begun, clock.lap(), recorder)
         clock.lap()
-        fitted = kind.refit([session], [measurement], model, [state.gate], recorder)
+        fitted = course.refit([session], [measurement], model, [state.gate], recorder)
         own = fitted.sessions[0].measurement
         end = End(
             begun=begun,

@@ -34,10 +34,9 @@ _SEARCH_POINTS = 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
 _UNTIL_THEY_MEET, _AFTERWARDS = 4, 3
 # First gate of the search and truncation of the score, as shares of the part's size.
-COARSE_GATE = 0.35
+COARSE_GATE, SCORE_SHARE = 0.35, 0.05
 # Where a hand-eye came from that was not searched.
 STATED, REUSED = "given in session.toml", "of another run, used as it is"
-SCORE_SHARE = 0.05
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
 

@@ -53,20 +53,15 @@ def fit_surfaces(
     def watch(index: int, step: Step) -> None:
         if recorder is not None:
             poses = step.linearised.captures[0].poses(step.model.T_mount)
-            recorder.iteration("fit", index, poses, step.rms, step.freed[0].overlaps.gate)
+            recorder.iteration("fit", index, poses, step.rms, step.linearised.freed[0].overlaps.gate)
 
     last, history = iterate(_Surfaces(measurements, gates), model, watch)
     last = last.linearised.with_errors(last.choice)
-    sigmas = known_sigmas(last.model.terms, last.fitted, np.sqrt(np.diag(last.hand_eye.values_covariance)))
-    values = values_of(last.model.terms)
-    covariance = covariance_of_fit(
-        last.model.terms,
-        last.fitted,
-        last.hand_eye.values_covariance,
-        kept_root(last.model.terms, model.effects_covariance),
-    )
-    model = replace(last.model, terms=split(last.model.terms, values, sigmas), effects_covariance=covariance)
-    captures, freed = _free(measurements, model, [f.overlaps.gate for f in last.freed])
+    terms, fitted, found = last.model.terms, last.choice.fitted, last.hand_eye.values_covariance
+    sigmas = known_sigmas(terms, fitted, np.sqrt(np.diag(found)))
+    covariance = covariance_of_fit(terms, fitted, found, kept_root(terms, model.effects_covariance))
+    model = replace(last.model, terms=split(terms, values_of(terms), sigmas), effects_covariance=covariance)
+    captures, freed = _free(measurements, model, [f.overlaps.gate for f in last.linearised.freed])
     overlaps = [_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True)]
     return Correction(
         model=model,

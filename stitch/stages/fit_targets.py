@@ -62,7 +62,7 @@ def fit_targets(
     moved = last.blocks.moved_by(last.linearised.columns @ kept)
     covariance = covariance + moved @ moved.T
     sigmas = known_sigmas(terms, last.fitted, np.sqrt(np.diag(covariance)[a:]))
-    values = values_of(last.model.terms)
+    values = values_of(terms)
     model = Model(
         last.model.T_mount,
         split(terms, values, sigmas),

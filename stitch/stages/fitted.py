@@ -1,4 +1,4 @@
-"""What a fit of one rig found, whatever was observed."""
+"""How a run goes with what was observed, and what the fit of a rig found."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -18,6 +18,8 @@ from stitch.measurement.robot import Robot
 
 _VISIBLE = 0.01
 _PARALLEL = np.cos(np.radians(2.0))
+# Joints that turn by less stand still.
+_TURNED = np.radians(0.5)
 
 
 def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> tuple[Array, Array]:
@@ -27,7 +29,7 @@ def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> t
         centre: (3,) of the part in the scanner frame; twists are taken about it, so that a rotation
             of the scanner is not mistaken for the translation it causes at the part.
     """
-    size = 2 * float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets])) / 2
+    size = float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets]))
     # A probe is a point: a tenth of its distance stands in for its size.
     size = size or 0.1 * float(np.linalg.norm(centre))
     about = frames.make(np.eye(3), centre)
@@ -78,15 +80,13 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
         T_base_flange = kinematics.forward(robot, joints)
         _, base_axes = kinematics.joint_axes(robot, joints)
         scanner_rides = np.array_equal(first.T_reference_mount, first.T_reference_flange)
-        for i in range(base_axes.shape[1]):
+        for i in np.flatnonzero(np.ptp(joints, axis=0) > _TURNED):
             seen = base_axes[:, i]
             if scanner_rides:
                 seen = np.einsum("vji,vj->vi", T_base_flange[:, :3, :3], seen)
             # A joint's axis has a place in the mount frame only while it does not move there.
             if np.linalg.norm(seen.mean(axis=0)) > _PARALLEL:
                 axes[f"the axis of joint {i + 1}"] = seen.mean(axis=0)
-        moving = np.ptp(joints, axis=0) > np.radians(0.5)
-        axes = {name: axis for i, (name, axis) in enumerate(axes.items()) if moving[int(name.split()[-1]) - 1]}
     motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
     _, s, Vt = np.linalg.svd(motions, full_matrices=False)
     if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):

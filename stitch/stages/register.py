@@ -32,10 +32,9 @@ Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 
 @dataclass(frozen=True)
 class Registration:
-    """Poses after the fit and what each view moved: the robot's own error."""
+    """Poses after the fit; how far they are from the model's is the robot's own error."""
 
     poses: Array  # (V, 4, 4) T_reference_scanner
-    corrections: Array  # (V, 6) twists in the reference frame: poses = exp(corrections) @ model poses
     overlaps: Overlaps
     history: tuple[float, ...]
 
@@ -88,8 +87,7 @@ def register(
             break
         gate = tighter
     final = collect(capture, poses, gate, picked)
-    corrections = frames.log(poses @ frames.inverse(model_poses))
-    return Registration(poses, corrections, final, (*history, final.gram.rms))
+    return Registration(poses, final, (*history, final.gram.rms))
 
 
 def _weighed(overlaps: Overlaps, capture: Capture, weights: Sequence[Array]) -> Gram:

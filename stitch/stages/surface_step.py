@@ -38,8 +38,6 @@ class Step:
     moved: float  # of the parameters, sigmas
     rms: float  # what the model leaves between the surfaces, length_unit
     hand_eye: HandEye
-    fitted: Mask
-    freed: list[FreePoses]
     linearised: "Linearised"
     choice: Choice
 
@@ -99,8 +97,6 @@ class Linearised:
             moved=moved,
             rms=_model_rms(self.freed),
             hand_eye=found,
-            fitted=fitted,
-            freed=self.freed,
             linearised=self,
             choice=choice,
         )
