@@ -127,7 +127,7 @@ def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
     count = min(_QUADRIC_NEIGHBOURS, len(points))
     if count <= 8:
         return float("nan")
-    centre = np.linspace(0, len(own) - 1, min(_NOISE_SAMPLES, len(own))).astype(int)
+    centre = evenly(len(own), _NOISE_SAMPLES)
     _, index = tree.query(own[centre], k=count)
     local = points[index] - own[centre][:, None]
     n = normals[centre]
@@ -141,7 +141,7 @@ def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
     design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     q, _ = np.linalg.qr(design)
     rest = z - np.einsum("nkc,nc->nk", q, np.einsum("nkc,nk->nc", q, z))
-    variance = (rest**2).sum(axis=1) / (count - 6)
-    # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     degrees = count - 6
+    variance = (rest**2).sum(axis=1) / degrees
+    # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance) / (1 - 2 / (9 * degrees)) ** 3))

@@ -9,6 +9,7 @@ import trimesh
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.measurement.scan import evenly
 from stitch.reading.clouds import read_cloud
 from stitch.reading.text_file import require_file
 
@@ -61,7 +62,7 @@ def surface_of_file(file: Path, scale: float) -> PlannedPart:
 
 def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> PlannedPart:
     """At most so many points (N, 3) of a cloud with their normals (N, 3), evenly over their order."""
-    picked = np.linspace(0, len(points) - 1, min(at_most, len(points))).astype(int)
+    picked = evenly(len(points), at_most)
     return PlannedPart(points[picked], normals[picked])
 
 

@@ -58,7 +58,7 @@ def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Ind
         lever: length that makes a radian of orientation comparable with a distance.
     """
     views = np.arange(len(T_reference_mount))
-    twists = frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
+    twists = _apart(T_reference_mount, lever)
     # Along the direction in which the poses differ most.
     along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
     orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
@@ -91,8 +91,15 @@ def joint_ends(joints: Array, seen: Indices) -> list[JointEnd]:
     return out
 
 
+def _apart(T_reference_mount: Array, lever: float) -> Array:
+    """(V, 6) twists of the poses from the first, as lengths."""
+    return np.asarray(
+        frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
+    )
+
+
 def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indices]:
-    twists = frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
+    twists = _apart(T_reference_mount, lever)
     with warnings.catch_warnings():
         # An empty group is no harm: it is left out by the callers.
         warnings.simplefilter("ignore", UserWarning)

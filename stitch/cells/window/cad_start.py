@@ -12,6 +12,7 @@ from stitch.cells.window.joined_scans import Joined
 from stitch.closed_form import feature_matching
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
+from stitch.measurement.scan import evenly
 
 _FEWEST = 50
 _POINTS = 1500  # of the scan that judge a candidate
@@ -73,7 +74,7 @@ def _spread(scan: Joined) -> Indices:
         raise NoResultError(
             f"the scans reach over {70 * size:.3g}, mostly empty; correct a scanner's pose, or cut them"
         )
-    picked: Indices = kept[np.linspace(0, len(kept) - 1, min(_POINTS, len(kept))).astype(int)]
+    picked: Indices = kept[evenly(len(kept), _POINTS)]
     return picked
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.bounding_box import box_of, corners
-from stitch.measurement.scan import Scan
+from stitch.measurement.scan import Scan, evenly
 from stitch.system.threads import parallel
 
 # Two patches whose normals differ by more than 45° are not the same surface.
@@ -44,7 +44,7 @@ def sample(scan: Scan, count: int) -> Indices:
     usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
     if len(usable) <= count:
         return usable
-    picked: Indices = usable[np.linspace(0, len(usable) - 1, count).astype(int)]
+    picked: Indices = usable[evenly(len(usable), count)]
     return picked
 
 
