@@ -1,6 +1,6 @@
 """How well each candidate explains the views: evidence, p-value, amplitude.
 
-Every form of a candidate is fitted with the variances estimated anew (`variance.py`). The p-value is that of
+Every form of a candidate is fitted with the variances estimated anew (`variance_components.py`). The p-value is that of
 the Wald F test under the form's own REML; forms are counted (Bonferroni). The evidence is the likelihood
 integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
 """

@@ -26,9 +26,7 @@ class MixedModel:
 
     z: Array  # (B, m)
     A: Array  # (B, m, a) columns of the free mean
-    components: (
-        Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and what there is more
-    )
+    components: Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and further ones
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
     scales: Array | None = None  # (c − 3,) that σ of the further components usually has; None: there are none
