@@ -1,5 +1,7 @@
 """Joint angles of a bag in the order of the arm, by the URDF that it recorded."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
@@ -57,19 +59,23 @@ def tree_of(found: Recorded) -> TransformTree:
 
 
 def _ends(urdf: str) -> list[tuple[str, str]]:
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "robot.urdf"
-        file.write_text(urdf, encoding="utf-8")
+    with _as_file(urdf) as file:
         return ends_of(file)
 
 
 def _forward(urdf: str, base: str, flange: str, joints: Array) -> Array:
     """T_base_flange (M, 4, 4), m, of joint angles (M, n), rad."""
+    with _as_file(urdf) as file:
+        return np.asarray(forward(robot_from_urdf(file, base, flange, "m", _GRAVITY), joints))
+
+
+@contextmanager
+def _as_file(urdf: str) -> Iterator[Path]:
+    """The text of a bag as the file that robots are read from."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "robot.urdf"
         file.write_text(urdf, encoding="utf-8")
-        T = forward(robot_from_urdf(file, base, flange, "m", _GRAVITY), joints)
-    return np.asarray(T)
+        yield file
 
 
 def chain_joints(urdf: str, base: str, flange: str) -> list[str]:

@@ -11,9 +11,9 @@ from stitch.comparison.run_verdict import run_verdict
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
 from stitch.runs.run import LeftOut, Run
+from stitch.writing.run_contents import FORMAT
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
-FORMAT = "stitch-run/1"
 _VERSIONS = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from stitch.errors import InputError
 from stitch.system.whole_folder import Ours
 
-_FORMAT = "stitch-run/1"
+# Of result.json.
+FORMAT = "stitch-run/1"
 # Every file that a command writes into a run folder. What is not listed here is never removed.
 FILES = {
     "model.toml",
@@ -108,7 +109,7 @@ def _session(file: Path) -> str | None:
         document = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError):
         return None
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
         return None
     session = document.get("session")
     return session if isinstance(session, str) and "\0" not in session else None

@@ -20,6 +20,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
+from stitch.reading.session_toml import FORMAT
 
 Columns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
 
@@ -93,7 +94,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 def _write(folder: Path, session: SessionFiles) -> None:
     folder.mkdir(exist_ok=True)
-    head = {"format": "stitch-session/1", "name": session.name}
+    head = {"format": FORMAT, "name": session.name}
     head |= {"length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
     for file in session.copies:

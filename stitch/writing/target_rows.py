@@ -9,6 +9,7 @@ from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model import Target
+from stitch.observations.targets.outliers import Outlier, outside
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import Run
 
@@ -89,11 +90,8 @@ def as_counted(measurement: Measurement, session: Session, document: dict[str, A
     if s is None:
         return measurement
     number = {view.name: v for v, view in enumerate(session.views)}
-    used = s.used.copy()
-    for o in outliers:
-        v = number.get(o["view"])
-        if v is not None:
-            used[v] &= False if o["target"] is None else s.target[v] != s.targets.index(o["target"])
+    gone = [Outlier(number[o["view"]], o["target"], np.nan, np.nan) for o in outliers if o["view"] in number]
+    used = outside(s.used, gone, s.targets, s.target)
     factor = document.get("cloud_noise_factor", measurement.capture.noise_factor)
     own = replace(measurement.capture, sightings=replace(s, used=used), noise_factor=factor)
     return replace(measurement, capture=own)

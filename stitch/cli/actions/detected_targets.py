@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch.cli.actions.looked_for import looked_for
+from stitch.cli.options import require_new
 from stitch.cli.terminal.streams import emit, results
 from stitch.errors import InputError
 from stitch.intake.targets_in_scans import points_columns, scans_of, targets_in, views_of_targets
@@ -27,8 +28,7 @@ def detected_targets(
     wanted = looked_for(board, ball)
     if wanted.nothing:
         raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
-    if output is not None and (output.exists() or output.is_symlink()):
-        raise InputError(f"{output}: exists already; to fix: remove it, or name another file")
+    require_new(output)
     loaded = load_session(session, at_most=None)
     found, notes = targets_in(scans_of(loaded), wanted)
     views = loaded.names
