@@ -10,7 +10,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.calibrate.view_jackknife import jackknife
-from stitch.closed_form.axzb import require_poses, shah
+from stitch.closed_form.axzb import shah
 from stitch.closed_form.relative_motions import roots
 from stitch.frames import Array
 from stitch.statistics.robust import mad_sigma
@@ -56,7 +56,6 @@ def refine_axzb(
     Raises:
         NoResultError: poses that cannot show both; names the axis they share.
     """
-    require_poses(A)
     X, Z = shah(A, B, weights)
     root = roots(A, weights)[:, None]
     for step in range(_STEPS + 1):

@@ -13,10 +13,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.closed_form.axxb_simultaneous import andreff, daniilidis
-from stitch.closed_form.relative_motions import axis_spread, matched_rotations, require_motion, roots, translation
+from stitch.closed_form.relative_motions import matched_rotations, require_motion, roots, translation
 from stitch.frames import Array, skew
 
-__all__ = ["SOLVERS", "andreff", "axis_spread", "daniilidis", "horaud_dornaika", "park_martin", "tsai_lenz"]
+__all__ = ["SOLVERS", "andreff", "daniilidis", "horaud_dornaika", "park_martin", "tsai_lenz"]
 
 
 def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:

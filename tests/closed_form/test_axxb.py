@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.closed_form.axxb import SOLVERS, axis_spread
+from stitch.closed_form.axxb import SOLVERS
+from stitch.closed_form.relative_motions import axis_spread
 from stitch.errors import NoResultError
 
 

@@ -43,7 +43,6 @@ class LegOffset:
     runner_up: int  # the leg that explains the data next best
     runner_up_drop: float
     found: bool  # beyond chance
-    p_after: float  # chance of so large a chi-square with the offset taken out
 
 
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
@@ -93,7 +92,6 @@ def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: in
         runner_up=int(second) + 1,
         runner_up_drop=float(drops[second]),
         found=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
-        p_after=float(chi2.sf(model.chi_square - drops[best], model.redundancy - 1)),
     )
 
 
