@@ -50,6 +50,32 @@ def test_right_names_are_left_alone(seed):
     assert mislabelled(sightings(places, seed, unseen)) == ()
 
 
+def many(count, mixed_up):
+    """Of `count` targets every view shows half; in one view those are in another order, if so."""
+    rng = np.random.default_rng(count)
+    places = np.tile(rng.uniform(-500, 500, (count, 3)), (VIEWS, 1, 1))
+    unseen = [(v, int(k)) for v in range(VIEWS) for k in rng.permutation(count)[: count // 2]]
+    own = sightings(places, 0, unseen)
+    shown = np.flatnonzero(own.used[OFF])
+    order = np.arange(count)
+    order[shown] = rng.permutation(shown) if mixed_up else shown
+    return renamed(own, order), order
+
+
+@pytest.mark.parametrize("count", [30, 150])
+def test_of_many_targets_those_of_a_view_are_put_right_too(count):
+    sighted, order = many(count, True)
+    (found,) = mislabelled(sighted)
+    assert found.view == OFF
+    assert dict(found.names) == {f"ball{name + 1}": f"ball{k + 1}" for k, name in enumerate(order) if name != k}
+    assert f"and {len(found.names) - 24} more" in found.said("v003") or len(found.names) <= 24
+
+
+@pytest.mark.parametrize("count", [30, 150])
+def test_right_names_of_many_targets_are_left_alone(count):
+    assert mislabelled(many(count, False)[0]) == ()
+
+
 def with_corners(measured, order):
     """The cell with four targets on the part, whose names in one view are in another order."""
     corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])

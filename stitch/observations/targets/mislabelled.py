@@ -4,16 +4,16 @@ One wrong name shows as an outlier. Where all names of a view are mixed up, what
 beside clouds it holds the scan in a wrong place, so that the scan is blamed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.measurement.sightings import Sightings
 from stitch.observations.targets.distances import MANY, distance_sigma, distances, places_of
 from stitch.observations.targets.outliers import LIMIT_TARGET, Outlier, outside
-from stitch.statistics.robust import MAD_TO_SIGMA
+from stitch.statistics.robust import MAD_TO_SIGMA, median_of_known
 
 # Targets of a view whose distances tell names apart, and views that say how far two targets lie apart.
 _TARGETS, _VIEWS = 3, 3
@@ -37,7 +37,8 @@ class Mislabelled:
 
     def said(self, view: str) -> str:
         """What happened and what to do, with the name of the view."""
-        named = "; ".join(f"{stated} is {right}" for stated, right in self.names)
+        told = [f"{stated} is {right}" for stated, right in self.names]
+        named = "; ".join(told[:MANY]) + (f" … and {len(told) - MANY} more" if len(told) > MANY else "")
         which = f" ({named})" if named else ""
         return (
             f"The targets of view {view} bear each other's names{which}, as the distances between them say: its "
@@ -46,30 +47,22 @@ class Mislabelled:
 
 
 def mislabelled(sightings: Sightings) -> tuple[Mislabelled, ...]:
-    """Views whose names are mixed up; none among more targets than are compared pair by pair."""
-    if len(sightings.targets) > MANY:
-        return ()
-    apart = distances(places_of(sightings))
-    few = np.isfinite(apart).sum(axis=0) < _VIEWS
-    usual = np.where(few, np.nan, np.nanmedian(np.where(few, 0.0, apart), axis=0))
-    off = np.abs(apart - usual)
-    between = off[:, ~np.eye(len(usual), dtype=bool)]
-    if not np.isfinite(between).any():
-        return ()
-    scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * float(np.nanmedian(between)))
+    """Views whose names are mixed up; of many targets each view is asked about some, all over its list."""
+    places = places_of(sightings)
+    worst, usually = _off(places, [_asked(place) for place in places])
+    scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * usually)
+    doubted = np.flatnonzero(worst > LIMIT_TARGET * scatter)
+    usual = _usual(places) if len(doubted) else np.empty((0, 0))
     found = []
-    for v in range(len(apart)):
-        stated = np.flatnonzero(np.isfinite(np.diagonal(apart[v])))
-        own, worst = apart[v][np.ix_(stated, stated)], float(np.nanmax(off[v], initial=0.0))
-        if len(stated) < _TARGETS or worst < LIMIT_TARGET * scatter:
-            continue
-        within = min(LIMIT_TARGET * scatter, _CLEARER * worst)
-        fits = list(_other_names(own, usual, within))
+    for v in doubted:
+        stated = np.flatnonzero(np.isfinite(places[v, :, 0]))
+        within = min(LIMIT_TARGET * scatter, _CLEARER * worst[v])
+        fits = list(_other_names(distances(places[v : v + 1, stated])[0], usual, within))
         if fits:
             names = [sightings.targets[k] for k in stated]
             right = [sightings.targets[k] for k in fits[0]]
             mixed = tuple((a, b) for a, b in zip(names, right, strict=True) if a != b)
-            found.append(Mislabelled(v, mixed if len(fits) == 1 else (), worst, worst / scatter))
+            found.append(Mislabelled(int(v), mixed if len(fits) == 1 else (), worst[v], worst[v] / scatter))
     return tuple(found)
 
 
@@ -79,6 +72,34 @@ def named_right(sightings: Sightings | None) -> Sightings | None:
         return None
     mixed_up = [m.outlier for m in mislabelled(sightings)]
     return replace(sightings, used=outside(sightings.used, mixed_up, sightings.targets, sightings.target))
+
+
+def _asked(place: Array) -> Indices:
+    """Of the targets (K, 3) that a view shows as many as are compared pair by pair."""
+    shown = np.flatnonzero(np.isfinite(place[:, 0]))
+    return np.asarray(shown[np.linspace(0, len(shown) - 1, min(len(shown), MANY)).astype(int)])
+
+
+def _off(places: Array, asked: Sequence[Indices]) -> tuple[Array, float]:
+    """(V,) by how much a distance of each view is off what it usually is, at the most, and the median of all."""
+    off = [np.zeros(0)]
+    for v, targets in enumerate(asked):
+        apart = distances(places[:, targets])[:, *np.triu_indices(len(targets), 1)]
+        few = np.isfinite(apart).sum(axis=0) < _VIEWS
+        own = np.abs(apart[v] - median_of_known(apart))
+        off.append(np.where(few, np.nan, own) if len(targets) >= _TARGETS else np.zeros(0))
+    every = np.concatenate(off)
+    usually = float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
+    return np.array([np.nanmax(own, initial=0.0) for own in off[1:]]), usually
+
+
+def _usual(places: Array) -> Array:
+    """(K, K) distances between targets as most views have them, NaN where few do."""
+    out = np.empty((places.shape[1],) * 2)
+    for k, row in enumerate(out):
+        apart = np.linalg.norm(places - places[:, k : k + 1], axis=2)
+        row[:] = np.where(np.isfinite(apart).sum(axis=0) < _VIEWS, np.nan, median_of_known(apart))
+    return out
 
 
 def _other_names(own: Array, usual: Array, within: float) -> Iterator[list[int]]:
@@ -91,14 +112,19 @@ def _other_names(own: Array, usual: Array, within: float) -> Iterator[list[int]]
         if k is None:
             choices.pop()
             named = named[:-1]
-        elif k not in named and _agree(own[len(named), : len(named)], usual[k, named], within):
-            if len(named) + 1 == len(own):
-                given += 1
-                yield [*named, k]
-            else:
-                named.append(k)
-                choices.append(iter(range(len(usual))))
+        elif len(named) + 1 == len(own):
+            given += 1
+            yield [*named, k]
+        else:
+            named.append(k)
+            choices.append(iter(_agreeing(own[len(named), : len(named)], usual, named, within)))
 
 
-def _agree(own: Array, usual: Array, within: float) -> bool:
-    return bool(np.all(np.abs(own - usual) < within))
+def _agreeing(own: Array, usual: Array, named: list[int], within: float) -> list[int]:
+    """Names that are left for a target, (d,) apart from d that have theirs: what few views say of some may be open."""
+    held = named[:MANY]
+    off = np.abs(usual[:, held] - own[: len(held)])
+    known = np.isfinite(off)
+    fits = (~known | (off < within)).all(axis=1) & (known.sum(axis=1) >= min(len(held), _TARGETS))
+    fits[named] = False
+    return [int(k) for k in np.flatnonzero(fits)]
