@@ -23,7 +23,7 @@ from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
-from stitch.diagnosis.within_overlaps import left_within
+from stitch.diagnosis.within_overlaps import left_within, scanner_error
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.state import State
@@ -57,11 +57,13 @@ def _diagnosed(state: State) -> Diagnosis:
     left_out = {e.name: e.cross_validation for e in examined}
     selection, notes = _held(linear, selection, left_out, limit)
     within = left_within(linear, state.session.scanner.noise)
-    if within and selection.verdict == "adequate":
+    by_field = scanner_error(linear) if selection.verdict == "adequate" else None
+    of_scanner = by_field is not None and by_field.over_noise
+    if (within or of_scanner) and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
     unnamed = _unnamed(linear, selection) if unknown else ()
-    of_field = unknown and follows_field(selection.empirical, unnamed)
+    of_field = unknown and (of_scanner or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
     rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
@@ -86,6 +88,7 @@ def _diagnosed(state: State) -> Diagnosis:
         curves=curves,
         within=within,
         of_field=of_field,
+        by_field=0.0 if by_field is None else by_field.rms,
         budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))

@@ -16,9 +16,11 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     if d.verdict == "adequate":
         by = _judged_by(d, length_unit)
         rest = f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {by}"
+        size = length_text(d.by_field, length_unit, 2)
+        field = f"; the scanner errs by {size} rms over its field, the same in every view, which no pose corrects"
         return (
             f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
-            f"{rest if _scatters(d) else ''}{_notes(d)}."
+            f"{rest if _scatters(d) else ''}{field if d.by_field else ''}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
         return _missing(d, length_unit, now, floor, second)
@@ -49,8 +51,9 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
 def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
     start = f"No effect of the library explains what is left ({now}, noise {floor}): {_within(d, length_unit)}"
     if d.of_field:
+        size = f" ({length_text(d.by_field, length_unit, 2)} rms)" if d.by_field else ""
         return (
-            f"{start}the scanner errs by where in its field a point is seen, the same in every view; have it "
+            f"{start}the scanner errs by where in its field a point is seen, the same in every view{size}; have it "
             f"calibrated, or describe how it errs by an effect of your own{_notes(d)}."
         )
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
@@ -66,6 +69,9 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
             f"the poses scatter by {scatter} otherwise" if _scatters(d) else "what was seen does not show the poses"
         )
         return f"{start}{follows}{otherwise}{_notes(d)}{_lack(d)}."
+    if d.within:
+        poses = f"until that is mended nothing is known of the poses, which scatter by {scatter}"
+        return f"{start}{follows}{poses}{_notes(d)}{_lack(d)}."
     than = f"more than {_limits(d, length_unit)} as stated" if d.scatter_limit.stated else "which no sound arm does"
     return (
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "

@@ -4,8 +4,10 @@ A seam or a ripple in the scanner's field, a corner that is off, a part that cha
 the poses that fit best take only a share of it. Only beside the noise can it be seen that it is there.
 """
 
+from stitch.diagnosis.thresholds import ALPHA_UNKNOWN
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.noise_floor import noise_floor
+from stitch.observations.surfaces.scanner_field import FieldError, field_error
 from stitch.observations.surfaces.surface_model import Surfaces
 
 
@@ -24,3 +26,14 @@ def left_within(linear: LinearModel, stated: float | None = None) -> float:
     freed, noise = surfaces.freed.overlaps, noise_floor(surfaces.capture, surfaces.freed.overlaps, stated)
     left = float(max(freed.gram.rms**2 - noise**2, 0.0) ** 0.5)
     return left if left > noise else 0.0
+
+
+def scanner_error(linear: LinearModel) -> FieldError | None:
+    """The scanner's error over its field where it is larger than every scanner's; None where overlaps show no such.
+
+    It may be small beside the noise: many points average that, and not what is the same in every view.
+    """
+    if not isinstance(linear.observation, Surfaces):
+        return None
+    found = field_error(linear.measurement, linear.observation.freed, ALPHA_UNKNOWN)
+    return found if found.unusual else None

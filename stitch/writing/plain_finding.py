@@ -16,7 +16,11 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     named = " or ".join(in_words(name) for name in found.effects)
     match found.verdict:
         case "adequate":
-            return "No effect is found missing: noise and the arm's scatter explain what is left."
+            size = length_text(found.by_field, length_unit, 2)
+            field = (
+                f" The scanner itself errs by {size} over its field, which no pose corrects." if found.by_field else ""
+            )
+            return f"No effect is found missing: noise and the arm's scatter explain what is left.{field}"
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":

@@ -7,28 +7,46 @@ import pytest
 from scipy.stats import chi2
 
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.quiet_scenes import simulated
+from data_synth.fixtures.quiet_scenes import Measured, simulated
 from data_synth.scene import load_scene
 from stitch import frames, pipeline
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.observations.surfaces.scanner_field import field_error, field_scatter
 from stitch.runs.state import state_of
 
 SEEDS = 2
 
 
-def chi_squares(share: float) -> tuple[list[float], list[float]]:
-    """Per seed χ² of the hand-eye's error and the sigma of its place (mm); smooth errors of `share` of the noise."""
+def repeated(share: float, seed: int) -> Measured:
+    """A plate seen by a scanner of which smooth errors of `share` of the noise repeat."""
     scene = load_scene("drill-plate")
     scanner = replace(scene.scanner, columns=50, rows=50, field_error=share * scene.scanner.noise)
+    return simulated(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
+
+
+def chi_squares(share: float) -> tuple[list[float], list[float]]:
+    """Per seed χ² of the hand-eye's error and the sigma of its place (mm); smooth errors of `share` of the noise."""
     squares, sigmas = [], []
     for seed in range(SEEDS):
-        measured = simulated(replace(scene, scanner=scanner, repeatability=(4e-6, 0.004)), {}, seed, views=10)
+        measured = repeated(share, seed)
         found = pipeline.run(session_of(measured))
         xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
         squares.append(float(xi @ np.linalg.solve(found.mount_covariance, xi)))
         sigmas.append(float(np.sqrt(np.trace(found.mount_covariance[3:, 3:]))))
     return squares, sigmas
+
+
+@pytest.mark.parametrize(
+    ("share", "unusual", "over_noise"), [(0.2, False, False), (0.9, True, False), (4.0, True, True)]
+)
+def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
+    """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""
+    measured = repeated(share, 0)
+    linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
+    found = field_error(linear.measurement, linear.observation.freed, 0.01)
+    assert (found.unusual, found.over_noise) == (unusual, over_noise)
+    assert found.rms < 2 * share * load_scene("drill-plate").scanner.noise
+    assert not unusual or found.rms > 0.3 * share * load_scene("drill-plate").scanner.noise
 
 
 @pytest.mark.slow
