@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import minimize
-from scipy.stats import chi2
 
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.point_gram import PointGram, seen_twists, streamed
+from stitch.statistics.tails import chi2_tail
 
 # Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
 # effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.
@@ -68,7 +68,7 @@ def field_error(measurement: Measurement, freed: FreePoses, alpha: float) -> Fie
 
     def exceeds(most: float) -> bool:
         # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
-        return 0.5 * float(chi2.sf(shown.likeliest(most)[1] - free, 1)) < alpha
+        return 0.5 * chi2_tail(shown.likeliest(most)[1] - free, 1) < alpha
 
     return FieldError(noise * float(share), exceeds(ALARM_SHARE), exceeds(1.0))
 
