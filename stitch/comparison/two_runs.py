@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
 
 from stitch import frames
 from stitch.comparison.model_history import ModelHistory, model_history
@@ -14,6 +13,7 @@ from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
 from stitch.reading.session_hash import UNKNOWN, session_hash
 from stitch.runs.run import Run
+from stitch.statistics.tails import chi2_tail
 from stitch.units import length_text
 
 # Probability below which chance does not explain a difference (5 %, as k = 2 covers 95 %).
@@ -56,7 +56,7 @@ class HandEyeChange:
         """That so large a twist comes about by the stated uncertainties; NaN where none is stated."""
         if not np.isfinite(self.covariance).all() or not (rank := np.linalg.matrix_rank(self.covariance)):
             return float("nan")
-        return float(chi2.sf(self.twist @ np.linalg.pinv(self.covariance) @ self.twist, rank))
+        return chi2_tail(float(self.twist @ np.linalg.pinv(self.covariance) @ self.twist), float(rank))
 
 
 @dataclass(frozen=True)
