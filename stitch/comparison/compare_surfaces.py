@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, edges_of, values_of_views, view_properties
+from stitch.comparison.tables import Comparison, Table, binned, values_of_views, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.gram import RMS_GATE
@@ -139,9 +139,7 @@ def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
 
 
 def _binned(rows: _Rows, name: str, unit: str, values: Array) -> Table:
-    """Bins with about equal counts; equal values stay together."""
-    edges = edges_of(values)
-    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
+    edges, bins = binned(values)
     return Table(name, unit, edges[:-1], edges[1:], (), *_statistics(rows, bins, len(edges) - 1))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, edges_of, view_properties
+from stitch.comparison.tables import Comparison, Table, binned, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
@@ -37,8 +37,7 @@ def compare_targets(state: State) -> Comparison:
     labels = {"view": (rows.view, state.session.names), "target": (rows.target, list(s.targets))}
     tables = [_table(rows, name, "", bins, _numbers(names), names) for name, (bins, names) in labels.items()]
     for name, unit, values in _properties(state, rows):
-        edges = edges_of(values)
-        bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
+        edges, bins = binned(values)
         tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
     of_views = {name: values for name, _, values in _of_views(state)}

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.measurement.views import Views
 
 _BINS = 6
@@ -81,10 +81,12 @@ def values_of_views(views: Views) -> dict[str, Array]:
     return {name: values for name, _, values in view_properties(views)}
 
 
-def edges_of(values: Array) -> Array:
-    """(B + 1,) edges of bins with about equal counts."""
+def binned(values: Array) -> tuple[Array, Indices]:
+    """(B + 1,) edges of bins with about equal counts, and the bin of every value (N,); equal values stay together."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-    return edges if len(edges) > 1 else np.array([edges[0] - 0.5, edges[0] + 0.5])
+    edges = edges if len(edges) > 1 else np.array([edges[0] - 0.5, edges[0] + 0.5])
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    return edges, bins.astype(np.int64)
 
 
 def comparison_document(found: Comparison) -> dict[str, object]:

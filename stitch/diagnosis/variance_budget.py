@@ -7,6 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
+from stitch.observations.error_model import WHITE
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors
@@ -15,10 +16,9 @@ from stitch.statistics.least_squares import column_space
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
-# Components as people call them; the arm's own keep the name of their effects.
-_WHITE = ("white rotation", "white translation", "sensor noise")
 # Sources that are new in every view, or no error of the poses.
 NOT_REPEATING = ("sensor noise", "white repeatability", "scanner field")
+# Components as people call them; the arm's own keep the name of their effects.
 _CALLED = {
     "sensor noise": "sensor noise",
     "white rotation": "white repeatability",
@@ -66,7 +66,7 @@ def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) 
     U = column_space(np.hstack([linear.reduce(linear.design), *named]))
     mixed = replace(linear.mixed, A=U[None])
     sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
-    for name, size, C in zip((*_WHITE, *errors.names), sizes, mixed.components[:, 0], strict=True):
+    for name, size, C in zip((*WHITE, *errors.names), sizes, mixed.components[:, 0], strict=True):
         yield _CALLED.get(name, f"{name} of every joint"), float(size * (np.trace(C) - np.sum(U * (C @ U))))
     if linear.mixed.fixed is not None:
         C = linear.mixed.fixed[0]

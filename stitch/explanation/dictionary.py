@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from stitch.effects.contract import Effect
+from stitch.effects.contract import TWIST, Effect
 from stitch.effects.specs import per_joint, twist
 from stitch.explanation.quantities import Quantity
 from stitch.frames import Array
@@ -15,8 +15,6 @@ from stitch.model.term import Term, term_of
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.observations.targets.target_model import Targets
-
-_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Ingredient:
     @property
     def what(self) -> str:
         """What is displaced."""
-        return f"q*{self.index + 1}" if self.place == "robot" else f"{self.place} {_AXES[self.index]}"
+        return f"q*{self.index + 1}" if self.place == "robot" else f"{self.place} {TWIST[self.index]}"
 
 
 def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ingredient], Array]:

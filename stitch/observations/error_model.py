@@ -14,6 +14,8 @@ from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances, whitener
 from stitch.statistics.variance_prior import NOISE
 
+# The first components of whatever was observed, by their names; what poses err beside follows them.
+WHITE = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
 _ABSENT = 1e-2
 # Among more numbers a search takes a second: one from the likeliest start must do.

@@ -7,6 +7,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
+from stitch.observations.error_model import WHITE
 from stitch.observations.surfaces.hand_eye import shares_of, weak_prior
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE, USUAL_SHARE
 from stitch.planning.expected_model import ExpectedModel, Seen
@@ -43,7 +44,7 @@ def expected_hand_eye(linear: ExpectedModel, found: Seen, middle: Array | None =
     capture, T_mount = found.measurement.capture, linear.model.T_mount
     sizes, components = linear.null.variances, linear.mixed.components[:, 0]
     errors = () if linear.pose_errors is None else linear.pose_errors.names
-    names = ("white rotation", "white translation", "sensor noise", *errors)
+    names = (*WHITE, *errors)
     columns = linear.reduce(linear.design)
     prior = weak_prior([capture], [found.freed], T_mount, linear.sizes[6:])
     scatter = np.einsum("c,cij->ij", sizes[: NOISE + 1], components[: NOISE + 1])

@@ -14,7 +14,7 @@ from stitch.measurement.scan import Scan, prepare_view
 from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.free_poses import SAMPLES, FreePoses
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.observations.surfaces.surface_model import surface_model
@@ -24,8 +24,6 @@ from stitch.planning.scatter import Scatter
 from stitch.statistics.variance_components import at_variances
 from stitch.statistics.variance_prior import NOISE
 
-# Correspondences that a view is given, as the stages take them.
-SAMPLES = 1500
 _SPACINGS, _SIGMAS = 1.5, 6.0  # of the gate
 # Fewer points of a view say nothing of six directions.
 FEWEST = 60

@@ -16,7 +16,8 @@ from stitch.observations.surfaces.gram import Gram, assemble
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import Overlaps, collect, next_gate
 
-_SAMPLES = 1500
+# Queries per view.
+SAMPLES = 1500
 _MAXIMUM_ITERATIONS = 12
 _CONVERGED = 1e-2
 # Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
@@ -51,7 +52,7 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
     Raises:
         NoResultError: no two views overlap.
     """
-    picked = [sample(scan, _SAMPLES) for scan in capture.scans]
+    picked = [sample(scan, SAMPLES) for scan in capture.scans]
     poses = np.array(model_poses)
     overlaps = collect(capture, poses, gate, picked)
     for _ in range(_MAXIMUM_ITERATIONS):

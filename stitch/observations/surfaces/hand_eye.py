@@ -14,6 +14,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
+from stitch.observations.error_model import WHITE
 from stitch.observations.pose_errors import PoseErrors, white
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
@@ -106,7 +107,7 @@ def _sources(
     mixed = rig.mixed(errors)
     sizes = fit_variances(mixed, both_starts=True)
     mean = sizes.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, sizes)
-    names = ("white rotation", "white translation", "sensor noise", *errors.names)
+    names = (*WHITE, *errors.names)
     found = zip(names, mean, mixed.components[:, 0], strict=True)
     sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in found}
     if repeating is not None:
