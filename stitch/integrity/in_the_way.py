@@ -21,6 +21,8 @@ _PROBES, _ASKED = 400, 20
 # Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
 # through. Where poses err or an edge is seen aslant, scans differ by less; so do those whose points lie as far apart.
 _APART, _SPACINGS = 0.03, 2.0
+# Nearest looks of another scan that must all pass a point.
+_LOOKS = 8
 # Share of a scan's points that is worth a word, and how many; scans of good sessions had 0.0025 at the most.
 _WORTH, _FEWEST = 0.01, 5
 
@@ -69,11 +71,15 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
-    """(n,) points in the frame of a scan in whose direction it sees something that is farther away."""
+    """(n,) points in the frame of a scan about whose direction all that it sees is farther away.
+
+    One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
+    """
     away = np.linalg.norm(points, axis=1)
-    beside, partner = look.query(np.ascontiguousarray(_directions(points)), k=1)
-    seen = np.linalg.norm(scan.points[partner.astype(int)], axis=1)
-    return np.asarray((beside * away < _SPACINGS * scan.spacing) & (seen > away + behind))
+    beside, partners = look.query(np.ascontiguousarray(_directions(points)), k=min(_LOOKS, len(scan.points)))
+    beside, partners = beside.reshape(len(points), -1), partners.reshape(len(points), -1).astype(int)
+    seen = np.linalg.norm(scan.points[partners], axis=2).min(axis=1)
+    return np.asarray((beside[:, 0] * away < _SPACINGS * scan.spacing) & (seen > away + behind))
 
 
 def _directions(points: Array) -> Array:
