@@ -11,6 +11,7 @@ from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
+from stitch.diagnosis.scanner_first import scanner_first
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
@@ -23,9 +24,10 @@ from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
-from stitch.diagnosis.within_overlaps import left_within, scanner_error
+from stitch.diagnosis.within_overlaps import left_within
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.scanner_field import FieldError
 from stitch.runs.state import State
 from stitch.stages.course import linearise
 from stitch.system.heap import return_large_arrays
@@ -55,15 +57,13 @@ def _diagnosed(state: State) -> Diagnosis:
     matrix = alias_matrix(linear, [r.score for r in selection.ranked])
     examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
     left_out = {e.name: e.cross_validation for e in examined}
-    selection, notes = _held(linear, selection, left_out, limit)
+    selection, by_field = _held(linear, selection, left_out, limit)
     within = left_within(linear, state.session.scanner.noise)
-    by_field = scanner_error(linear) if selection.verdict == "adequate" else None
-    of_scanner = by_field is not None and by_field.over_noise
-    if (within or of_scanner) and selection.verdict == "adequate":
+    if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
     unnamed = _unnamed(linear, selection) if unknown else ()
-    of_field = unknown and (of_scanner or follows_field(selection.empirical, unnamed))
+    of_field = unknown and (by_field is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
     rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
@@ -81,7 +81,7 @@ def _diagnosed(state: State) -> Diagnosis:
         next=tuple(propose(linear, selection)),
         missing=missing,
         linear=linear,
-        notes=notes,
+        notes=selection.notes,
         scatter_limit=limit,
         implausible=beyond,
         unnamed=unnamed,
@@ -116,16 +116,17 @@ def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: Scatt
 
 def _held(
     linear: LinearModel, selection: Selection, left_out: dict[str, CrossValidation | None], limit: ScatterLimit
-) -> tuple[Selection, tuple[str, ...]]:
-    """What is named, held against views left out and halves of the views; and why something is not."""
-    if selection.verdict != "missing_effect":
-        return selection, selection.notes
-    asked = [r for r in (*selection.named, selection.second) if r is not None]
+) -> tuple[Selection, FieldError | None]:
+    """What is named, held against views left out, halves of the views and the scanner's own error, which is returned
+    where it is part of the answer."""
+    if selection.verdict == "missing_effect":
+        asked = [r for r in (*selection.named, selection.second) if r is not None]
 
-    def wrong_anyway() -> bool:
-        return implausible(linear, limit) or bool(unnamed_errors(linear))
+        def wrong_anyway() -> bool:
+            return implausible(linear, limit) or bool(unnamed_errors(linear))
 
-    return validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
+        selection = validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
+    return scanner_first(linear, selection)
 
 
 def linear_model_of(state: State) -> LinearModel:

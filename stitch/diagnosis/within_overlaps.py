@@ -4,7 +4,10 @@ A seam or a ripple in the scanner's field, a corner that is off, a part that cha
 the poses that fit best take only a share of it. Only beside the noise can it be seen that it is there.
 """
 
+from collections.abc import Sequence
+
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN
+from stitch.model.term import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.noise_floor import noise_floor
 from stitch.observations.surfaces.scanner_field import FieldError, field_error
@@ -28,12 +31,15 @@ def left_within(linear: LinearModel, stated: float | None = None) -> float:
     return left if left > noise else 0.0
 
 
-def scanner_error(linear: LinearModel) -> FieldError | None:
+def scanner_error(linear: LinearModel, beside: Sequence[Term] = ()) -> FieldError | None:
     """The scanner's error over its field where it is larger than every scanner's; None where overlaps show no such.
 
     It may be small beside the noise: many points average that, and not what is the same in every view.
+
+    Args:
+        beside: effects of points that may have any size.
     """
     if not isinstance(linear.observation, Surfaces):
         return None
-    found = field_error(linear.measurement, linear.observation.freed, ALPHA_UNKNOWN)
+    found = field_error(linear.measurement, linear.model, linear.observation.freed, ALPHA_UNKNOWN, beside)
     return found if found.unusual else None

@@ -17,8 +17,8 @@ ON_ONE_VIEW = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.
 def told(found: CrossValidation, p: float, wrong_anyway: bool = False) -> tuple[str, tuple[str, ...]]:
     named = Ranked(SimpleNamespace(name="backlash"), adjusted=p, log_posterior=5.0, posterior=0.99)
     selection = Selection("missing_effect", (named,), (named,), ())
-    upheld, notes = validated(selection, {"backlash": found}, {"backlash": None}, lambda: wrong_anyway)
-    return upheld.verdict, notes
+    upheld = validated(selection, {"backlash": found}, {"backlash": None}, lambda: wrong_anyway)
+    return upheld.verdict, upheld.notes
 
 
 def test_a_name_that_holds_stays():

@@ -43,7 +43,7 @@ def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
     """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""
     measured = repeated(share, 0)
     linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
-    found = field_error(linear.measurement, linear.observation.freed, 0.01)
+    found = field_error(linear.measurement, linear.model, linear.observation.freed, 0.01)
     assert (found.unusual, found.over_noise) == (unusual, over_noise)
     assert found.rms < 2 * share * load_scene("drill-plate").scanner.noise
     assert not unusual or found.rms > 0.3 * share * load_scene("drill-plate").scanner.noise

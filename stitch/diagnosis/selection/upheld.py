@@ -15,7 +15,7 @@ def validated(
     found: dict[str, CrossValidation | None],
     in_halves: dict[str, Halves | None],
     wrong_anyway: Callable[[], bool],
-) -> tuple[Selection, tuple[str, ...]]:
+) -> Selection:
     """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
     one may be.
 
@@ -23,7 +23,7 @@ def validated(
     then something is there, of another form.
     """
     if selection.verdict != "missing_effect":
-        return selection, selection.notes
+        return selection
     notes = list(selection.notes)
     for named in (selection.named[0], selection.second):
         if named is None:
@@ -31,13 +31,13 @@ def validated(
         refusal = _refused(named, found.get(named.name), in_halves.get(named.name))
         if refusal is None:
             if named is selection.named[0]:
-                return selection, selection.notes
-            return replace(selection, named=(named,), second=None), tuple(notes)
+                return selection
+            return replace(selection, named=(named,), second=None, notes=tuple(notes))
         notes.append(refusal)
     something = selection.named[0].adjusted < BEYOND_CHANCE or wrong_anyway()
     verdict = "unknown_effect" if something else "adequate"
-    nothing = Selection(verdict, (), selection.ranked, selection.empirical)
-    return nothing, tuple(notes[: len(selection.notes) + 1])
+    kept = tuple(notes[: len(selection.notes) + 1])
+    return Selection(verdict, (), selection.ranked, selection.empirical, notes=kept)
 
 
 def _refused(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:

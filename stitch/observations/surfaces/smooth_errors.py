@@ -1,0 +1,64 @@
+"""Smooth errors along the ray of a scanner, over its field and over incidence, and what they do to the overlaps."""
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from stitch.frames import Array, Indices
+from stitch.measurement.measurement import Measurement
+from stitch.model.point_slopes import PointSlopes
+from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.point_gram import PointGram, streamed
+
+_DEGREE = 3
+# Corners are seen by few points.
+_REACH = 0.98
+
+
+def smooth_sums(
+    measurement: Measurement, freed: FreePoses, beside: PointSlopes | None = None
+) -> tuple[PointGram, float]:
+    """Sums of K smooth errors of unit size along the ray, then of what is beside them, and the noise; NaN without
+    scans."""
+    capture, half = measurement.capture, _half_field(measurement)
+
+    def of_points(v: int, index: Indices) -> Array:
+        smooth = _undone(capture.scans[v].points[index], measurement.scan_views[v].cosine[index], half)
+        if beside is None or not beside.steps:
+            return smooth
+        return np.concatenate([smooth, beside.at(v, freed.poses[v], index)])
+
+    def of_targets() -> Array:
+        assert capture.sightings is not None
+        points = capture.sightings.points
+        seen = capture.sightings.target >= 0
+        # An empty slot has no ray; nobody knows at what slant a target was seen.
+        flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
+        moved = _undone(flat, np.ones(len(flat)), half).reshape(-1, *points.shape)
+        smooth = np.where(seen[..., None], moved, 0.0)
+        if beside is None or not beside.steps:
+            return smooth
+        return np.concatenate([smooth, beside.at_targets(freed.poses)])
+
+    sums = streamed(freed, capture.noise_factor, of_points, of_targets)
+    return sums, float(np.nanmedian([scan.noise for scan in capture.scans]))
+
+
+def _half_field(measurement: Measurement) -> Array:
+    """(2,) x/z and y/z up to which the scanner sees."""
+    slopes = np.concatenate([np.abs(scan.points[:, :2] / scan.points[:, 2:]) for scan in measurement.capture.scans])
+    return np.asarray(np.maximum(np.quantile(slopes, _REACH, axis=0), 1e-6))
+
+
+def _undone(points: Array, cosine: Array, half: Array) -> Array:
+    """(K, N, 3) what undoes smooth errors along the rays of points (N, 3), scanner frame, per unit.
+
+    Legendre products over the field, of unit rms together, and the slope with incidence.
+    """
+    a, b = np.clip(points[:, :2] / points[:, 2:] / half, -1.2, 1.2).T
+    powers = [legendre.legvander(x, _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1) for x in (a, b)]
+    orders = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1) if 0 < i + j <= _DEGREE]
+    weights = np.array([1.0 / (i + j) for i, j in orders])
+    weights /= np.linalg.norm(weights)
+    smooth = [w * powers[0][:, i] * powers[1][:, j] for w, (i, j) in zip(weights, orders, strict=True)]
+    rays = points / np.linalg.norm(points, axis=1)[:, None]
+    return np.asarray(-np.array([*smooth, 1 / cosine - 1])[..., None] * rays)
