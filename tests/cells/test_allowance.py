@@ -76,7 +76,7 @@ def test_an_even_allowance_is_found_and_the_pose_stays(casting, blade_cad):
     assert abs(found.allowance.value - STOCK) < 4 * found.allowance.sigma < 0.005
     off = error(found, T, blade_cad)
     assert off @ np.linalg.solve(found.covariance, off) < 27.9  # χ² of 6, chance 1e-4
-    assert "plus: stock outside" in allowance_sentence(found.allowance)
+    assert "plus: stock outside" in allowance_sentence(found.allowance, "mm")
 
 
 def test_too_little_stock_is_minus(blade, blade_cad):
@@ -161,7 +161,7 @@ def test_what_a_shift_imitates_is_no_allowance(box_cad):
     stated = fit(joined, box_cad, np.eye(4), wanted=Wanted(known=STOCK))
     assert np.abs(stated.T_base_part - np.eye(4)).max() < 0.01
     assert stated.allowance.value == STOCK
-    assert "as stated" in allowance_sentence(stated.allowance)
+    assert "as stated" in allowance_sentence(stated.allowance, "mm")
 
 
 def test_an_opposite_side_tells_it(box_cad):

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cells.drilling.camera_effects import Trial
 from stitch.cells.drilling.drill_job import Job
+from stitch.cells.drilling.drill_sentences import found_effects, worth
 from stitch.cells.drilling.drill_solution import Drive, JobResult
 from stitch.frames import transform
-from stitch.units import known_text
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
 from viz.cells.page import Page, Picture, Table, write
@@ -26,8 +25,9 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     if len(result.leave_one_out_errors):
         caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
         pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
-    words = (sentence(job, result), job.file, _about(job))
-    write(Page("Drilling", *words, pictures, _tables(job, result), notes=_notes(result, job.length_unit)), path)
+    words = (worth(result, job.length_unit), job.file, _about(job))
+    notes = list(found_effects(result, job.length_unit))
+    write(Page("Drilling", *words, pictures, _tables(job, result), notes=notes), path)
 
 
 def _about(job: Job) -> list[Row]:
@@ -39,35 +39,6 @@ def _about(job: Job) -> list[Row]:
         ("Arm", "not stated"),
         ("Sensor", f"camera on the flange, by a plate of {len(job.plate_uv)} holes{rangers}"),
     ]
-
-
-def sentence(job: Job, result: JobResult) -> str:
-    """What the correction is worth."""
-    before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
-    after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
-    return (
-        f"{len(result.drives)} holes to drill in {len(result.groups)} groups. By the drawing the drives miss the "
-        f"reference holes by {before.min():.2f} to {before.max():.2f} {job.length_unit}; after the correction "
-        f"{after.max():.2f} {job.length_unit} at most is left."
-    )
-
-
-def _camera(found: Trial, length_unit: str) -> str:
-    """What an effect of the camera is, and its size."""
-    if found.effect == "plate_height":
-        return f"The plate of holes is {known_text(found.value, found.sigma)} {length_unit} off its stated height"
-    size = known_text(100 * found.value, 100 * found.sigma)
-    return f"The lens shifts the image's corners by {size} % of their way from its middle"
-
-
-def _notes(result: JobResult, length_unit: str) -> list[str]:
-    found = [t for t in (result.effects.trials if result.effects else ()) if t.accepted]
-    out = [f"{_camera(t, length_unit)} (1 σ; p = {t.p_value:.1g}). That is taken out." for t in found]
-    tool = result.tool_axis
-    if tool is not None and tool.accepted:
-        tilt, sigma = np.degrees([tool.tilt, tool.sigma])
-        out.append(f"The tool's true axis lies {tilt:.2f} ± {sigma:.2f}° off its frame's z; the drives take it up.")
-    return out
 
 
 def _tables(job: Job, result: JobResult) -> list[Table]:
@@ -112,8 +83,9 @@ def record(job: Job, result: JobResult, path: Path) -> None:
 
 
 def _words(job: Job, result: JobResult) -> str:
-    notes = "\n".join(f"- {note}" for note in _notes(result, job.length_unit))
+    notes = "\n".join(f"- {note}" for note in found_effects(result, job.length_unit))
     return (
-        f"# Drilling\n\n{sentence(job, result)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as measured. Green: "
-        f"corrected drives. Red and green arrows: errors before and after, {magnified(job, result):g} times larger."
+        f"# Drilling\n\n{worth(result, job.length_unit)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as "
+        "measured. Green: corrected drives. Red and green arrows: errors before and after, "
+        f"{magnified(job, result):g} times larger."
     )

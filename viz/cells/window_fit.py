@@ -8,6 +8,7 @@ import rerun as rr
 from stitch import frames
 from stitch.cells.window.allowance import allowance_sentence
 from stitch.cells.window.deviation import Deviations
+from stitch.cells.window.fit_sentences import agreement, with_unit
 from stitch.cells.window.window_jobs import FitJob
 from stitch.cells.window.window_solution import Part
 from stitch.comparison.plain_verdict import Judged
@@ -30,7 +31,7 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
         cad = "the CAD" if part.fit.allowance is None else "the CAD with its allowance"
         caption = (
             "The scan on the CAD, seen along the part's thinnest axis, outer and inner side alike. Red stands outside "
-            f"{cad}, blue inside; full colour is the tolerance of {_told(job, f'{job.tolerance:g}')}. Black rings: "
+            f"{cad}, blue inside; full colour is the tolerance of {with_unit(job, f'{job.tolerance:g}')}. Black rings: "
             f"cells of the map whose mean is beyond it.{named}"
         )
         pictures.append(Picture(f"Deviation map{of}", deviation_map(part.deviations, unit), caption, pixels=True))
@@ -40,16 +41,11 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
     write(Page("Scan onto CAD", *words, pictures, _tables(job, parts), light=_light(job, parts)), path)
 
 
-def _told(job: FitJob, size: str) -> str:
-    """A length with its unit, where that is known."""
-    return f"{size} {job.length_unit}" if job.length_unit else size
-
-
 def _light(job: FitJob, parts: list[Part]) -> Judged:
     bad, cells = (sum(int(x) for x in own) for own in zip(*map(_counts, parts), strict=True))
     if not bad:
-        return Judged("good", f"Within {_told(job, f'{job.tolerance:g}')}: all {cells} cells of the map.")
-    allowed = _told(job, f"{job.tolerance:g}")
+        return Judged("good", f"Within {with_unit(job, f'{job.tolerance:g}')}: all {cells} cells of the map.")
+    allowed = with_unit(job, f"{job.tolerance:g}")
     return Judged("bad", f"Not within {allowed}: {bad} of {cells} cells of the map are beyond it.")
 
 
@@ -61,8 +57,8 @@ def _about(job: FitJob) -> list[Row]:
     return [
         ("Measured", f"{len(job.placed.names)} scans, {len(job.scan.points):,} points"),
         ("Arm", "not stated"),
-        ("Scanner", f"noise {_told(job, f'{job.scan.noise:.2g}')} as the scans show it"),
-        ("CAD", f"{job.cad_file.name}, {_told(job, f'{job.cad.size:.4g}')} across"),
+        ("Scanner", f"noise {with_unit(job, f'{job.scan.noise:.2g}')} as the scans show it"),
+        ("CAD", f"{job.cad_file.name}, {with_unit(job, f'{job.cad.size:.4g}')} across"),
         ("Parts in the scan", str(job.instances)),
     ]
 
@@ -71,22 +67,9 @@ def sentence(job: FitJob, parts: list[Part]) -> str:
     """What was found and how it compares."""
     sentences = []
     for i, part in enumerate(parts):
-        bad, cells = part.deviations.outside, part.deviations.cells
-        name = f"Part {i + 1}" if len(parts) > 1 else "The part"
-        where = f"its points scatter about the CAD by {_told(job, f'{part.fit.scale:.3f}')} (1 σ)"
-        if bad.any():
-            worst = float(cells.mean[int(np.argmax(np.abs(cells.mean)))])
-            sentences.append(
-                f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by "
-                f"{_told(job, f'{worst:+.2f}')} at most."
-            )
-        else:
-            sentences.append(
-                f"{name} is found; {where}, and all {len(bad)} cells of the map are within "
-                f"{_told(job, f'{part.deviations.tolerance:g}')}."
-            )
+        sentences.append(agreement(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
         if part.fit.allowance is not None:
-            sentences.append(allowance_sentence(part.fit.allowance))
+            sentences.append(allowance_sentence(part.fit.allowance, job.length_unit))
     return " ".join(sentences)
 
 

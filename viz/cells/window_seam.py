@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.window.seam import Limits, Seam, Station
+from stitch.cells.window.seam import VERDICTS, Limits, Seam, Station
+from stitch.cells.window.seam_sentences import limits_text, stations_sentence
 from stitch.cells.window.window_jobs import SeamJob
 from stitch.comparison.plain_verdict import Judged
 from stitch.frames import Array
@@ -16,7 +17,7 @@ from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
 from viz.identity import Row
 
-VERDICTS = {"good": GREEN, "bad": ORANGE, "open": YELLOW, "not measured": DARK}
+_COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, YELLOW, DARK), strict=True))
 # Half width of a cut along the seam and half its extent across and down, mm.
 _SLICE, _ACROSS, _DOWN = 4.0, 32.0, 14.0
 _RECORDED_POINTS = 300_000
@@ -39,7 +40,7 @@ def write_page(job: SeamJob, seams: list[Seam], path: Path) -> None:
         for s in seams
     ]
     tables = [Table("Stations", ("station", "flush (mm)", "gap (mm)", "verdict", "reason"), rows)]
-    words = (sentence(job.limits, seams), job.file, _about(job))
+    words = (stations_sentence(job.limits, seams), job.file, _about(job))
     write(Page("Seam", *words, pictures, tables, light=_light(seams)), path)
 
 
@@ -59,20 +60,8 @@ def _about(job: SeamJob) -> list[Row]:
         ("Measured", f"{len(job.stations)} stations, {len(job.placed.names)} scans, {len(job.scan.points):,} points"),
         ("Arm", "not stated"),
         ("Scanner", f"noise {job.scan.noise:.2g} mm as the scans show it"),
-        ("Limits", _limits(job.limits)),
+        ("Limits", limits_text(job.limits)),
     ]
-
-
-def _limits(limits: Limits) -> str:
-    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
-    return f"flush {flush} mm, gap {gap} mm"
-
-
-def sentence(limits: Limits, seams: list[Seam]) -> str:
-    """How many stations are good."""
-    counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
-    found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    return f"{len(seams)} stations: {found}. Allowed: {_limits(limits)}."
 
 
 def values(limits: Limits, seams: list[Seam]) -> Figure:
@@ -85,7 +74,7 @@ def values(limits: Limits, seams: list[Seam]) -> Figure:
         ax.axhline(middle, color="0.6", lw=0.8)
         for k, s in enumerate(seams):
             value, sigma = getattr(s, name), getattr(s, f"sigma_{name}")
-            ax.errorbar(k, value, 2 * sigma, fmt="o", color=VERDICTS[s.verdict], capsize=4)
+            ax.errorbar(k, value, 2 * sigma, fmt="o", color=_COLOURS[s.verdict], capsize=4)
         ax.set_xticks(range(len(seams)), [s.station for s in seams])
         ax.set(xlabel="station", ylabel=f"{name} (mm)")
         ax.spines[["top", "right"]].set_visible(False)
@@ -115,7 +104,7 @@ def _draw_cut(ax: Axes, job: SeamJob, station: Station, seam: Seam) -> None:
     near = (np.abs(local) < [_ACROSS, _SLICE, _DOWN]).all(axis=1)
     a, _, h = local[near].T
     ax.scatter(a, h, s=2, c=np.where(a < 0, BLUE, DARK), lw=0)
-    colour = VERDICTS[seam.verdict]
+    colour = _COLOURS[seam.verdict]
     for edge in (seam.inner, seam.outer):
         if edge is not None:
             ax.plot(*edge, "o", color=colour, ms=5, mec="white")
@@ -136,10 +125,10 @@ def loop(job: SeamJob, seams: list[Seam]) -> Figure:
     ax.plot(*np.vstack([flat, flat[:1]]).T, color="0.8", lw=1, ls=":")
     for at, station, seam in zip(flat, job.stations, seams, strict=True):
         towards = axes_of_plane @ station.across * reach
-        ax.plot(*np.array([at - towards, at + towards]).T, color=VERDICTS[seam.verdict], lw=3, solid_capstyle="round")
+        ax.plot(*np.array([at - towards, at + towards]).T, color=_COLOURS[seam.verdict], lw=3, solid_capstyle="round")
         ax.annotate(seam.station, at + 1.9 * towards, ha="center", va="center", fontsize=11)
     for verdict in dict.fromkeys(s.verdict for s in seams):
-        ax.plot([], [], color=VERDICTS[verdict], lw=3, label=verdict)
+        ax.plot([], [], color=_COLOURS[verdict], lw=3, label=verdict)
     ax.set(aspect="equal", xlabel="in the plane of the stations (mm)", ylabel="upwards in it (mm)")
     ax.margins(0.15)
     ax.legend(frameon=False, loc="center")
@@ -160,11 +149,11 @@ def record(job: SeamJob, seams: list[Seam], path: Path) -> None:
     """Base frame: scanned points, station frames, the gap as a line between its edges, verdicts as labels."""
     points = job.scan.points
     pick = np.linspace(0, len(points) - 1, min(len(points), _RECORDED_POINTS)).astype(int)
-    words = f"# Seam\n\n{sentence(job.limits, seams)}\n\nThe lines across the seam run from edge to edge."
+    words = f"# Seam\n\n{stations_sentence(job.limits, seams)}\n\nThe lines across the seam run from edge to edge."
     with stage.stage(path, "Seam", words) as recording:
         stage.points(recording, "scan", points[pick], [stage.GREY], 0.35)
         for station, seam in zip(job.stations, seams, strict=True):
-            T, colour = job.T_base_part @ station.T_part_station, _rgb(VERDICTS[seam.verdict])
+            T, colour = job.T_base_part @ station.T_part_station, _rgb(_COLOURS[seam.verdict])
             stage.frame(recording, f"stations/{seam.station}", T, 12.0)
             if seam.inner is not None and seam.outer is not None:
                 edges = np.array([[edge[0], 0.0, edge[1]] for edge in (seam.inner, seam.outer)])

@@ -45,11 +45,14 @@ def _print(result: BaseResult) -> None:
     for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
         table.add_column(heading)
     table.add_row("least squares", *_pose(solution.T_base1_base2))
-    table.add_row("  sigma", _numbers(solution.sigma[3:], 5), _numbers(solution.sigma[:3], 6))
+    table.add_row("  1 σ", _numbers(solution.sigma[3:], 5), _numbers(solution.sigma[:3], 6))
     if result.projection is not None:
         table.add_row("projection", *_pose(result.projection.T_base1_base2))
     terminal.print(table)
-    terminal.print(f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings.")
+    terminal.print(
+        f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings, p = "
+        f"{solution.p_value:.2g}."
+    )
     for comparison in result.comparisons:
         terminal.print(describe(comparison, unit) + ".")
     if result.no_projection:
@@ -63,4 +66,4 @@ def _pose(T: np.ndarray) -> tuple[str, str]:
 
 
 def _numbers(values: np.ndarray, digits: int) -> str:
-    return "  ".join(f"{value:.{digits}f}" for value in values)
+    return "  ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)

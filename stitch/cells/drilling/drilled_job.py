@@ -4,11 +4,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 from stitch.cells.drilling import hole_session
 from stitch.cells.drilling.drill_job import read_job
 from stitch.cells.drilling.drill_output import document, write_drives
+from stitch.cells.drilling.drill_sentences import effects_not_found, found_effects, hand_eye, worth
 from stitch.cells.drilling.drill_solution import JobResult, solve_job
 from stitch.cells.outputs import show
 from stitch.system.console import console
@@ -33,45 +35,40 @@ def drilled_job(
     if as_json:
         print(json.dumps(document(result), indent=1))
     else:
-        _print(result, job.length_unit)
+        _print(console(), result, job.length_unit)
+        if output is not None:
+            print(output)
 
 
-def _print(result: JobResult, unit: str) -> None:
-    terminal = console()
-    if len(result.leave_one_out_errors):
-        sizes = np.linalg.norm(result.leave_one_out_errors, axis=1)
-        terminal.print(f"Homography, one hole left out: mean {sizes.mean():.3f}, largest {sizes.max():.3f} {unit}.")
-    for name, c in result.groups.items():
-        errors, residuals = (np.linalg.norm(values, axis=1) for values in (c.errors, c.residuals))
-        terminal.print(
-            f"Group {name}: drive errors {errors.min():.3f} to {errors.max():.3f} {unit} at {len(errors)} reference "
-            f"holes; {residuals.max():.3f} {unit} at most are left."
-        )
-    for trial in result.effects.trials if result.effects else ():
-        verdict = "found" if trial.accepted else "not found"
-        terminal.print(
-            f"{trial.effect}: {verdict}, {trial.value:.4g} ± {trial.sigma:.2g} (F {trial.F:.1f}, "
-            f"p {trial.p_value:.1e}, BIC {trial.bic_change:+.1f})."
-        )
-    if (tool := result.tool_axis) is not None:
-        verdict = "found" if tool.accepted else "not found"
-        terminal.print(
-            f"tool axis: {verdict}, {np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}° off z "
-            f"(p {tool.p_value:.1e})."
-        )
-    for name, r in result.rangers.items():
-        terminal.print(
-            f"Ranger {name}: origin {_numbers(r.origin)}, direction {_numbers(r.direction)}, rms {r.rms:.3f}."
-        )
-    table = Table(title="Drives", title_justify="left")
+def _print(terminal: Console, result: JobResult, unit: str) -> None:
+    terminal.print(worth(result, unit))
+    for line in (*hand_eye(result, unit), *found_effects(result, unit), *effects_not_found(result)):
+        terminal.print(line)
+    if result.rangers:
+        terminal.print(_rangers(result, unit))
+    terminal.print(_drives(result, unit))
+
+
+def _rangers(result: JobResult, unit: str) -> Table:
+    table = Table(title="Beams of the range sensors, in the frame of the flange", title_justify="left")
+    for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
+        table.add_column(heading)
+    for name, beam in result.rangers.items():
+        table.add_row(name, _numbers(beam.origin, 3), _numbers(beam.direction, 4), f"{beam.rms:.3f}")
+    return table
+
+
+def _drives(result: JobResult, unit: str) -> Table:
+    """Corrected poses of the tool, and how far each went from where the drawing has it."""
+    table = Table(title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
     for heading in ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}"):
         table.add_column(heading)
     for drive in result.drives:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
-        angles = _numbers(np.degrees(drive.angles), 3)
-        table.add_row(drive.hole.name, drive.hole.group, _numbers(drive.position, 3), angles, f"{shift:.3f}")
-    terminal.print(table)
+        place, angles = _numbers(drive.position, 3), _numbers(np.degrees(drive.angles), 3)
+        table.add_row(drive.hole.name, drive.hole.group, place, angles, f"{shift:.3f}")
+    return table
 
 
-def _numbers(values: np.ndarray, digits: int = 4) -> str:
+def _numbers(values: np.ndarray, digits: int) -> str:
     return " ".join(f"{value:.{digits}f}" for value in values)

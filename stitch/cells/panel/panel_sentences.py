@@ -14,8 +14,8 @@ def leg_sentence(o: LegOffset) -> str:
     """A leg whose length its controller does not know."""
     doubt = "" if o.chi_square_drop - o.runner_up_drop > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
     return (
-        f"Leg {o.leg} of robot {o.robot} is {o.offset:+.3f} ± {o.sigma:.3f} mm longer than its controller believes"
-        f"{doubt}. It is taken out of the model and put into the commands."
+        f"Leg {o.leg} of robot {o.robot} is {o.offset:+.3f} ± {o.sigma:.3f} mm (1 σ) longer than its controller "
+        f"believes{doubt}. It is taken out of the model and put into the commands."
     )
 
 

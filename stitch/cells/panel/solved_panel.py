@@ -45,7 +45,7 @@ def solved_panel(
 
 
 def _print_model(terminal: Console, result: JobResult) -> None:
-    table = Table(title="Global model", title_justify="left")
+    table = Table(title="Robots and tracker in one model: 1 σ of the worst axis", title_justify="left")
     for heading in ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p"):
         table.add_column(heading)
     for model in result.models:
@@ -74,19 +74,22 @@ def _print_legs(terminal: Console, result: JobResult) -> None:
 def _print_moves(terminal: Console, job: Job, result: JobResult) -> None:
     shift, turn = (errors.position[:, -1].max() for errors in (result.errors.shift, result.errors.turn))
     terminal.print(
-        f"Slaves against {job.robots[job.master]}, worst rms to expect: {shift:.3f} mm after 100 mm, {turn:.3f} mm "
-        "after 2°."
+        f"With {job.robots[job.master]} as master, the others are off by {shift:.3f} mm rms at most after a shift by "
+        f"100 mm, {turn:.3f} mm after a turn by 2°."
     )
     worst = result.errors.by_master.max(axis=1)
     best = int(np.argmin(worst))
     if worst[best] < 0.9 * worst[job.master]:
         terminal.print(
-            f"As master {job.robots[best]} would leave {worst[best]:.3f} mm instead of {worst[job.master]:.3f}."
+            f"{job.robots[best]} as master would leave {worst[best]:.3f} mm instead of {worst[job.master]:.3f} mm."
         )
     if result.pose_error is not None:
         x, y, z = result.pose_error[3:]
-        turns = " ".join(f"{value:+.4f}" for value in np.degrees(result.pose_error[:3]))
-        terminal.print(f"Panel off its target by x {x:+.3f}, y {y:+.3f}, z {z:+.3f} mm and {turns} °.")
+        a, b, c = np.degrees(result.pose_error[:3])
+        terminal.print(
+            f"Panel off its target by x {x:+.3f}, y {y:+.3f}, z {z:+.3f} mm, turned about x {a:+.4f}, y {b:+.4f}, "
+            f"z {c:+.4f}°, in the panel's frame."
+        )
     if (shape := shape_sentence(job, result)) is not None:
         terminal.print(shape)
     if job.forces is not None:

@@ -87,14 +87,16 @@ def columns(points: Array, cad: Surface, wanted: Wanted) -> Array:
     return np.column_stack([ones, *(x[:, i] * y[:, j] * z[:, k] for i, j, k in _ORDERS)])
 
 
-def allowance_sentence(found: Allowance) -> str:
-    """Its size with sigma, and what the sign means."""
+def allowance_sentence(found: Allowance, length_unit: str | None) -> str:
+    """Its size with sigma, and what the sign means; None: nobody says in which unit."""
+    unit = f" {length_unit}" if length_unit else ""
     if not found.wanted.free:
-        return f"Allowance {found.value:+.4g} as stated (plus: stock outside the CAD)."
-    size = f"Allowance {found.value:+.4f} ± {found.sigma:.4f} (1 σ; plus: stock outside the CAD)"
+        return f"Allowance {found.value:+.4g}{unit} as stated (plus: stock outside the CAD)."
+    size = f"Allowance {found.value:+.4f} ± {found.sigma:.4f}{unit} (1 σ; plus: stock outside the CAD)"
     if found.wanted.varying:
         size += (
-            f", from {found.lowest:+.4f} to {found.highest:+.4f} over the scan, each ± {found.sigma_field:.4f} at most"
+            f", from {found.lowest:+.4f} to {found.highest:+.4f}{unit} over the scan, each ± "
+            f"{found.sigma_field:.4f}{unit} at most"
         )
     if found.told < FAINT:
         size += f"; only {found.told:.1%} of it is told from a motion of the part, so that errors of form weigh in it"

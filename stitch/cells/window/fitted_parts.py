@@ -4,13 +4,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from stitch.cells.outputs import show
 from stitch.cells.window import scan_session
-from stitch.cells.window.allowance import allowance_sentence, read_allowance
-from stitch.cells.window.window_jobs import read_fit_job
+from stitch.cells.window.allowance import read_allowance
+from stitch.cells.window.fit_sentences import NO_UNIT, agreement, details
+from stitch.cells.window.window_jobs import FitJob, read_fit_job
 from stitch.cells.window.window_solution import Part, fit_document, fit_parts, write_fit
 from stitch.system.console import console
 from stitch.writing.session_files import write_session
@@ -41,37 +41,15 @@ def fitted_parts(
     if as_json:
         print(json.dumps(fit_document(job, parts), indent=1))
         return
-    terminal = console()
-    for i, part in enumerate(parts):
-        _print(terminal, i + 1, part)
+    _print(console(), job, parts)
     for name in written:
         print(f"{output}/{name}")
 
 
-def _print(terminal: Console, number: int, part: Part) -> None:
-    found, cells = part.fit, part.deviations.cells
-    x, y, z = found.T_base_part[:3, 3]
-    terminal.print(
-        f"Part {number}: origin {x:.3f} {y:.3f} {z:.3f} in the base, σ {found.sigma[3:].max():.4f} and "
-        f"{np.degrees(found.sigma[:3]).max():.5f}°; distances {found.scale:.3f} robust, {found.rms:.3f} rms."
-    )
-    if found.allowance is not None:
-        terminal.print(f"  {allowance_sentence(found.allowance)}")
-    if part.start.runner_up > 0.9 * part.start.share:
-        terminal.print(
-            f"  Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part "
-            "is nearly symmetric, or too little of it was scanned."
-        )
-    bad = part.deviations.outside
-    if bad.any():
-        worst = int(np.argmax(np.abs(cells.mean)))
-        at = " ".join(f"{value:.0f}" for value in cells.middle[worst])
-        terminal.print(
-            f"  {bad.sum()} of {len(bad)} cells beyond {part.deviations.tolerance:g}; worst "
-            f"{cells.mean[worst]:+.2f} at {at}."
-        )
-    else:
-        terminal.print(f"  All {len(bad)} cells within {part.deviations.tolerance:g}.")
-    for name, count in part.forbidden.items():
-        if count:
-            terminal.print(f"  {count} points in forbidden region {name}; they did not count.")
+def _print(terminal: Console, job: FitJob, parts: list[Part]) -> None:
+    for i, part in enumerate(parts):
+        terminal.print(agreement(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
+        for line in details(job, part):
+            terminal.print(f"  {line}")
+    if job.length_unit is None:
+        terminal.print(NO_UNIT)

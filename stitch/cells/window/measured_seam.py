@@ -10,6 +10,7 @@ from rich.table import Table
 from stitch.cells.outputs import show
 from stitch.cells.window import scan_session
 from stitch.cells.window.seam import Limits, Seam
+from stitch.cells.window.seam_sentences import stations_sentence
 from stitch.cells.window.window_jobs import read_seam_job
 from stitch.cells.window.window_solution import solve_seam, write_seam
 from stitch.system.console import console
@@ -41,8 +42,7 @@ def measured_seam(
 
 
 def _print(seams: list[Seam], limits: Limits) -> None:
-    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
-    table = Table(title=f"Flush {flush} mm, gap {gap} mm", title_justify="left")
+    table = Table(title="Stations, ± 1 σ", title_justify="left")
     for heading in ("station", "flush / mm", "gap / mm", "verdict"):
         table.add_column(heading)
     for s in seams:
@@ -50,4 +50,6 @@ def _print(seams: list[Seam], limits: Limits) -> None:
         table.add_row(
             s.station, *(("", "") if s.reason else values), f"{s.verdict}{': ' if s.reason else ''}{s.reason}"
         )
-    console().print(table)
+    terminal = console()
+    terminal.print(stations_sentence(limits, seams))
+    terminal.print(table)

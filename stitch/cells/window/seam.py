@@ -13,6 +13,7 @@ from stitch.frames import Array
 
 # Width of the strip along the seam that is fitted, and how far across and down it reaches, mm.
 _ALONG, _ACROSS, _DEPTH = 12.0, 40.0, 20.0
+VERDICTS = ("good", "bad", "open", "not measured")
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Seam:
     gap: float = np.nan  # between the edges, along `across`
     sigma_flush: float = np.nan
     sigma_gap: float = np.nan
-    verdict: str = "not measured"  # or "good", "bad", "open"
+    verdict: str = "not measured"  # of VERDICTS
     reason: str = ""
     inner: tuple[float, float] | None = None  # its edge: across and outwards in the station's frame
     outer: tuple[float, float] | None = None
