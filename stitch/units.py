@@ -79,6 +79,8 @@ class Amount(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
+        if self.unit == "view":
+            return f"view {self.value}, counted from 0"
         known = "" if self.sigma == "–" else f" ± {self.sigma}"
         return f"{self.value}{known}{'' if self.unit in ('', '1') else f' {self.unit}'}"
 

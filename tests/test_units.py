@@ -25,7 +25,7 @@ def test_numbers_end_where_their_sigma_begins():
         (1.2e-3, 4e-4, "m/h", "1.2 ± 0.4 mm/h"),
         (-3e-3, 1e-3, "m", "-3 ± 1 mm"),
         (600.0, None, "s", "600 s"),
-        (12.0, float("nan"), "view", "12 view"),
+        (12.0, float("nan"), "view", "view 12, counted from 0"),
     ],
 )
 def test_parameters_of_effects_are_in_mrad(value, sigma, unit, told):

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, binned, values_of_views, view_properties
+from stitch.comparison.tables import PLACE, Comparison, Table, binned, values_of_views, view_properties
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.gram import RMS_GATE
@@ -151,4 +151,4 @@ def _regions(rows: _Rows) -> Table:
     used, bins = np.unique(bins, return_inverse=True)
     centre = [low + (np.array(np.unravel_index(b, (_PLACES,) * 3)) + 0.5) / _PLACES * (high - low) for b in used]
     labels = [f"({c[0]:.4g}, {c[1]:.4g}, {c[2]:.4g})" for c in centre]
-    return _labelled(rows, "place on the part", bins.astype(np.int64), labels)
+    return _labelled(rows, PLACE, bins.astype(np.int64), labels)

@@ -7,6 +7,7 @@ import numpy as np
 from stitch.frames import Array, Indices
 from stitch.measurement.views import Views
 
+PLACE = "place on the part"
 _BINS = 6
 _FAIR = 50  # correspondences of a bin that may be called the worst
 

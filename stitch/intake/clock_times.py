@@ -1,52 +1,84 @@
-"""Times of day as tables have them, 09:14:13 with a date or without, as seconds."""
+"""Times of day as tables have them, 09:14:13 with a date or without, as seconds; what cannot be told is said."""
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
 
 from stitch.frames import Array
 
-_CLOCK = re.compile(r"(?:(?P<date>[\d.\-/]+)[T ]+)?(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}(?:[.,]\d+)?))?Z?")
-_YEAR_FIRST, _DAY_FIRST = (
-    re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})"),
-    re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})"),
+_CLOCK = re.compile(
+    r"(?:(?P<date>[\d.\-/]+)[T ]+)?(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}(?:[.,]\d+)?))?(?: ?(?P<half>[AP]M)|Z)?",
+    re.IGNORECASE,
 )
-_DAY_S = 86400.0
+_YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")
+_YEAR_LAST = re.compile(r"(\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{2})")
+_DAY_S, _CENTURY = 86400.0, 2000
+DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
 
 
-def seconds_of(cells: Sequence[str]) -> Array | None:
-    """Seconds (n,) since the first; None where a cell is no time, or where they run backwards.
+@dataclass(frozen=True)
+class ClockTimes:
+    """A column of times of day."""
 
-    A date that may begin with its day or its month is no time; nor are times without a date that pass midnight.
+    seconds: Array | None  # (n,) since the first; None where they are left out
+    words: str  # how dates were read, or why times are left out; empty where nothing is to be said
+
+
+def clock_times(cells: Sequence[str]) -> ClockTimes | None:
+    """Read a column; None where a cell is no time, or where all are the same.
+
+    Dates whose order nobody states are read both ways. What runs backwards one way is read the other way.
     """
-    told = [_seconds(cell.strip()) for cell in cells]
+    both = [_since_first(cells, day_first) for day_first in (True, False)]
+    known = [seconds for seconds in both if seconds is not None]
+    if not known or all(s[-1] == s[0] and (np.diff(s) == 0).all() for s in known):
+        return None
+    forwards = [seconds for seconds in known if (np.diff(seconds) >= 0).all()]
+    if not forwards:
+        return ClockTimes(None, "times of day run backwards and are left out; to fix: write the date beside them")
+    if len(forwards) == 2 and not np.array_equal(forwards[0], forwards[1]):
+        return ClockTimes(
+            None,
+            f"times are left out, as {cells[0].strip()} may begin with the day or the month; to fix: write dates as "
+            "2026-12-31",
+        )
+    alike = len(known) == 2 and np.array_equal(known[0], known[1])
+    words = "" if alike else DAY_FIRST if forwards[0] is both[0] else MONTH_FIRST
+    return ClockTimes(forwards[0], words)
+
+
+def _since_first(cells: Sequence[str], day_first: bool) -> Array | None:
+    told = [_seconds(cell.strip(), day_first) for cell in cells]
     if not told or any(t is None for t in told):
         return None
-    seconds = np.array(told, float)
-    return None if (np.diff(seconds) < 0).any() or seconds[-1] == seconds[0] else seconds - seconds[0]
+    seconds: Array = np.array(told, float)
+    return np.asarray(seconds - seconds[0])
 
 
-def _seconds(cell: str) -> float | None:
+def _seconds(cell: str, day_first: bool) -> float | None:
     found = _CLOCK.fullmatch(cell)
     if not found:
         return None
-    day = 0.0
-    if found["date"]:
-        ordinal = _ordinal(found["date"])
-        if ordinal is None:
-            return None
-        day = _DAY_S * ordinal
-    return day + 3600.0 * int(found["h"]) + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
+    day = _ordinal(found["date"], day_first) if found["date"] else 0
+    if day is None:
+        return None
+    hour = int(found["h"])
+    if found["half"]:
+        hour = hour % 12 + 12 * (found["half"].upper() == "PM")
+    return _DAY_S * day + 3600.0 * hour + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
 
 
-def _ordinal(text: str) -> int | None:
-    """Days; None where it is no date."""
+def _ordinal(text: str, day_first: bool) -> int | None:
+    """Days; None where it is no date. With dots the day always stands first."""
     if found := _YEAR_FIRST.fullmatch(text):
         year, month, day = map(int, found.groups())
-    elif found := _DAY_FIRST.fullmatch(text):
-        day, month, year = map(int, found.groups())
+    elif found := _YEAR_LAST.fullmatch(text):
+        first, second, year = int(found[1]), int(found[3]), int(found[4])
+        year += _CENTURY * (len(found[4]) == 2)
+        day, month = (first, second) if day_first or found[2] == "." else (second, first)
     else:
         return None
     try:

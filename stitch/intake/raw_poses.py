@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.clock_times import seconds_of
+from stitch.intake.clock_times import ClockTimes, clock_times
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
 from stitch.reading.text_file import read_text, require_file, shortened
@@ -34,12 +34,17 @@ class RawPoses:
     words: str  # how it was read
 
     @property
-    def time_s(self) -> Array | None:
-        """Seconds (V,) since the first pose, where one of the texts beside the poses is a time of day."""
+    def clock(self) -> ClockTimes | None:
+        """Times of day, where one of the texts beside the poses is one."""
         if len({len(texts) for texts in self.labels}) != 1:
             return None
-        times = [t for column in zip(*self.labels, strict=True) if (t := seconds_of(column)) is not None]
+        times = [t for column in zip(*self.labels, strict=True) if (t := clock_times(column)) is not None]
         return times[0] if len(times) == 1 else None
+
+    @property
+    def time_s(self) -> Array | None:
+        """Seconds (V,) since the first pose, where one of the texts beside the poses is a time of day."""
+        return None if self.clock is None else self.clock.seconds
 
     def renamed(self, names: Sequence[str]) -> "RawPoses":
         """The same with columns named by a person.

@@ -60,6 +60,7 @@ def _columns(raw: RawPoses, decided: Decided, stated: StatedFolder) -> Guess:
     layout = decided.best.way.reading.layout
     beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
     words = f"; beside the poses {', '.join(beside)}" if beside else ""
+    words += f"; {raw.clock.words}" if raw.clock is not None and raw.clock.words else ""
     if stated.columns:
         return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
     reason = ("the file names them" if layout.named else "told by their values") + words

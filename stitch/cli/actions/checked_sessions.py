@@ -2,7 +2,9 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
@@ -32,7 +34,8 @@ def checked(sessions: list[Path], as_json: bool) -> None:
     if as_json:
         emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
     else:
-        _print(facts)
+        for fact in facts:
+            _print(fact)
     for line in errors:
         print(f"stitch: {line}", file=sys.stderr)
     if errors:
@@ -82,10 +85,26 @@ def summary(session: Session) -> dict[str, object]:
     }
 
 
-def _print(facts: list[dict[str, object]]) -> None:
-    terminal = console()
-    for fact in facts:
-        table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
-        for key, value in fact.items():
-            table.add_row(key, ", ".join(value) if isinstance(value, list) else str(value))
-        terminal.print(table)
+def _print(fact: dict[str, Any]) -> None:
+    table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
+    for name, told in _rows(fact):
+        table.add_row(name, told)
+    console().print(table)
+
+
+def _rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The same for people: words for keys, lengths with their unit."""
+    carried = "the scanner" if fact["mount"] == "eye_in_hand" else "the part"
+    yield "mount", f"{fact['mount']}: {carried} sits at the flange"
+    yield "length unit", fact["length_unit"]
+    yield "views", str(fact["views"])
+    if fact["points"]:
+        yield "scanned points", f"{fact['points']:,}"
+    if fact["targets"]:
+        yield "labelled points", f"{fact['targets']} targets, seen {fact['sightings']} times"
+    if fact["median_range"] is not None:
+        yield "distance from the scanner", f"{fact['median_range']:g} {fact['length_unit']}, median"
+    yield "arm", fact["robot"] or "not stated: poses of the flange only"
+    yield "joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"
+    yield "hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: it is found from the scans"
+    yield "beside the poses", ", ".join(fact["covariates"]) or "nothing"

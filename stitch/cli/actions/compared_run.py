@@ -9,7 +9,7 @@ from rich.table import Table as Printed
 from stitch.cli.terminal.streams import emit
 from stitch.comparison.compare_surfaces import compare
 from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.tables import Comparison, Table, comparison_document
+from stitch.comparison.tables import PLACE, Comparison, Table, comparison_document
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
@@ -43,11 +43,11 @@ def show_comparison(found: Comparison, state: State, run: Path) -> None:
     what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
     terminal.print(f"{length_text(found.rms, state.session.length_unit)} rms {what} under the model.")
     for table in found.labelled:
-        _worst(terminal, table, to_um)
+        _worst(terminal, table, _named(table, state), to_um)
     for table in found.places[:_SHOWN]:
         _one(terminal, table, to_um)
     rest = ", ".join(f"{t.name} ({t.clearest:.1f})" for t in found.places[_SHOWN:])
-    terminal.print(f"Less clear (largest mean over its sigma): {rest}.", soft_wrap=True)
+    terminal.print(f"Less clear (largest mean over its σ): {rest}.", soft_wrap=True)
     for file in ("compare.json", "pictures/compare.png"):
         if (run / file).exists():
             terminal.print(f"  {run / file}")
@@ -61,19 +61,29 @@ def write_comparison(state: State, run: Path) -> Comparison:
     return found
 
 
-def _worst(terminal: Console, table: Table, to_um: float) -> None:
+def _named(table: Table, state: State) -> str:
+    """What the rows are; of places, in which unit and frame they are written."""
+    if table.name != PLACE:
+        return table.name
+    frame = "base" if state.session.mount == "eye_in_hand" else "flange"
+    return f"{table.name}, (x, y, z) in {state.session.length_unit} in the frame of the {frame}"
+
+
+def _worst(terminal: Console, table: Table, name: str, to_um: float) -> None:
     told = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"
         + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
         for i in table.worst(_WORST)
     )
-    terminal.print(f"Worst by {table.name} (µm rms): {told}", soft_wrap=True)
+    terminal.print(f"Worst by {name} (µm rms): {told}", soft_wrap=True)
 
 
 def _one(terminal: Console, table: Table, to_um: float) -> None:
     unit = f" ({table.unit})" if table.unit else ""
-    printed = Printed(title=f"{table.name}{unit}: clearest mean {table.clearest:.1f} sigma", title_justify="left")
-    for heading in ("from", "to", "mean (µm)", "± ", "rms (µm)", "count", "views"):
+    printed = Printed(
+        title=f"By {table.name}{unit}: clearest mean {table.clearest:.1f} σ from zero", title_justify="left"
+    )
+    for heading in ("from", "to", "mean (µm)", "± 1 σ", "rms (µm)", "count", "views"):
         printed.add_column(heading, justify="right")
     for i in range(len(table.count)):
         between = [f"{table.low[i]:.4g}", f"{table.high[i]:.4g}"]

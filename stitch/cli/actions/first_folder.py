@@ -18,6 +18,7 @@ from stitch.intake.first_session import FirstSession, first_session
 from stitch.intake.guesses import Guess
 from stitch.intake.session_draft import require_free, write_draft
 from stitch.intake.stated import StatedFolder
+from stitch.system.console import console
 
 # Guesses that are asked for one by one; the fields of `StatedFolder` bear the same names.
 _ASKED = ("rotation", "length_unit", "cloud_unit", "mount")
@@ -73,7 +74,23 @@ def _end(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None
     if as_json:
         emit(json.dumps(_document(out, views, guesses), indent=1))
     print(f"{out / 'session.toml'} and views.csv: {views} views", file=sys.stderr)
+    untold = [guess for guess in guesses if not guess.told]
+    if untold:
+        _warn(out, untold)
     print(f"Next: stitch run {out}", file=sys.stderr)
+
+
+def _warn(out: Path, untold: Sequence[Guess]) -> None:
+    """What was guessed and may be wrong, where it is read last."""
+    terminal = console()
+    terminal.print("NOT TOLD by these files and scans, guessed, and wrong for all that is known:", style="bold red")
+    for guess in untold:
+        terminal.print(f"  {guess.what}: {guess.value}; to state it: {guess.flag}", soft_wrap=True)
+    terminal.print(
+        f"Until that is stated, results of {out} are worth no more than the guess; `stitch check --deep {out}` tries "
+        "the usual mistakes.",
+        soft_wrap=True,
+    )
 
 
 def _tell(guesses: Sequence[Guess]) -> None:
