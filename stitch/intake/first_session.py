@@ -36,6 +36,7 @@ from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.session import Scanner, Session, View
 from stitch.measurement.thinning import thinned
 from stitch.reading.clouds import read_cloud
+from stitch.reading.poses_in_scans import poses_in_scans
 
 # Enough points a view to tell conventions.
 _POINTS = 8000
@@ -93,11 +94,26 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
 
 
 def _raw(found: Found) -> RawPoses:
+    if not found.poses:
+        return _in_headers(found.clouds)
     first = found.poses[0]
     if first.suffix.lower() in PROGRAMS:
         table = parse_number_table(first, import_file(first, "mm").text)
         return RawPoses(str(first), table.header, table.numbers, table.labels, "the points of a robot program")
     return read_raw_poses(found.poses)
+
+
+def _in_headers(clouds: Sequence[Path]) -> RawPoses:
+    poses = poses_in_scans(list(clouds))
+    assert poses is not None  # `look_into` has seen them
+    words = "they may be the scanner's own, of scans that were registered already: then the hand-eye is about unity"
+    return RawPoses(
+        source=f"{clouds[0].name} … {clouds[-1].name}",
+        header=None,
+        numbers=poses.reshape(-1, 16),
+        labels=tuple((cloud.name,) for cloud in clouds),
+        words=words,
+    )
 
 
 def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:

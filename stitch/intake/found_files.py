@@ -12,6 +12,7 @@ from stitch.errors import InputError
 from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
+from stitch.reading.poses_in_scans import poses_in_scans
 
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
 _EITHER = (".txt", ".csv", ".asc")
@@ -31,7 +32,7 @@ class Found:
 
     folder: Path
     clouds: tuple[Path, ...]
-    poses: tuple[Path, ...]  # one table, or a file for each pose
+    poses: tuple[Path, ...]  # one table, or a file for each pose; none: they stand in the headers of the scans
     urdf: Path | None
     aside: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
 
@@ -56,7 +57,12 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
     taken = {*clouds, *other_clouds}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f)]
     _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
-    chosen, rest = _named(poses, taken) if poses is not None else _poses(folder, candidates, len(clouds))
+    chosen: list[Path] = []
+    rest: list[Path] = []
+    if poses is not None:
+        chosen, rest = _named(poses, taken)
+    elif candidates or poses_in_scans(clouds) is None:
+        chosen, rest = _poses(folder, candidates, len(clouds))
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
     return Found(
         folder=folder,

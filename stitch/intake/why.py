@@ -29,7 +29,7 @@ def guesses_of(
         _columns(raw, decided, stated),
         _rotation(decided, stated),
         _unit(decided, stated),
-        _cloud_unit(clouds, own_units, stated),
+        _cloud_unit(found, clouds, own_units, stated),
     )
 
 
@@ -44,8 +44,16 @@ def judged_words(judged: Judged) -> str:
 def _files(found: Found, raw: RawPoses) -> Guess:
     clouds = f"{len(found.clouds)} clouds {found.clouds[0].name} … {found.clouds[-1].name}"
     aside = f"; left aside: {', '.join(f.name for f in found.aside[:5])}" if found.aside else ""
-    poses = found.poses[0].name if len(found.poses) == 1 else f"{found.poses[0].name} … {found.poses[-1].name}"
-    return Guess("files", f"{clouds}, {len(raw.numbers)} poses in {poses}", f"{raw.words}{aside}", True, "--poses")
+    return Guess(
+        "files", f"{clouds}, {len(raw.numbers)} poses in {_where(found)}", f"{raw.words}{aside}", True, "--poses"
+    )
+
+
+def _where(found: Found) -> str:
+    if not found.poses:
+        return "their headers"
+    first, last = found.poses[0].name, found.poses[-1].name
+    return first if len(found.poses) == 1 else f"{first} … {last}"
 
 
 def _pairing(decided: Decided) -> Guess:
@@ -98,8 +106,10 @@ def _unit(decided: Decided, stated: StatedFolder) -> Guess:
     return Guess("length_unit", way.length_unit, reason, decided.told, "--unit")
 
 
-def _cloud_unit(clouds: Sequence[Array], own_units: Sequence[str], stated: StatedFolder) -> Guess:
+def _cloud_unit(found: Found, clouds: Sequence[Array], own_units: Sequence[str], stated: StatedFolder) -> Guess:
     if stated.cloud_unit:
         return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
     other = own_units[1] if len(own_units) > 1 else None
-    return Guess("cloud_unit", own_units[0], size_words(clouds), other is None, "--cloud-unit", other)
+    counted = found.clouds[0].suffix.lower() in (".png", ".tif", ".tiff")
+    words = "; whole numbers of depth are mm unless the intrinsics state depth_scale" * counted
+    return Guess("cloud_unit", own_units[0], f"{size_words(clouds)}{words}", other is None, "--cloud-unit", other)

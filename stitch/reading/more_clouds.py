@@ -1,7 +1,7 @@
 """Scans in formats of other trades: meshes (STL, OBJ, OFF, glTF), NumPy arrays, PTX, and E57 and LAS by their packages.
 
-A mesh counts by its vertices, with the normals of its faces. Of a file with several scans the first is read; points
-stay in the scanner's own frame.
+A mesh counts by its vertices, with the normals of its faces. A file with several scans is refused; points stay in the
+scanner's own frame.
 """
 
 from pathlib import Path
@@ -61,6 +61,8 @@ def read_ptx(path: Path) -> dict[str, Array]:
     rows = lines[_PTX_HEADER : _PTX_HEADER + count]
     if len(rows) < count:
         raise InputError(f"{path}: {count} points announced, data for {len(rows)}; export it again")
+    if any(line.strip() for line in lines[_PTX_HEADER + count :]):
+        raise InputError(_several(path, "several scans"))
     table = np.loadtxt(rows, ndmin=2)
     return dict(zip([*"xyz", "intensity"], table.T, strict=False))
 
@@ -73,9 +75,16 @@ def read_las(path: Path) -> dict[str, Array]:
 
 
 def read_e57(path: Path) -> dict[str, Array]:
-    """Columns (N,) of the first scan of an E57 in its own frame, by pye57."""
-    scan = package("pye57", path, "formats").E57(str(path)).read_scan(0, ignore_missing_fields=True, transform=False)
+    """Columns (N,) of the one scan of an E57 in its own frame, by pye57."""
+    file = package("pye57", path, "formats").E57(str(path))
+    if file.scan_count != 1:
+        raise InputError(_several(path, f"{file.scan_count} scans"))
+    scan = file.read_scan(0, ignore_missing_fields=True, transform=False)
     columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
     if "intensity" in scan:
         columns["intensity"] = np.asarray(scan["intensity"], float)
     return measured(columns)
+
+
+def _several(path: Path, held: str) -> str:
+    return f"{path}: holds {held}, a file is one view; to fix: export every scan to a file of its own"

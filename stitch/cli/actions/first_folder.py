@@ -83,7 +83,7 @@ def _end(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None
 def _warn(out: Path, untold: Sequence[Guess]) -> None:
     """What was guessed and may be wrong, where it is read last."""
     terminal = console()
-    terminal.print("NOT TOLD by these files and scans, guessed, and wrong for all that is known:", style="bold red")
+    terminal.print("NOT TOLD by files and scans, only guessed; any of it may be wrong:", style="bold red")
     for guess in untold:
         terminal.print(f"  {guess.what}: {guess.value}; to state it: {guess.flag}", soft_wrap=True)
     terminal.print(
