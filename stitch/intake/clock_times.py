@@ -15,7 +15,7 @@ _CLOCK = re.compile(
 )
 _YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")
 _YEAR_LAST = re.compile(r"(\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{2})")
-_DAY_S, _CENTURY = 86400.0, 2000
+DAY_S, _CENTURY = 86400.0, 2000
 DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
 
 
@@ -25,6 +25,15 @@ class ClockTimes:
 
     seconds: Array | None  # (n,) since the first; None where they are left out
     words: str  # how dates were read, or why times are left out; empty where nothing is to be said
+    first_s: float = 0.0  # the first since the calendar's beginning, or since midnight where no date stands beside it
+
+
+def clock_of(labels: Sequence[tuple[str, ...]]) -> ClockTimes | None:
+    """The one column of times of day among the texts beside the rows of a table; None without, or with several."""
+    if len({len(texts) for texts in labels}) != 1:
+        return None
+    times = [t for column in zip(*labels, strict=True) if (t := clock_times(column)) is not None]
+    return times[0] if len(times) == 1 else None
 
 
 def clock_times(cells: Sequence[str]) -> ClockTimes | None:
@@ -32,30 +41,31 @@ def clock_times(cells: Sequence[str]) -> ClockTimes | None:
 
     Dates whose order nobody states are read both ways. What runs backwards one way is read the other way.
     """
-    both = [_since_first(cells, day_first) for day_first in (True, False)]
-    known = [seconds for seconds in both if seconds is not None]
-    if not known or all(s[-1] == s[0] and (np.diff(s) == 0).all() for s in known):
+    both = [_moments(cells, day_first) for day_first in (True, False)]
+    known = [moments for moments in both if moments is not None]
+    if not known or all((moments == moments[0]).all() for moments in known):
         return None
-    forwards = [seconds for seconds in known if (np.diff(seconds) >= 0).all()]
+    forwards = [moments for moments in known if (np.diff(moments) >= 0).all()]
     if not forwards:
         return ClockTimes(None, "times of day run backwards and are left out; to fix: write the date beside them")
-    if len(forwards) == 2 and not np.array_equal(forwards[0], forwards[1]):
+    since_first = [moments - moments[0] for moments in forwards]
+    if len(forwards) == 2 and not np.array_equal(since_first[0], since_first[1]):
         return ClockTimes(
             None,
             f"times are left out, as {cells[0].strip()} may begin with the day or the month; to fix: write dates as "
             "2026-12-31",
         )
-    alike = len(known) == 2 and np.array_equal(known[0], known[1])
+    alike = len(forwards) == 2
     words = "" if alike else DAY_FIRST if forwards[0] is both[0] else MONTH_FIRST
-    return ClockTimes(forwards[0], words)
+    return ClockTimes(np.asarray(since_first[0]), words, float(forwards[0][0]))
 
 
-def _since_first(cells: Sequence[str], day_first: bool) -> Array | None:
+def _moments(cells: Sequence[str], day_first: bool) -> Array | None:
     told = [_seconds(cell.strip(), day_first) for cell in cells]
     if not told or any(t is None for t in told):
         return None
-    seconds: Array = np.array(told, float)
-    return np.asarray(seconds - seconds[0])
+    moments: Array = np.array(told, float)
+    return moments
 
 
 def _seconds(cell: str, day_first: bool) -> float | None:
@@ -68,7 +78,7 @@ def _seconds(cell: str, day_first: bool) -> float | None:
     hour = int(found["h"])
     if found["half"]:
         hour = hour % 12 + 12 * (found["half"].upper() == "PM")
-    return _DAY_S * day + 3600.0 * hour + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
+    return DAY_S * day + 3600.0 * hour + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
 
 
 def _ordinal(text: str, day_first: bool) -> int | None:

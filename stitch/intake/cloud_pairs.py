@@ -1,4 +1,4 @@
-"""Which row of a table belongs to which cloud: by name, by number, by order."""
+"""Which row of a table belongs to which cloud: by name, by time, by number, by order."""
 
 import re
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.pairs_by_time import rows_by_time
 
 # Clouds or poses that a list may lack: more, and the lists do not belong together.
 _LACKING = 2
@@ -39,7 +40,8 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
     Raises:
         InputError: so many more of one than of the other that they do not belong together.
     """
-    named = _by_text(clouds, labels) or _by_number(clouds, labels) or _by_column(clouds, numbers)
+    named = _by_text(clouds, labels) or _by_time(clouds, labels)
+    named = named or _by_number(clouds, labels) or _by_column(clouds, numbers)
     if named is not None:
         return [named]
     N, M = len(clouds), len(labels)
@@ -94,6 +96,18 @@ def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairi
     if len(known) < 2 or len(set(known)) < len(known):
         return None
     return Pairing(tuple(rows), "by the names beside the poses", True)
+
+
+def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
+    """The times in the clouds' names are those beside the poses, to a fraction of the time from scan to scan."""
+    found = rows_by_time(clouds, labels)
+    if found is None:
+        return None
+    rows, farthest = found
+    words = f"by the times in the names of the clouds, {farthest:.2g} s at most from those of their poses"
+    left = len(labels) - len(rows)
+    words += f"; {left} poses belong to no cloud" if left else ""
+    return Pairing(tuple(rows), words, True)
 
 
 def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.importer import import_file
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import Pairing, pairings
 from stitch.intake.doctor import Decided, decide
-from stitch.intake.found_files import PROGRAMS, Found, look_into
+from stitch.intake.found_files import Found, look_into
 from stitch.intake.guesses import Guess
+from stitch.intake.header_poses import header_poses
 from stitch.intake.joint_poses import JOINT_ANGLES, joint_layouts, joint_readings
 from stitch.intake.layouts import layouts
 from stitch.intake.mounting import Mounting, mounting
-from stitch.intake.number_table import parse_number_table
 from stitch.intake.plausible_units import CLOUD_UNITS, cloud_units, pose_units
+from stitch.intake.program_poses import is_program, program_poses
 from stitch.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, readings
 from stitch.intake.stated import StatedFolder, StatedTable
@@ -36,7 +36,6 @@ from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.session import Scanner, Session, View
 from stitch.measurement.thinning import thinned
 from stitch.reading.clouds import read_cloud
-from stitch.reading.poses_in_scans import poses_in_scans
 
 # Enough points a view to tell conventions.
 _POINTS = 8000
@@ -95,25 +94,11 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
 
 def _raw(found: Found) -> RawPoses:
     if not found.poses:
-        return _in_headers(found.clouds)
+        return header_poses(found.clouds)
     first = found.poses[0]
-    if first.suffix.lower() in PROGRAMS:
-        table = parse_number_table(first, import_file(first, "mm").text)
-        return RawPoses(str(first), table.header, table.numbers, table.labels, "the points of a robot program")
+    if is_program(first):
+        return program_poses(first)
     return read_raw_poses(found.poses)
-
-
-def _in_headers(clouds: Sequence[Path]) -> RawPoses:
-    poses = poses_in_scans(list(clouds))
-    assert poses is not None  # `look_into` has seen them
-    words = "they may be the scanner's own, of scans that were registered already: then the hand-eye is about unity"
-    return RawPoses(
-        source=f"{clouds[0].name} … {clouds[-1].name}",
-        header=None,
-        numbers=poses.reshape(-1, 16),
-        labels=tuple((cloud.name,) for cloud in clouds),
-        words=words,
-    )
 
 
 def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:

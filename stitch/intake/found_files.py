@@ -6,18 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from stitch.errors import InputError
+from stitch.intake.cloud_files import clouds_among
+from stitch.intake.program_poses import PROGRAMS, read_by_its_program
 from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
 from stitch.reading.clouds import CLOUD_SUFFIXES
-from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.reading.poses_in_scans import poses_in_scans
 
-# Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
-_EITHER = (".txt", ".csv", ".asc")
-_CLOUD_LINES = 400
-PROGRAMS = (".ls", ".src", ".mod", ".script")
 _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
 _PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
@@ -51,11 +46,11 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
         raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
     files = _files(folder, 0)
     named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
-    clouds, other_clouds = _clouds([f for f in files if f not in named])
+    clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
         raise InputError(_no_clouds(folder, files))
     taken = {*clouds, *other_clouds}
-    candidates = [f for f in files if f not in taken and _may_hold_poses(f)]
+    candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
     _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
     chosen: list[Path] = []
     rest: list[Path] = []
@@ -104,38 +99,6 @@ def _files(folder: Path, depth: int) -> list[Path]:
         elif entry.is_dir() and depth < _DEEPEST and not (entry / "result.json").exists():
             out += _files(entry, depth + 1)
     return out
-
-
-def _clouds(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Files of the kind that most clouds have, and clouds of other kinds."""
-    fitting = [f for f in files if f.suffix.lower() in CLOUD_SUFFIXES and _is_cloud(f)]
-    if not fitting:
-        return [], []
-    kinds = Counter(f.suffix.lower() for f in fitting)
-    order = list(CLOUD_SUFFIXES)
-    best = max(kinds, key=lambda kind: (kinds[kind], -order.index(kind)))
-    return [f for f in fitting if f.suffix.lower() == best], [f for f in fitting if f.suffix.lower() != best]
-
-
-def _is_cloud(file: Path) -> bool:
-    if file.suffix.lower() == ".npy":
-        return _is_cloud_array(file) or is_depth_image(file)
-    if file.suffix.lower() in DEPTH_SUFFIXES:
-        return is_depth_image(file)
-    if file.suffix.lower() not in _EITHER:
-        return True
-    with file.open("rb") as stream:
-        return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
-
-
-def _is_cloud_array(file: Path) -> bool:
-    """An image of points, or more rows than a campaign has views; matrices (V, 4, 4) are poses."""
-    try:
-        shape = np.load(file, mmap_mode="r", allow_pickle=False).shape or (0,)
-    except (ValueError, OSError):
-        return False
-    image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
-    return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
 
 
 def _may_hold_poses(file: Path) -> bool:

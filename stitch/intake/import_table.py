@@ -14,13 +14,12 @@ from stitch.intake.covariates import covariate_columns
 from stitch.intake.layouts import Layout, layouts
 from stitch.intake.number_table import read_number_table
 from stitch.intake.plausible_units import POSE_UNITS, pose_units
+from stitch.intake.program_poses import PROGRAMS
 from stitch.intake.raw_poses import STRUCTURED, RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, angle_units, readings
 from stitch.intake.stated import StatedTable
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.units import METRES
-
-_PROGRAMS = (".ls", ".src", ".mod", ".script")
 
 
 def is_table_of_poses(file: Path) -> bool:
@@ -28,7 +27,7 @@ def is_table_of_poses(file: Path) -> bool:
     suffix = file.suffix.lower()
     if suffix in STRUCTURED:
         return True
-    if suffix in _PROGRAMS or not file.is_file():
+    if suffix in PROGRAMS or not file.is_file():
         return False
     try:
         table = read_number_table(file)

@@ -1,7 +1,5 @@
 """Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
 
-import csv
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +9,11 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.table_cells import DECIMAL_COMMA, cells_of, value
+from stitch.intake.table_rows import below_titles, levelled, with_units
 from stitch.reading.text_file import read_any_text, shortened
 
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_BRACKETS = str.maketrans("[](){}", " " * 6)
 _COMMENTS = ("#", "%", "//")
 _LARGEST_MB = 50
 
@@ -48,10 +45,9 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    separator = max(_SEPARATORS, key=lambda s: sum(_value(c) is not None for _, line in body for c in _cells(line, s)))
-    # A spreadsheet writes an empty row as separators.
-    read = [(i, cells) for i, line in body if (cells := _cells(line, separator))]
-    rows = _below_titles(read)
+    separator = max(_SEPARATORS, key=lambda s: sum(value(c) is not None for _, line in body for c in cells_of(line, s)))
+    read = levelled([(i, cells_of(line, separator)) for i, line in body])
+    rows = below_titles(read)
     above = len(read) - len(rows)
     comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
@@ -59,7 +55,7 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     if len(numeric) < 3:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     numbers = np.array([[_number(file, i, row[c]) for c in numeric] for i, row in rows])
-    decimal = any(_DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
+    decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
     words += ", with a header" if header else ", without a header"
     if above:
@@ -74,45 +70,11 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     )
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    """Cells of a line, trimmed; an empty one at the end goes."""
-    line = line.translate(_BRACKETS).strip()
-    if separator == " ":
-        return line.split()
-    row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    cells = [cell.strip().strip('"') for cell in row]
-    while cells and not cells[-1]:
-        cells.pop()
-    return cells
-
-
-def _value(cell: str) -> float | None:
-    """The number in a cell, with a point or a comma; None if there is none."""
-    cell = cell.rstrip("°").strip()
-    if _NUMBER.fullmatch(cell):
-        return float(cell)
-    if _DECIMAL_COMMA.fullmatch(cell):
-        return float(cell.replace(",", "."))
-    return None
-
-
 def _number(file: Path, line: int, cell: str) -> float:
-    value = _value(cell)
-    if value is None or not abs(value) < 1e30:
+    found = value(cell)
+    if found is None or not abs(found) < 1e30:
         raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
-    return value
-
-
-def _below_titles(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    """Without what people write above a table: rows of another length with hardly a number among their words."""
-    width = Counter(len(row) for _, row in rows).most_common(1)[0][0] if rows else 0
-    first = 0
-    while first < len(rows) - 1 and len(rows[first][1]) != width:
-        known = [_value(cell) is not None for cell in rows[first][1]]
-        if all(known) or sum(known) > 1:
-            break
-        first += 1
-    return rows[first:]
+    return found
 
 
 def _split_header(
@@ -125,13 +87,16 @@ def _split_header(
     top, first = rows[0]
     below = rows[1:] or rows
     width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
-    typical = next((row for _, row in below if len(row) == width), first)
-    texts = [_value(cell) is None for cell in first]
-    if len(rows) > 1 and any(t and _value(c) is not None for t, c in zip(texts, typical, strict=False)):
+    typical = next((row for _, row in below if len(row) == width and any(value(c) is not None for c in row)), first)
+    texts = [value(cell) is None for cell in first]
+    if len(rows) > 1 and any(t and value(c) is not None for t, c in zip(texts, typical, strict=False)):
         header, rows = first, rows[1:]
+        units = with_units(header, rows[0][1]) if len(rows) > 1 else None
+        if units is not None:
+            header, rows = units, rows[1:]
     elif comment:
-        names = _cells(comment.lstrip("#%/ "), separator)
-        header = names if len(names) == width and all(_value(name) is None for name in names) else None
+        names = cells_of(comment.lstrip("#%/ "), separator)
+        header = names if len(names) == width and all(value(name) is None for name in names) else None
     odd = next(((i, row) for i, row in rows if len(row) != width), None)
     if odd is not None:
         raise InputError(
@@ -145,5 +110,5 @@ def _split_header(
 def _columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
     """Columns of text, and of numbers: a column with numbers in more than half of its cells is one of numbers."""
     width = len(rows[0][1])
-    share = [sum(_value(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
+    share = [sum(value(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
     return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]

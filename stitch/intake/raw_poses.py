@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.clock_times import ClockTimes, clock_times
+from stitch.intake.clock_times import ClockTimes, clock_of
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
 from stitch.reading.text_file import read_text, require_file, shortened
@@ -36,10 +36,7 @@ class RawPoses:
     @property
     def clock(self) -> ClockTimes | None:
         """Times of day, where one of the texts beside the poses is one."""
-        if len({len(texts) for texts in self.labels}) != 1:
-            return None
-        times = [t for column in zip(*self.labels, strict=True) if (t := clock_times(column)) is not None]
-        return times[0] if len(times) == 1 else None
+        return clock_of(self.labels)
 
     @property
     def time_s(self) -> Array | None:

@@ -59,7 +59,7 @@ def _where(found: Found) -> str:
 def _pairing(decided: Decided) -> Guess:
     pairing = decided.best.way.pairing
     if pairing.by_name:
-        return Guess("pairing", pairing.words, "cloud and pose bear the same name or number", True, "--poses")
+        return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--poses")
     reason = f"names do not tell it; under it {judged_words(decided.best)}"
     return Guess("pairing", pairing.words, reason, decided.told, "a column with the cloud's file name")
 

@@ -1,4 +1,4 @@
-"""Clouds and poses find each other by name, by number, by order."""
+"""Clouds and poses find each other by name, by time, by number, by order."""
 
 from pathlib import Path
 
@@ -38,3 +38,27 @@ def test_a_failed_scan_leaves_every_gap_open():
 def test_lists_that_do_not_belong_together_are_refused():
     with pytest.raises(InputError, match="4 clouds and 9 poses"):
         pairings(CLOUDS, [()] * 9)
+
+
+SCANS = [Path(f"scan_2026-04-03_09-{minute}-07.ply") for minute in (12, 13, 15)]
+
+
+@pytest.mark.parametrize("day", ["2026-04-03T", "03.04.2026 ", ""])
+def test_times_tell_though_there_are_more_poses(day):
+    times = ["09:11:50", "09:12:06.5", "09:13:07", "09:14:00", "09:15:08", "09:16:00"]
+    (pairing,) = pairings(SCANS, [(f"{day}{time}",) for time in times])
+    assert pairing.rows == (1, 2, 4) and pairing.by_name and "1 s at most" in pairing.words
+    assert "3 poses belong to no cloud" in pairing.words
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ["09:12:07", "09:13:07", "09:14:07", "09:14:30", "09:14:40", "09:14:50"],  # the last scan has no pose
+        ["10:12:07", "10:13:07", "10:15:07", "10:16:00", "10:17:00", "10:18:00"],  # another hour
+        ["09:12:07", "09:12:07", "09:12:07", "09:12:07", "09:12:07", "09:12:07"],
+    ],
+)
+def test_times_that_are_not_those_of_the_scans_tell_nothing(times):
+    with pytest.raises(InputError, match="3 clouds and 6 poses"):
+        pairings(SCANS, [(time,) for time in times])

@@ -71,3 +71,26 @@ def test_what_is_no_table_is_refused_with_its_line(tmp_path, text, told):
     (tmp_path / "t.csv").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=told):
         read_number_table(tmp_path / "t.csv")
+
+
+def test_remarks_in_some_rows_and_units_in_a_row_of_their_own(tmp_path):
+    lines = [
+        "Messreihe 3;;;;;;;",
+        "",
+        "Datei;X;Y;Z;Rx;Ry;Rz;Bemerkung",
+        ";mm;mm;mm;[deg];deg;deg;",
+        "a.ply;1,5;2;3;4;5;6;",
+        "b.ply;2,5;2;3;4;5;6;Neustart",
+        ";;;;;;;",
+    ]
+    (tmp_path / "t.csv").write_text("\r\n".join(lines), encoding="cp1252")
+    table = read_number_table(tmp_path / "t.csv")
+    assert table.header == ("X [mm]", "Y [mm]", "Z [mm]", "Rx [deg]", "Ry [deg]", "Rz [deg]")
+    assert table.numbers.tolist() == [[1.5, 2, 3, 4, 5, 6], [2.5, 2, 3, 4, 5, 6]]
+    assert table.labels == (("a.ply", ""), ("b.ply", "Neustart")) and table.lines == (5, 6)
+
+
+def test_a_number_that_lacks_at_the_end_is_no_remark(tmp_path):
+    (tmp_path / "t.csv").write_text("x;y;z\n1;2;3\n4;5;\n7;8;9\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 3: '' is no number"):
+        read_number_table(tmp_path / "t.csv")

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from stitch.intake.found_files import PROGRAMS
+from stitch.intake.program_poses import PROGRAMS
 from stitch.intake.raw_poses import STRUCTURED, TABLES
 from stitch.reading.clouds import CLOUD_SUFFIXES
 
