@@ -5,7 +5,7 @@ import pytest
 
 from stitch.errors import InputError
 from stitch.intake.first_session import first_session
-from stitch.intake.stated import Stated
+from stitch.intake.stated import StatedFolder
 from stitch.reading.clouds import read_cloud
 from stitch.reading.poses_in_scans import poses_in_scans
 from tests.needs import needs
@@ -71,7 +71,7 @@ def test_a_folder_of_such_scans_needs_no_table(tmp_path):
         T[:3, 3] = 0.4, 0.1 * i, 0.5
         rows = "".join(f"{x:.4f} {y:.4f} {0.4 + 0.1 * x:.4f} 1\n" for x, y in rng.uniform(-0.1, 0.1, (400, 2)))
         (tmp_path / f"pos{i}.ptx").write_text(ptx(T).replace(POINTS, rows).replace("4\n1\n", "400\n1\n", 1))
-    first = first_session(tmp_path, Stated())
+    first = first_session(tmp_path, StatedFolder())
     files = next(guess for guess in first.guesses if guess.what == "files")
     assert "4 poses in their headers" in files.value and first.pairing.by_name
     assert first.decided.best.way.length_unit == "m"
