@@ -8,7 +8,7 @@ from viz.colours import UNSEEN
 
 _LENGTH, _HEIGHT = 256, 14
 # All of it with its words, which are as large in any window.
-WIDE, HIGH = (-28.0, _LENGTH + 28.0), (-4.0, _HEIGHT + 54.0)
+WIDE, HIGH = (-28.0, _LENGTH + 44.0), (-4.0, _HEIGHT + 54.0)
 
 
 def log_colour_bar(recording: rr.RecordingStream, path: str, name: str, ticks: list[str], grey: str) -> None:

@@ -9,6 +9,7 @@ from stitch.measurement.views import Views
 
 PLACE = "place on the part"
 _BINS = 6
+_ENDINGS = {"_c": "°C", "_percent": "%", "_s": "s", "_mm": "mm", "_deg": "°"}
 _FAIR = 50  # correspondences of a bin that may be called the worst
 
 
@@ -74,7 +75,12 @@ def view_properties(views: Views) -> list[tuple[str, str, Array]]:
     out += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
     if views.has("time"):
         out.append(("time", "s", views.time))
-    return out + [(name, "", values) for name, values in views.covariates.items()]
+    return out + [(name, _unit_of(name), values) for name, values in views.covariates.items()]
+
+
+def _unit_of(covariate: str) -> str:
+    """As the name says it: scanner_temperature_c, humidity_percent."""
+    return next((unit for ending, unit in _ENDINGS.items() if covariate.endswith(ending)), "")
 
 
 def values_of_views(views: Views) -> dict[str, Array]:

@@ -108,7 +108,7 @@ def _draw_cut(ax: Axes, job: SeamJob, station: Station, seam: Seam) -> None:
     for edge in (seam.inner, seam.outer):
         if edge is not None:
             ax.plot(*edge, "o", color=colour, ms=5, mec="white")
-    text = seam.verdict if seam.reason else f"flush {seam.flush:+.2f}, gap {seam.gap:.2f}"
+    text = seam.verdict if seam.reason else f"flush {seam.flush:+.2f}, gap {seam.gap:.2f} mm"
     ax.set_title(f"{seam.station}: {text}", fontsize=9, color=colour)
     ax.set(xlim=(-_ACROSS, _ACROSS), ylim=(-_DOWN, 6), aspect="equal")
 
@@ -159,7 +159,7 @@ def record(job: SeamJob, seams: list[Seam], path: Path) -> None:
                 edges = np.array([[edge[0], 0.0, edge[1]] for edge in (seam.inner, seam.outer)])
                 edges = frames.transform(T, edges)
                 stage.line(recording, f"stations/{seam.station}/gap", edges, colour, 0.8)
-                label = [f"{seam.verdict}: flush {seam.flush:+.2f}, gap {seam.gap:.2f}"]
+                label = [f"{seam.verdict}: flush {seam.flush:+.2f}, gap {seam.gap:.2f} mm"]
                 stage.points(recording, f"stations/{seam.station}/verdict", edges[1:], [colour], 1.5, label)
 
 

@@ -60,7 +60,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     if asked.as_json:
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        show(runs, target, asked.says_next)
+        show(runs, target, asked.tolerance, asked.says_next)
 
 
 def _given(asked: ModelOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from stitch.cli.actions.compared_run import write_comparison
 from stitch.cli.actions.diagnosed_run import write_diagnosis
 from stitch.cli.terminal.printing import print_page
+from stitch.cli.terminal.run_summary import show_light
 from stitch.comparison.two_runs import TwoRuns, sentence, two_runs
 from stitch.errors import InputError
 from stitch.pipeline import diagnose
@@ -30,7 +31,9 @@ def page_of_one(
     page = run / "report.html"
     with run_folder.held(run):
         state = load_state(run, effects_file, trust=trust)
-        run_folder.extend("stitch.reports", stored_run(run, state), page, tolerance)
+        shown = stored_run(run, state)
+        run_folder.extend("stitch.reports", shown, page, tolerance)
+        show_light(console(), shown, tolerance)
         if with_diagnosis:
             write_comparison(state, run)
             write_diagnosis(diagnose(state), state, run)

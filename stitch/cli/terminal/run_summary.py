@@ -9,7 +9,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from stitch.comparison.model_history import model_history
-from stitch.comparison.run_verdict import run_verdict
+from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import expanded
 from stitch.runs.run import Run
@@ -19,7 +19,7 @@ from stitch.units import METRES, known_text, length_text
 _FILES = ("stitched.ply", "mesh.ply", "recording.rrd", "report.html")
 
 
-def show(runs: list[Run], target: Path, says_next: bool = True) -> None:
+def show(runs: list[Run], target: Path, tolerance: float | None = None, says_next: bool = True) -> None:
     """For people, on standard error; the next command only where it is the reader's to give."""
     terminal = console()
     for result in runs:
@@ -30,6 +30,7 @@ def show(runs: list[Run], target: Path, says_next: bool = True) -> None:
             if s.note:
                 terminal.print(f"{s.name}: {s.note}.", soft_wrap=True)
         terminal.print(run_verdict(result, model_history(result)), soft_wrap=True, style="bold")
+        show_light(terminal, result, tolerance)
         terminal.print(result.verdict, soft_wrap=True)
         hidden = [f"Not observable from these motions: {direction}." for direction in result.unobservable]
         for line in (*hidden, *result.notes[len(result.left_out) :]):
@@ -42,6 +43,13 @@ def show(runs: list[Run], target: Path, says_next: bool = True) -> None:
     _files(terminal, folders)
     if says_next:
         terminal.print(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}", soft_wrap=True)
+
+
+def show_light(terminal: Console, run: Run, tolerance: float | None) -> None:
+    """Whether the part is within what is allowed, as the page's light says it; nothing where nobody says what is."""
+    light = None if tolerance is None else run_light(run, model_history(run), tolerance)
+    if light is not None:
+        terminal.print(light.sentence, soft_wrap=True, style="bold")
 
 
 def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
