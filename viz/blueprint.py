@@ -50,7 +50,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
-            _bars("bars", "Each view off the others (µm); grey: at first", "bars/first", "bars/views"),
+            _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
             _bar("colours/field", "Views disagree by (µm)"),
             row_shares=[6, 10, 3],
         ),
