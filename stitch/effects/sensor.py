@@ -18,7 +18,7 @@ def range_scale(points: Array, view: ScanView, s: float) -> Array:
 def range_nonlinearity(points: Array, view: ScanView, k: float) -> Array:
     """x = x* + u·k·(r/r₀−1)², r₀ the standoff"""
     u = view.along(points)
-    r = (points * u).sum(axis=1)
+    r = (view.away(points) * u).sum(axis=1)
     return np.asarray(points + u * (k * (r / view.views.standoff - 1) ** 2)[:, None])
 
 

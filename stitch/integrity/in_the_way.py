@@ -52,7 +52,7 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
         size: of the part, length_unit.
     """
     views = [v for v, scan in enumerate(scans) if len(scan.points)]
-    looks = {v: KDTree(_directions(scans[v].points)) for v in views}
+    looks = {v: KDTree(scans[v].rays(scans[v].points)) for v in views}
     shares = {}
     for v in views:
         others = [w for w in views if w != v]
@@ -75,12 +75,8 @@ def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Ma
 
     One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
     """
-    away = np.linalg.norm(points, axis=1)
-    beside, partners = look.query(np.ascontiguousarray(_directions(points)), k=min(_LOOKS, len(scan.points)))
+    away = np.linalg.norm(points - scan.eye, axis=1)
+    beside, partners = look.query(scan.rays(points), k=min(_LOOKS, len(scan.points)))
     beside, partners = beside.reshape(len(points), -1), partners.reshape(len(points), -1).astype(int)
-    seen = np.linalg.norm(scan.points[partners], axis=2).min(axis=1)
+    seen = np.linalg.norm(scan.points[partners] - scan.eye, axis=2).min(axis=1)
     return np.asarray((beside[:, 0] * away < _SPACINGS * scan.spacing) & (seen > away + behind))
-
-
-def _directions(points: Array) -> Array:
-    return np.asarray(points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300))

@@ -46,18 +46,18 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
         needed: closure that counts as closed.
     """
 
-    def closes(points: Array, wide: bool) -> float:
-        other = prepare_view(scan.name, points)
+    def closes(points: Array, eye: Array, wide: bool) -> float:
+        other = prepare_view(scan.name, points, eye=eye)
         found = [judge(other, T_pose, surface)]
         if wide:
             found += place(other, surface, starts_about(T_pose, other, size), size)[:1]
         return max(f.closure if f.near > 0.3 else 0.0 for f in found)
 
     for words, flip in _FLIPS.items():
-        if closes(scan.points @ flip, True) > needed:
+        if closes(scan.points @ flip, scan.eye @ flip, True) > needed:
             return ScanFault("mirrored", f"{words} in this cloud: export it again")
     for factor, words in UNITS.items():
-        if closes(scan.points / factor, True) > needed:
+        if closes(scan.points / factor, scan.eye / factor, True) > needed:
             return ScanFault(
                 "unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit"
             )
@@ -70,7 +70,7 @@ def scale_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed
     scale = _similarity(scan, begin.T, surface, size)
     if not (_LEAST_SCALE < scale < 1 / _LEAST_SCALE) or abs(scale - 1) < _NEAR_ONE:
         return None
-    other = prepare_view(scan.name, scan.points * scale)
+    other = prepare_view(scan.name, scan.points * scale, eye=scan.eye * scale)
     found = judge(other, T_pose, surface)
     if found.closure < needed:
         # The factor from the shape is good to a thousandth; the range that it leaves is one of millimetres.

@@ -67,7 +67,7 @@ def standing_still(scans: Sequence[Scan], poses: Array, tolerance: float, size: 
     still = np.concatenate(stays)
     if still.mean() < _WORTH:
         return None
-    looks = [_directions(scan) for scan in scans]
+    looks = [KDTree(scan.rays(scan.points)) for scan in scans]
     judged = [_under_model(scans, looks, poses, (v, own), tolerance) for v, own in enumerate(probes)]
     on_part, through = (np.concatenate([found[i] for found in judged]) for i in range(2))
     if np.sum(still & through & ~on_part) < max(_THROUGH, _ODDS * np.sum(still & on_part)):
@@ -118,10 +118,6 @@ def _staying(scan: Scan, own: Indices, others: Sequence[Scan], tolerance: float)
     return np.asarray(np.mean([in_place(other, points, normals, tolerance) for other in others], axis=0) > 0.5)
 
 
-def _directions(scan: Scan) -> KDTree:
-    return KDTree(scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True))
-
-
 def _under_model(
     scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, probes: tuple[int, Indices], tolerance: float
 ) -> tuple[Mask, Mask]:
@@ -135,8 +131,9 @@ def _under_model(
         points = frames.transform(T_w_v, scans[v].points[own])
         normals = frames.rotate(T_w_v, scans[v].normals[own])
         on_part |= in_place(scan, points, normals, tolerance)
-        away = np.linalg.norm(points, axis=1)
-        beside, partner = looks[w].query(np.ascontiguousarray(points / away[:, None]), k=1)
+        away = np.linalg.norm(points - scan.eye, axis=1)
+        beside, partner = looks[w].query(scan.rays(points), k=1)
         hit = beside * away < 2 * scan.spacing
-        through |= hit & (np.linalg.norm(scan.points[partner.astype(int)], axis=1) > away + _BEHIND * scan.spacing)
+        seen = np.linalg.norm(scan.points[partner.astype(int)] - scan.eye, axis=1)
+        through |= hit & (seen > away + _BEHIND * scan.spacing)
     return on_part, through

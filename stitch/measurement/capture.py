@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import Scan, prepare_view
-from stitch.measurement.session import Session, View
+from stitch.measurement.session import Scanner, Session, View
 from stitch.measurement.sightings import Sightings, sightings_of
 from stitch.system.threads import parallel
 
@@ -77,13 +78,16 @@ def capture(session: Session) -> Capture:
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    scans = parallel(_prepared, session.views, "preparing scans") if session.has_clouds else ()
+    prepared = partial(_prepared, scanner=session.scanner)
+    scans = parallel(prepared, session.views, "preparing scans") if session.has_clouds else ()
     return place(session.name, tuple(scans), T_base_flange, session.mount, sightings_of(session))
 
 
-def _prepared(view: View) -> Scan:
+def _prepared(view: View, scanner: Scanner) -> Scan:
     assert view.cloud is not None
-    return prepare_view(view.name, view.cloud.points) if view.cloud.whole is None else view.cloud.whole.scan
+    if view.cloud.whole is not None:
+        return view.cloud.whole.scan
+    return prepare_view(view.name, view.cloud.points, eye=scanner.eye(view.cloud.points))
 
 
 def place(

@@ -102,7 +102,8 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     like = [ScanView(v, views, np.zeros(0), intensity[v], gravity=down[v], size=size) for v in range(views.count)]
     scan_views = [
-        replace(like[v], cosine=np.maximum(scan.confidence, SMALLEST_COSINE)) for v, scan in enumerate(capture.scans)
+        replace(like[v], cosine=np.maximum(scan.confidence, SMALLEST_COSINE), eye=scan.eye)
+        for v, scan in enumerate(capture.scans)
     ]
     target_views: list[ScanView] = []
     if capture.sightings is not None:

@@ -36,13 +36,25 @@ class Scan:
     spacing: float  # median distance between neighbours
     scanned_spacing: float  # the same between all points that were scanned, of which these may be some
     noise: float  # 1-sigma across the surface, from the scan itself
+    eye: Array  # (3,) from where the scanner looks
+
+    def rays(self, points: Array) -> Array:
+        """(N, 3) unit vectors from the eye to points (N, 3), scanner frame."""
+        return rays_to(points, self.eye)
 
 
-def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Scan:
+def rays_to(points: Array, eye: Array) -> Array:
+    """(N, 3) unit vectors from an eye (3,) to points (N, 3)."""
+    away = points - eye
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
+
+
+def prepare_view(name: str, points: Array, picked: Indices | None = None, eye: Array | None = None) -> Scan:
     """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan.
 
     Args:
         picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
+        eye: (3,) from where the scanner looks, its own frame; the origin unless stated.
     """
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points, leafsize=16)
@@ -53,8 +65,8 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
     centroid = around.mean(axis=1)
     radius = distance[:, -1]
     normals, variation = _planes(around - centroid[:, None])
-    ray = own / np.linalg.norm(own, axis=1, keepdims=True)
-    cosine = np.einsum("ij,ij->i", normals, ray)
+    eye = np.zeros(3) if eye is None else eye
+    cosine = np.einsum("ij,ij->i", normals, rays_to(own, eye))
     normals *= -np.sign(cosine)[:, None]
     confidence = np.abs(cosine)
     offset = np.linalg.norm(centroid - own, axis=1)
@@ -79,6 +91,7 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None) -> Sca
         spacing=spacing,
         scanned_spacing=scanned_spacing,
         noise=noise,
+        eye=eye,
     )
 
 

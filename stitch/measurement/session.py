@@ -42,6 +42,16 @@ class Scanner:
     optical_axis: Array  # (3,) unit vector in the scanner frame
     kind: SensorKind | None = None  # None: nobody says; whatever a sensor may have can be asked for
 
+    def eye(self, points: Array) -> Array:
+        """(3,) from where it looks at points (N, 3), scanner frame: the origin, if that is not amid what it measures.
+
+        A scanner with the origin of its frame in its measuring volume stands its working distance behind that.
+        """
+        if self.standoff is None or not len(points):
+            return np.zeros(3)
+        amid = np.median(np.linalg.norm(points, axis=1)) < self.standoff / 2
+        return np.asarray(-self.standoff * self.optical_axis if amid else np.zeros(3))
+
 
 @dataclass(frozen=True)
 class StatedRepeatability:

@@ -16,7 +16,7 @@ from stitch.measurement.bounding_box import box_of
 from stitch.measurement.capture import Capture, capture
 from stitch.measurement.cloud import Cloud, WholeCloud
 from stitch.measurement.scan import evenly, prepare_view, sparse
-from stitch.measurement.session import Session, View
+from stitch.measurement.session import Scanner, Session, View
 from stitch.system.threads import parallel
 
 # Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most. Hand-eye and
@@ -51,13 +51,17 @@ def thinned(session: Session, at_most: int = ENOUGH) -> tuple[Session, Capture]:
     """A session with at most `at_most` points a view, evenly over the scan order, and its capture."""
 
     def of_view(view: View) -> View:
-        return view if view.cloud is None else replace(view, cloud=thinned_cloud(view.name, view.cloud, at_most))
+        if view.cloud is None:
+            return view
+        return replace(view, cloud=thinned_cloud(view.name, view.cloud, at_most, session.scanner))
 
     session = replace(session, views=tuple(parallel(of_view, session.views)))
     return session, capture(session)
 
 
-def thinned_cloud(name: str, cloud: Cloud, at_most: int, again: Callable[[], Cloud] | None = None) -> Cloud:
+def thinned_cloud(
+    name: str, cloud: Cloud, at_most: int, scanner: Scanner, again: Callable[[], Cloud] | None = None
+) -> Cloud:
     """A cloud with at most `at_most` of its points, and where the whole is.
 
     Args:
@@ -69,7 +73,7 @@ def thinned_cloud(name: str, cloud: Cloud, at_most: int, again: Callable[[], Clo
         return cloud
     if cloud.whole is not None:
         return _taken(cloud, picked, replace(cloud.whole, scan=sparse(cloud.whole.scan, at_most)))
-    scan = prepare_view(name, cloud.points, picked)
+    scan = prepare_view(name, cloud.points, picked, scanner.eye(cloud.points))
     whole = WholeCloud(again or (lambda: cloud), len(cloud.points), box_of(cloud.points), scan)
     return _taken(cloud, picked, whole)
 

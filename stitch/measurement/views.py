@@ -78,14 +78,21 @@ class ScanView:
     gravity: Array  # (3,) unit vector in the reference frame
     size: float  # of the part: lengths of shape effects may be counted in it
     origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
+    eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, its own frame
 
     def along(self, points: Array) -> Array:
         """(N, 3) unit rays."""
-        return np.asarray(points / np.sqrt(np.einsum("ij,ij->i", points, points))[:, None])
+        away = self.away(points)
+        return np.asarray(away / np.sqrt(np.einsum("ij,ij->i", away, away))[:, None])
+
+    def away(self, points: Array) -> Array:
+        """(N, 3) from the scanner's eye to the points."""
+        return points - self.eye
 
     def rho2(self, points: Array) -> Array:
         """(N,) ρ² = a² + b² of (a, b) = (x/z, y/z)."""
-        return np.asarray((points[:, 0] ** 2 + points[:, 1] ** 2) / points[:, 2] ** 2)
+        x, y, z = self.away(points).T
+        return np.asarray((x**2 + y**2) / z**2)
 
     def since_first(self, covariate: str) -> float:
         """A covariate of this view less its value at the first one."""

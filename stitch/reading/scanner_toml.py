@@ -46,15 +46,17 @@ def within(file: Path, table: dict[str, Any]) -> Array | None:
     if "within" not in table:
         return None
     try:
-        box = np.array(table["within"], float)
-    except (TypeError, ValueError, OverflowError):
+        box = np.array(table["within"])
+    except ValueError:
         box = np.zeros(0)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+    # Words and true are numbers to NumPy; integers of hundreds of digits are objects.
+    is_box = box.shape == (2, 3) and box.dtype.kind in "if" and bool(np.isfinite(box).all())
+    if not is_box or not (box[0] < box[1]).all():
         raise InputError(
             f"{file}: scanner.within is {shortened(table['within'])}; state the lowest and the highest corner of the "
             "box that counts, in the scanner's frame: [[-200, -200, 300], [200, 200, 600]]"
         )
-    return box
+    return box.astype(float)
 
 
 def _pose(file: Path, value: Any) -> Array:

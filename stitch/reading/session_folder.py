@@ -10,7 +10,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Nominal, Sighting
-from stitch.measurement.session import Mount, Session, View
+from stitch.measurement.session import Mount, Scanner, Session, View
 from stitch.measurement.thinning import ENOUGH, points_within
 from stitch.reading import scanner_toml, session_toml
 from stitch.reading.frames_csv import read_frames
@@ -49,14 +49,15 @@ def load_session(
     robot = session_toml.robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
     cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
-    views = _views(path, document, rows, scans=scans, at_most=at_most, memory=memory)
+    scanner = scanner_toml.scanner(file, document.get("scanner", {}))
+    views = _views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)
     cad, cad_unit = session_toml.cad(file, document.get("part", {}))
     session = Session(
         path=path,
         name=session_toml.name_of(file, document),
         length_unit=unit,
         mount=mount,  # type: ignore[arg-type]
-        scanner=scanner_toml.scanner(file, document.get("scanner", {})),
+        scanner=scanner,
         robot=robot,
         sphere_radius=session_toml.positive(file, document.get("sphere", {}), "sphere", "radius"),
         cad=cad,
@@ -106,6 +107,7 @@ def _views(
     path: Path,
     document: dict[str, Any],
     rows: list[Row],
+    scanner: Scanner,
     *,
     scans: bool,
     at_most: int | None,
@@ -119,7 +121,8 @@ def _views(
     unit = document["length_unit"]
     clouds: Iterable[Cloud | None] = [None] * len(rows)
     if scans:
-        clouds = read_scans(path, rows, unit, document.get("cloud_unit", unit), within=within, at_most=at_most)
+        cloud_unit = document.get("cloud_unit", unit)
+        clouds = read_scans(path, rows, unit, cloud_unit, scanner, within=within, at_most=at_most)
     views = []
     for row, cloud in zip(rows, clouds, strict=True):
         if scans and cloud is None and not sightings:

@@ -4,9 +4,12 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Scanner
 from stitch.measurement.thinning import thinned_cloud
 from stitch.reading.clouds import read_cloud
 from stitch.reading.plausible import require_near
@@ -19,7 +22,14 @@ _FEWEST = 3
 
 
 def read_scans(
-    path: Path, rows: Sequence[Row], length_unit: str, cloud_unit: str, *, within: Array | None, at_most: int | None
+    path: Path,
+    rows: Sequence[Row],
+    length_unit: str,
+    cloud_unit: str,
+    scanner: Scanner,
+    *,
+    within: Array | None,
+    at_most: int | None,
 ) -> Iterator[Cloud | None]:
     """The scans of a session folder in the order of its rows, None where a row names none.
 
@@ -32,11 +42,13 @@ def read_scans(
         InputError: a file missing, broken, with too few points or in another unit; names the view and its line.
     """
     read = partial(_read, scale=METRES[cloud_unit] / METRES[length_unit], within=within)
-    cloud = partial(_cloud, path, read=read, metres=METRES[length_unit], at_most=at_most)
+    cloud = partial(_cloud, path, read=read, metres=METRES[length_unit], scanner=scanner, at_most=at_most)
     return parallel(cloud, rows, "reading scans")
 
 
-def _cloud(path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, at_most: int | None) -> Cloud | None:
+def _cloud(
+    path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, scanner: Scanner, at_most: int | None
+) -> Cloud | None:
     if not row.cloud:
         return None
     file = path / row.cloud
@@ -51,7 +63,7 @@ def _cloud(path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, a
         require_near(str(file), cloud.points * metres)
     except InputError as error:
         raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, partial(read, file))
+    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, scanner, partial(read, file))
 
 
 def _read(file: Path, scale: float, within: Array | None) -> Cloud:
@@ -61,5 +73,9 @@ def _read(file: Path, scale: float, within: Array | None) -> Cloud:
         return cloud
     inside = cloud.within(within)
     if not len(inside.points):
-        raise InputError(f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml")
+        middle = ", ".join(f"{x:.3g}" for x in np.median(cloud.points, axis=0))
+        raise InputError(
+            f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml, their "
+            f"middle lies at ({middle}); to fix: make the box larger, or leave this view out of views.csv"
+        )
     return inside

@@ -114,8 +114,7 @@ def _surface(
     scan = registered.measurement.capture.scans[v]
     _, nearest = scan.tree.query(points, k=1)
     normals = scan.normals[nearest]
-    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
-    confidence = np.abs(np.einsum("ij,ij->i", normals, ray))
+    confidence = np.abs(np.einsum("ij,ij->i", normals, scan.rays(points)))
     terms = registered.model.terms
     if moves_points(terms):
         scale = registered.intensity_scale

@@ -1,5 +1,7 @@
 """Normals, noise and thinning of scans against a sphere and against all points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from stitch.effects import EFFECTS
 from stitch.effects.in_session import lacking
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.scan import prepare_view
+from stitch.measurement.session import Scanner
 
 
 def test_normals_and_noise_of_a_sphere():
@@ -21,6 +24,21 @@ def test_normals_and_noise_of_a_sphere():
     assert inner.mean() > 0.5
     assert np.median(np.einsum("ij,ij->i", scan.normals, direction)[inner]) > 0.995
     assert scan.noise == pytest.approx(0.03, rel=0.04)
+
+
+def test_an_origin_amid_what_is_measured_is_not_where_the_scanner_looks_from():
+    """Half of a plate tilted through the origin would turn its back on it; from the standoff all faces the scanner."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-60, 60, (2, 4000))
+    points = np.column_stack([x, y, 0.4 * x + 0.02 * rng.standard_normal(len(x))])
+    axis = np.array([0.0, 0.0, 1.0])
+    scanner = Scanner(None, None, 420.0, axis)
+    assert np.array_equal(scanner.eye(points), [0, 0, -420]) and not scanner.eye(points + 400 * axis).any()
+    assert not replace(scanner, standoff=None).eye(points).any()
+    amid = prepare_view("p", points, eye=scanner.eye(points))
+    ahead = prepare_view("p", points + 420 * axis)
+    assert (amid.normals[:, 2] < 0).all() and np.allclose(amid.normals, ahead.normals, atol=1e-6)
+    assert np.allclose(amid.confidence, ahead.confidence) and np.array_equal(amid.usable, ahead.usable)
 
 
 def test_a_thinned_scan_keeps_the_surface_of_all_points(blade_capture):
