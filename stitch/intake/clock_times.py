@@ -10,7 +10,8 @@ import numpy as np
 from stitch.frames import Array
 
 _CLOCK = re.compile(
-    r"(?:(?P<date>[\d.\-/]+)[T ]+)?(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}(?:[.,]\d+)?))?(?: ?(?P<half>[AP]M)|Z)?",
+    r"(?:(?P<date>[\d.\-/]+)[T ]+)?"
+    r"(?P<h>[01]?\d|2[0-3]):(?P<m>[0-5]\d)(?::(?P<s>[0-5]\d(?:[.,]\d+)?))?(?: ?(?P<half>[AP]M)|Z)?",
     re.IGNORECASE,
 )
 _YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")

@@ -55,6 +55,7 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     if len(numeric) < 3:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     numbers = np.array([[_number(file, i, row[c]) for c in numeric] for i, row in rows])
+    _require_one_decimal_mark(file, rows, numeric)
     decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
     words += ", with a header" if header else ", without a header"
@@ -75,6 +76,18 @@ def _number(file: Path, line: int, cell: str) -> float:
     if found is None or not abs(found) < 1e30:
         raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
     return found
+
+
+def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]], numeric: Sequence[int]) -> None:
+    """Refuse a column with commas before the decimals in which a point stands too: 1.269 may mean a thousand."""
+    for c in numeric:
+        pointed = [(i, row[c]) for i, row in rows if "." in row[c]]
+        if pointed and any("," in row[c] for _, row in rows):
+            line, cell = pointed[0]
+            raise InputError(
+                f"{file} line {line}: {shortened(cell)} has a point, other numbers of its column have a comma before "
+                "their decimals; to fix: write all alike, without marks for thousands"
+            )
 
 
 def _split_header(

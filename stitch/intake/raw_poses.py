@@ -47,8 +47,10 @@ class RawPoses:
         """The same with columns named by a person.
 
         Raises:
-            InputError: more or fewer names than columns.
+            InputError: more or fewer names than columns, or a name twice.
         """
+        if twice := {name for name in names if name != "-" and names.count(name) > 1}:
+            raise InputError(f"--columns {','.join(names)}: {twice.pop()} stands twice; to fix: name each column once")
         if len(names) != self.numbers.shape[1]:
             raise InputError(
                 f"--columns {','.join(names)}: {len(names)} names, {self.source} has {self.numbers.shape[1]} columns "

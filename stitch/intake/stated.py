@@ -58,4 +58,4 @@ class StatedFolder(StatedTable):
 
 def _known(flag: str, value: str | None, known: Collection[str]) -> None:
     if value is not None and value not in known:
-        raise InputError(f"{flag} {value}: use {', '.join(known)}")
+        raise InputError(f"{flag} {value}: to fix: use {', '.join(known)}")

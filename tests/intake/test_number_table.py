@@ -55,6 +55,16 @@ def test_what_a_spreadsheet_writes_above_its_table_is_passed_over(tmp_path):
     assert table.labels == (("P1",), ("P2",)) and "1 line of words" in table.words
 
 
+@pytest.mark.parametrize("units", ["", "[mm];;;;[deg];\n"])
+def test_remarks_in_few_rows_and_units_in_a_row_of_their_own(tmp_path, units):
+    text = f"x;y;z;a;b;Remark\n{units}1,5;2;3;4;5;\n2,5;2;3;4;5;cold\n3,5;2;3;4;5;\n"
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    table = read_number_table(tmp_path / "t.csv")
+    assert table.numbers[:, 0].tolist() == [1.5, 2.5, 3.5] and table.numbers.shape == (3, 5)
+    assert table.header == (("x mm", "y", "z", "a", "b deg") if units else ("x", "y", "z", "a", "b"))
+    assert table.labels == (("",), ("cold",), ("",))
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -65,6 +75,8 @@ def test_what_a_spreadsheet_writes_above_its_table_is_passed_over(tmp_path):
         ("P1,1,2\nP2,4,5,6\nP3,6,7,8\n", "line 1: 3 cells"),
         ("1,2,3\n4,x5,6\n7,8,9\n", "line 2: 'x5'"),
         ("1,2,3\n4,1e99,6\n7,8,9\n", "line 2"),
+        # Thousands, or a little more than one?
+        ("1269,5;2;3\n1.269;5;6\n", "line 2: '1.269' has a point"),
     ],
 )
 def test_what_is_no_table_is_refused_with_its_line(tmp_path, text, told):

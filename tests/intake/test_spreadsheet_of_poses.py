@@ -61,6 +61,8 @@ def test_angles_are_no_position_though_their_columns_come_first(tmp_path):
         (["3/4/2026 09:00:00", "3/5/2026 09:00:00"], None),  # of March, or the third of April?
         (["30.02.2026 09:00:00", "30.02.2026 09:01:00"], None),
         (["9:14", "late"], None),
+        (["9:45", "9:75"], None),
+        (["23:00", "24:00"], None),
         ([], None),
     ],
 )
