@@ -39,7 +39,7 @@ def load(path: Path) -> list[str]:
         del EFFECTS[name]
     try:
         with _named(path, ""):
-            spec.loader.exec_module(_module(spec))
+            _execute(path, importlib.util.module_from_spec(spec))
         names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
         if not names:
             raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
@@ -54,8 +54,9 @@ def load(path: Path) -> list[str]:
     return names
 
 
-def _module(spec: Any) -> ModuleType:
-    return importlib.util.module_from_spec(spec)
+def _execute(path: Path, module: ModuleType) -> None:
+    """Run the file as it stands; Python's own import would leave a cache beside it, and may take one that is old."""
+    exec(compile(path.read_bytes(), path, "exec"), vars(module))
 
 
 def _guarded(effect: Effect, path: Path) -> Callable[..., Any]:

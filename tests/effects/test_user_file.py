@@ -29,6 +29,19 @@ def test_a_users_effect_takes_its_place(tmp_path):
         EFFECTS.pop("humidity_bias", None)
 
 
+def test_a_file_counts_as_it_stands_and_nothing_is_written_beside_it(tmp_path):
+    """Python's cache takes a file of the same second and length for the one before."""
+    file = tmp_path / "mine.py"
+    try:
+        for size in (0.02, 0.03):
+            file.write_text(USER.replace("0.02", str(size)))
+            load(file)
+            assert EFFECTS["humidity_bias"].specs["k"].typical == size
+    finally:
+        EFFECTS.pop("humidity_bias", None)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
