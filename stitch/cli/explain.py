@@ -30,6 +30,8 @@ def explain_run(
         raise InputError(f"{output}: effects stand in a Python file; to fix: name it {output.with_suffix('.py').name}")
     if output is not None and output.exists():
         raise InputError(f"{output}: there is such a file; to fix: name another, or move it away")
+    if output is not None and not output.parent.is_dir():
+        raise InputError(f"{output}: there is no folder {output.parent}; to fix: make it, or name another")
     # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.cli.actions.explained_run import explained_run
 

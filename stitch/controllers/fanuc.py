@@ -21,6 +21,7 @@ UNREAD = re.compile(r"^[ \t]*\d+:\s*[JLCA]\s+PR\[", re.M)
 _FRAME = re.compile(r"UF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 # Numbers, or the stars of a point that was never taught.
 _FIELD = re.compile(r"\b([XYZWPR]|[JE]\d)\s*=\s*([-+.\deE*]+)")
+_DECIMAL_COMMA = re.compile(r"=\s*([-+]?\d+,\d+)")
 
 
 def read(file: Path, text: str) -> list[Taught]:
@@ -41,6 +42,8 @@ def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
     group = _GROUP.search(body)
     if group is None:
         raise InputError(f"{file} line {line}: P[{index}] has no GP1; the arm's own group is read")
+    if (cut := _DECIMAL_COMMA.search(group[1])) is not None:
+        raise InputError(f"{file} line {line}: P[{index}] has {cut[1]!r}; to fix: write decimals with a point")
     begin = match.start(3) + group.start(1)
     fields = {
         m[1]: Written(

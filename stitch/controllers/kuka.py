@@ -23,6 +23,10 @@ _IN_FORCE = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{[^}]*?\bTOOL_NO\s+(\d+)[^}]*?\b
 _MOTION = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+(?:(\w+)|\{(.*?)\})", re.M | re.I)
 # Motions whose targets are not read.
 UNREAD = re.compile(r"^[ \t]*S?(?:CIRC|SPL)(?:_REL)?\s+[\w{]", re.M | re.I)
+# A motion to an aggregate that its line does not close.
+_OPEN = re.compile(r"^[ \t]*S?(?:PTP|LIN)(?:_REL)?\s+\{[^}\n]*$", re.M | re.I)
+# A field of an aggregate: X 1200.5, S 2, or with the aggregate's type before it, E6POS: X 1200.5.
+_CELL = re.compile(r"\s*(?:\w+\s*:)?\s*\w+\s+\S+\s*")
 _FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
 
@@ -30,7 +34,7 @@ def read(file: Path, text: str) -> list[Taught]:
     """Points of a .dat (as declared) or a .src (as moved to).
 
     Raises:
-        InputError: a point without numbers, a name that is declared nowhere.
+        InputError: a point without numbers or with a brace that stays open, a name that is declared nowhere.
     """
     if file.suffix.lower() == ".dat":
         return list(_declared(file, text).values())
@@ -39,7 +43,10 @@ def read(file: Path, text: str) -> list[Taught]:
     if data is not None:
         told = _declared(data, program_text(data))
         known |= {name: replace(point, file=data) for name, point in told.items()}
-    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(without_comments(text, ";"))]
+    clean = without_comments(text, ";")
+    if (left := _OPEN.search(clean)) is not None:
+        raise InputError(f"{file} line {line_of(text, left.start())}: a brace stays open; to fix: close it on its line")
+    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(clean)]
 
 
 def _declared(file: Path, text: str) -> dict[str, Taught]:
@@ -67,6 +74,12 @@ def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taug
 
 def _point(file: Path, name: str, line: int, body: str, begin: int) -> Taught:
     """A point from the fields between its braces, which stand at `begin`."""
+    odd = next((cell for cell in body.split(",") if not _CELL.fullmatch(cell)), None)
+    if odd is not None:
+        raise InputError(
+            f"{file} line {line}: {name} has {odd.strip()!r} between its commas; to fix: write name and number, "
+            "decimals with a point"
+        )
     fields = {
         m[1].upper(): Written(
             number(file, line, f"{name} {m[1].upper()}", m[2]), (begin + m.start(2), begin + m.end(2))

@@ -23,6 +23,8 @@ PROGRAMS: dict[str, ModuleType] = {
 }
 # Frame and tool of nothing: points taught in them are flange poses in the base.
 NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0")
+# No length in mm and no angle of a controller is larger.
+_LARGEST = 1e9
 _NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal: "ur"}
 
 
@@ -121,8 +123,10 @@ def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array
         return np.eye(4)
     count = 7 if pose is abb.pose else 6
     cells = value.split(",")
-    if len(cells) != count or not all(is_number(cell) for cell in cells):
-        raise InputError(f"--{name} {value}: write {count} numbers with commas, as the controller shows the pose")
+    if len(cells) != count or not all(is_number(cell) and abs(float(cell)) < _LARGEST for cell in cells):
+        raise InputError(
+            f"--{name} {value}: to fix: write {count} numbers with commas, as the controller shows the pose"
+        )
     try:
         return pose(np.array([float(cell) for cell in cells]))
     except ValueError as error:

@@ -48,9 +48,11 @@ def _script(file: Path, text: str) -> list[Taught]:
     for position, name, kind, (begin, end) in sorted(found):
         spans = tuple((begin + m.start(), begin + m.end()) for m in _CELL.finditer(clean[begin:end]))
         cells = [clean[slice(*span)] for span in spans]
-        if len(cells) != 6:
-            continue  # A list of something else: a payload, a vector, an I/O pattern.
         line = line_of(text, position)
+        if len(cells) != 6:
+            if kind:
+                raise InputError(f"{file} line {line}: {name} has {len(cells)} numbers; to fix: a pose p[…] takes six")
+            continue  # A list of something else: a payload, a vector, an I/O pattern.
         if not all(is_number(cell) for cell in cells):
             if name != f"line{line}":
                 continue  # Computed while the program runs: no taught point.

@@ -152,6 +152,10 @@ def test_ur_recording_in_metres(tmp_path):
         ("a.mod", ABB.replace("0.965926", "0.5"), r"a.mod line 4: p20: quaternion of length"),
         ("a.mod", ABB.replace("[[600,-5.5,800]", "[[600,-5.5]"), r"a.mod line 3: p10 is neither"),
         ("a.script", "movel(p[x,0,0,0,0,0])\n", r"a.script line 1: the target is computed"),
+        ("a.script", "movel(p[0,5,0,0,0,0,0])\n", r"a.script line 1: line1 has 7 numbers"),
+        ("a.src", "LIN {X 1,5,Y 0,Z 0,A 0,B 0,C 0}\n", r"a.src line 1: line1 has '5' between its commas"),
+        ("a.src", "LIN {X 1.5,Y 0,Z 0,A 0,B 0,C 0\n", r"a.src line 1: a brace stays open"),
+        ("a.ls", FANUC.replace("-195.800", "-195,800"), r"a.ls line 7: P\[1\] has '-195,800'"),
         ("a.csv", "a,b\n1,2\n", r"a.csv line 1: no columns x, y, z"),
         ("a.csv", "x,y,z\n1,2,oops\n", r"a.csv line 2: z is 'oops'"),
         ("a.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", r"a.csv line 2: quaternion of length 1.4142"),
@@ -168,7 +172,7 @@ def test_bad_files_name_line_and_mend(name, text, message, tmp_path):
 
 def test_bad_options_and_programs_without_points(tmp_path):
     (tmp_path / "p.ls").write_text(FANUC)
-    with pytest.raises(InputError, match="--tool 1,2: write 6 numbers"):
+    with pytest.raises(InputError, match="--tool 1,2: to fix: write 6 numbers"):
         import_file(tmp_path / "p.ls", tool="1,2")
     with pytest.raises(InputError, match="--unit inch"):
         import_file(tmp_path / "p.ls", unit="inch")

@@ -313,7 +313,7 @@ def test_what_is_too_large_or_out_of_reach_is_refused(tmp_path):
         (["--program", "w.script", "-o", "c.src"], "c.src: to fix: end the copy's name in .script"),
         (["--program", "w.script", "-o", "c.script", "--limit", "-1"], "--limit -1: to fix"),
         (["--program", "w.script", "-o", "c.script", "--limit", "0.01"], "more than the 0.01 mm"),
-        (["--program", "w.script", "-o", "c.script", "--near", "1,2"], "--near 1,2: write 6 angles"),
+        (["--program", "w.script", "-o", "c.script", "--near", "1,2"], "--near 1,2: to fix: write 6 angles"),
         (["--program", "w.script", "--to", "ros"], "name one of --to FORMAT and --program FILE"),
         (
             ["--program", "w.ls", "-o", "c.ls", "--frame", ZERO["fanuc"], "--tool", ZERO["fanuc"]],

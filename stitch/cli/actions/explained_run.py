@@ -34,7 +34,10 @@ def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, 
     else:
         _show(found, heldout, state.session.length_unit, run, output)
     if not found.found and output is not None:
-        raise NoResultError(f"{run}: no formula holds, nothing was written to {output}")
+        raise NoResultError(
+            f"{run}: no formula holds, nothing was written to {output}; what may matter beside can stand in columns of "
+            "views.csv, and more views tell more"
+        )
 
 
 def _document(found: Explanation, heldout: float | None) -> dict[str, object]:

@@ -62,9 +62,10 @@ def _near(near: str | None, arm: ArmModel) -> Array | None:
     if near is None:
         return None
     cells = near.split(",")
-    if len(cells) != arm.robot.n_joints or not all(is_number(cell) for cell in cells):
-        raise InputError(f"--near {near}: write {arm.robot.n_joints} angles in degrees with commas")
-    return np.radians([float(cell) for cell in cells])
+    told: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+    if len(told) != arm.robot.n_joints or not np.isfinite(told).all():
+        raise InputError(f"--near {near}: to fix: write {arm.robot.n_joints} angles in degrees with commas")
+    return np.asarray(np.radians(told))
 
 
 def _coupled(program: Program, j3: str | None) -> bool:
