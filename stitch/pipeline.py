@@ -22,7 +22,7 @@ from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
 from stitch.stages.course import End, collected, course_of, linearise
-from stitch.stages.rig import require_effects, require_same_rig
+from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
 
@@ -68,6 +68,7 @@ def run_rig(
         model = in_unit(model, sessions[0].length_unit) if model else None
         arm = in_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
+        require_measured_once(sessions)
         begun = course.start(sessions, measurements, model)
         measurements = [about_part(m, begun.T_mount) for m in measurements]
         seconds = clock.lap()

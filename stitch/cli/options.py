@@ -59,6 +59,9 @@ def bytes_of(size: str | None) -> float | None:
         return None
     told = re.fullmatch(r"([0-9.]+) *([KMGT])i?B?", size.strip(), re.IGNORECASE)
     try:
-        return float(told[1]) * 1e3 ** (1 + "KMGT".index(told[2].upper())) if told else float(size)
+        found = float(told[1]) * 1e3 ** (1 + "KMGT".index(told[2].upper())) if told else float(size)
     except ValueError:
-        raise InputError(f"--memory {size}: to fix: give a size such as 2GB or 800MB") from None
+        found = float("nan")
+    if not 0 < found < float("inf"):
+        raise InputError(f"--memory {size}: to fix: give a size such as 2GB or 800MB")
+    return found

@@ -10,6 +10,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
+from stitch.reading.arm_loads import require_loads
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number, number
 from stitch.reading.names import require_name
@@ -51,6 +52,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     cells = [(line, _row_cells(header, row)) for line, row in lines]
     covariates = covariate_names(header, cells)
     joints = [_joints(file, line, row, header) for line, row in cells]
+    require_loads(file, header, cells, sum(bool(_JOINT.match(name)) for name in header))
     rows: list[Row] = []
     seen: dict[str, int] = {}
     latest = -np.inf

@@ -8,6 +8,9 @@ from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile
 
+# No two measured scans begin with so many points alike.
+_TELLING = 100
+
 
 def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> None:
     """Refuse sessions that cannot share a hand-eye, or that show nothing.
@@ -33,6 +36,25 @@ def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> No
             raise InputError(f"{session.path}: sessions without clouds run one by one; use --hand-eye for the next")
         if len(session.views) < 2:
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
+
+
+def require_measured_once(sessions: Sequence[Session]) -> None:
+    """Refuse a scan that stands in two sessions: it would count as two, and the hand-eye seem surer than it is.
+
+    Raises:
+        InputError: names both sessions and views.
+    """
+    known: dict[bytes, tuple[Session, str]] = {}
+    for session in sessions:
+        clouds = {view.name: view.cloud.points[:_TELLING].tobytes() for view in session.views if view.cloud is not None}
+        for name, points in clouds.items():
+            if points in known:
+                other, view = known[points]
+                raise InputError(
+                    f"{session.path}: the scan of view {name} is that of view {view} in {other.path}, measured once "
+                    "and given twice; to fix: name each session once"
+                )
+        known |= {points: (session, name) for name, points in clouds.items()}
 
 
 def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:

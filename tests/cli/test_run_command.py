@@ -57,6 +57,7 @@ def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path, capsys):
     ("size", "said"),
     [
         ("much", "--memory much: to fix: give a size such as 2GB"),
+        ("nan", "--memory nan: to fix"),
         ("1GB", r"memory: 1 GB are too little for a run of 3 views; to fix: give 1\.3 GB"),
         ("900 MiB", "memory: 0.9 GB are too little"),
     ],

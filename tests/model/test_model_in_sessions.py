@@ -99,3 +99,9 @@ def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_sessio
             run_rig(rig, effects=[effect])
         with pytest.raises(InputError, match=told):
             run_rig(rig, fitted(measurement_of(session, own), effect)[0])
+
+
+def test_a_scan_does_not_count_twice(placed_session):
+    session, _ = placed_session
+    with pytest.raises(InputError, match="the scan of view v000 is that of view v000"):
+        run_rig([session, replace(session, name="other")])

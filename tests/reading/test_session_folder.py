@@ -37,6 +37,17 @@ def remove(name):
     return lambda folder: (folder / name).unlink()
 
 
+def column(name, *cells):
+    """An edit that adds a column to views.csv."""
+
+    def write(folder):
+        rows = (folder / "views.csv").read_text().splitlines()
+        own = zip(rows, [name, *cells], strict=True)
+        (folder / "views.csv").write_text("\n".join(",".join(row) for row in own) + "\n")
+
+    return write
+
+
 def write_cloud(text):
     def spoil(folder):
         (folder / "clouds/v001.xyz").write_text(text)
@@ -88,7 +99,11 @@ BAD = {
         toml(r'"\+z"', '"+z"\nwithin = [0, 0, 300]'), ["scanner.within is [0, 0, 300]", "highest corner"]),
     "box upside down": (toml(r'"\+z"', '"+z"\nwithin = [[9, 9, 9], [0, 0, 0]]'), ["scanner.within", "highest corner"]),
     "box beside the scans": (
-        toml(r'"\+z"', '"+z"\nwithin = [[0, 0, -9], [1, 1, -8]]'), ["v000", "none of its", "scanner.within"]),
+        toml(r'"\+z"', '"+z"\nwithin = [[0, 0, -9], [1, 1, -8]]'), ["v000", "none of its", "scanner.within", "to fix"]),
+    "box of words": (
+        toml(r'"\+z"', '"+z"\nwithin = [["0", "0", "0"], ["9", "9", "9"]]'), ["scanner.within", "highest corner"]),
+    "payload below zero": (column("payload_kg", "5", "-3", "5"), ["line 3", "payload_kg is -3"]),
+    "payload of some views": (column("payload_kg", "5", "", "5"), ["line 3", "payload_kg is ''", "every row"]),
     "sensor of no kind": (toml(r'"\+z"', '"+z"\nkind = "laser"'), ["kind is 'laser'", "'tracker'"]),
     "gravity in words": (table('[robot]\njoints = [{ a = 1 }]\ngravity = "down"'), ["session.toml", "gravity is 'down'"]),
     "URDF that is no name": (table("[robot]\nurdf = 5"), ["session.toml", "robot.urdf is 5"]),
