@@ -47,11 +47,13 @@ def _require_sense(
 ) -> None:
     """Refuse options that do not go together."""
     if add and not runs:
-        raise InputError("--add: name the cell first, then its runs: stitch watch CELL --add RUN")
+        raise InputError("--add: no runs; to fix: name the cell first, then its runs: stitch watch CELL --add RUN")
     if at and len(runs) != 1:
         raise InputError("--at: says when one run was measured; to fix: name one RUN with --add")
     if len(folders) > 1 and (in_use is not None or dfq is not None):
         raise InputError("--in-use and --dfq: belong to one cell; to fix: name one")
+    if dfq is not None and (dfq.suffix.lower() != ".dfq" or not dfq.parent.is_dir()):
+        raise InputError(f"--dfq {dfq}: to fix: name a file that ends in .dfq, in a folder that exists")
     names = [folder.resolve().name for folder in folders]
     if len(set(names)) < len(names):
         raise InputError(f"two cells are named {max(names, key=names.count)!r}; to fix: name each once")

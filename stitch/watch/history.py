@@ -85,7 +85,9 @@ def opened(folder: Path, new: bool = False) -> Iterator[History]:
         NoResultError: another process holds it for long.
     """
     file = folder / FILE
-    begun = not file.is_file()
+    if file.exists() and not file.is_file():
+        raise InputError(f"{file}: is no file; to fix: move it away, or name another folder for the cell")
+    begun = not file.exists()
     if begun:
         if not new:
             raise InputError(f"{folder}: no cell with a history; to fix: stitch watch {folder} --add RUN begins one")
@@ -93,7 +95,7 @@ def opened(folder: Path, new: bool = False) -> Iterator[History]:
         folder.mkdir(parents=True, exist_ok=True)
     connection = sqlite3.connect(file, timeout=_WAIT, isolation_level=None)
     try:
-        _prepare(connection)
+        _prepare(file, connection)
         yield History(folder, connection)
     except sqlite3.OperationalError as error:
         if "locked" in str(error) or "busy" in str(error):
@@ -124,9 +126,13 @@ def _require_free(folder: Path) -> None:
             raise InputError(f"{folder}: is {what}, no cell; to fix: name the folder of the cell first, then the runs")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; to fix: name a folder for the cell")
+    for above in folder.resolve().parents:
+        if (above / "session.toml").exists():
+            raise InputError(f"{folder}: lies in the session {above}, which is only read; to fix: name another folder")
 
 
-def _prepare(connection: sqlite3.Connection) -> None:
+def _prepare(file: Path, connection: sqlite3.Connection) -> None:
+    _require_history(file, connection)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
     if connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'cell'").fetchone()[0]:
@@ -138,6 +144,16 @@ def _prepare(connection: sqlite3.Connection) -> None:
             connection.execute(statement)
         connection.execute("INSERT INTO cell VALUES ('format', ?)", (json.dumps(FORMAT),))
     connection.commit()
+
+
+def _require_history(file: Path, connection: sqlite3.Connection) -> None:
+    """Refuse a database of something else, and a history in another form."""
+    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+    if not tables:
+        return
+    own = connection.execute("SELECT value FROM cell WHERE key = 'format'").fetchall() if "states" in tables else []
+    if own != [(json.dumps(FORMAT),)]:
+        raise InputError(f"{file}: is no history in the form {FORMAT}; to fix: name another folder for the cell")
 
 
 def as_text(matrix: Array) -> str:

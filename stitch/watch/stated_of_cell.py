@@ -1,24 +1,32 @@
 """What people state of a cell: which calibration it uses, and when a run was measured."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.watch.history import History
 from stitch.watch.read_record import read_record
+from stitch.watch.run_record import RunRecord
 
 
-def use(history: History, run: Path) -> None:
-    """From now on the cell uses the calibration of this run.
+def use(history: History, run_hash: str) -> None:
+    """From now on the cell uses the calibration of this run."""
+    with history.writing():
+        history.state({"in_use": run_hash})
+
+
+def known_run(history: History, run: Path, added: Sequence[RunRecord]) -> str:
+    """The hash of a run that is in the history, or will be.
 
     Raises:
-        InputError: the run is not in the history.
+        InputError: it is not.
     """
-    record = read_record(run)
-    with history.writing():
-        if not history.sql("SELECT 1 FROM runs WHERE run_hash = ?", record.run_hash):
-            raise InputError(f"{run}: is not in the history of {history.folder}; to fix: append it with --add first")
-        history.state({"in_use": record.run_hash})
+    run_hash = read_record(run).run_hash
+    known = history.sql("SELECT 1 FROM runs WHERE run_hash = ?", run_hash)
+    if not known and run_hash not in {record.run_hash for record in added}:
+        raise InputError(f"{run}: is not in the history of {history.folder}; to fix: append it with --add first")
+    return run_hash
 
 
 def measured_at(text: str) -> float:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -82,6 +83,9 @@ def test_a_plant_has_a_page_with_a_row_a_cell(tmp_path, capsys):
         (("s0", "--add", "s1"), "is a run, no cell"),
         (("cell", "--add", "s0", "s1", "--at", "2026-01-01"), "name one RUN"),
         (("cell", "--add", "s0", "--at", "noon"), "no time; to fix"),
+        (("cell", "--add", "s0", "--in-use", "s1"), "is not in the history"),
+        (("cell", "--add", "s0", "--dfq", "s0/result.json"), "ends in .dfq"),
+        (("session/cell", "--add", "s0"), "lies in the session"),
         (("cell", "--add", "metres"), None),
         (("cell", "--add", "s0", "copy"), "has the very numbers of"),
         (("cell", "--add", "reused"), "as it is, so nothing was measured anew"),
@@ -95,6 +99,8 @@ def test_what_cannot_be_is_refused_in_one_line_and_leaves_nothing(arguments, tol
     bare_run(tmp_path / "metres", T, SIGMA, length_unit="m", mount="eye_to_hand")
     effects = {"joint_compliance": {"c2": (read_record(tmp_path / "s0").estimates[0].value, "rad/(N m)")}}
     bare_run(tmp_path / "copy", T, SIGMA, mount="eye_to_hand", name="other", effects=effects)
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "session.toml").touch()
     reused = bare_run(tmp_path / "reused", T, SIGMA, mount="eye_to_hand") / "result.json"
     stage = {"name": "coarse", "rms": 0.1, "correspondences": 9, "iterations": 1, "seconds": 0.0}
     note = {"note": "hand-eye of another run, used as it is"}
@@ -118,6 +124,18 @@ def test_a_damaged_history_is_named(tmp_path, capsys):
     (tmp_path / "cell" / "history.sqlite").write_bytes(b"no data base" * 500)
     assert ends("watch", tmp_path / "cell") == 2
     assert "history.sqlite: damaged" in capsys.readouterr().err
+
+
+def test_a_database_of_something_else_is_left_as_it_is(tmp_path, capsys):
+    run = run_folder(tmp_path, "s0")
+    (tmp_path / "cell").mkdir()
+    file = tmp_path / "cell" / "history.sqlite"
+    connection = sqlite3.connect(file)
+    connection.execute("CREATE TABLE parts (name)")
+    connection.close()
+    before = file.read_bytes()
+    assert ends("watch", tmp_path / "cell", "--add", run) == 2
+    assert "is no history in the form" in capsys.readouterr().err and file.read_bytes() == before
 
 
 def test_many_writers_lose_nothing(tmp_path):

@@ -26,6 +26,8 @@ def run_batch(
     Raises:
         InputError, NoResultError: as `stitch batch` ends.
     """
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; to fix: name a folder for the runs with -o")
     jobs, stood = _jobs(sessions, output, force, recording), output.exists()
     rows: dict[str, SessionRow] = {}
     try:

@@ -18,7 +18,7 @@ from stitch.watch.history import History, opened
 from stitch.watch.openmetrics import openmetrics
 from stitch.watch.read_record import read_record
 from stitch.watch.report_document import report_document
-from stitch.watch.stated_of_cell import measured_at, use
+from stitch.watch.stated_of_cell import known_run, measured_at, use
 from stitch.writing.json_file import to_json
 from stitch.writing.run_folder import extend
 
@@ -47,9 +47,10 @@ def watched_cells(
     reports: list[CellReport] = []
     with ExitStack() as stack:
         histories = [stack.enter_context(opened(folder, new=add)) for folder in folders]
+        used = None if in_use is None else known_run(histories[0], in_use, records)
         added = append_runs(histories[0], records) if add else 0
-        if in_use is not None:
-            use(histories[0], in_use)
+        if used is not None:
+            use(histories[0], used)
         reports = [cell_report(history, tolerance) for history in histories]
         if page:
             _write_pages(histories, reports, folders)
