@@ -11,7 +11,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.scan import evenly
 from stitch.reading.clouds import read_cloud
-from stitch.reading.text_file import require_file
+from stitch.reading.text_file import reason_of, require_file
 
 # Points on the whole surface: a view sees a third of them, and a few thousand say what millions would.
 _POINTS = 9_000
@@ -78,8 +78,7 @@ def _mesh(file: Path) -> trimesh.Trimesh | None:
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:  # whatever a library raises at bytes that are no mesh
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{file}: cannot be read ({reason}); to fix: export it again") from None
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: export it again") from None
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
 
 

@@ -14,7 +14,7 @@ from stitch.reading.depth_image import DEPTH_SUFFIXES, read_depth_columns
 from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, read_mesh, read_ptx
 from stitch.reading.organised import grid_shape, measured
 from stitch.reading.pcd import read_pcd
-from stitch.reading.text_file import require_file, shortened
+from stitch.reading.text_file import reason_of, require_file
 from stitch.reading.zdf import read_zdf
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
@@ -54,8 +54,7 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     except InputError:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no cloud
-        reason = shortened(" ".join(str(error).split()) or type(error).__name__)
-        raise InputError(f"{path}: cannot be read ({reason}); export it again") from None
+        raise InputError(f"{path}: cannot be read ({reason_of(error)}); export it again") from None
     return _cloud(path, columns, scale)
 
 

@@ -13,7 +13,7 @@ from stitch.reading.clouds import read_ply
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_depth
 from stitch.reading.organised import grid_shape
 from stitch.reading.pcd import read_pcd
-from stitch.reading.text_file import shortened
+from stitch.reading.text_file import reason_of
 from stitch.reading.zdf import read_zdf_image
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -38,8 +38,7 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
     except InputError:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no scan
-        reason = shortened(" ".join(str(error).split()) or type(error).__name__)
-        raise InputError(f"{path}: cannot be read ({reason}); export it again") from None
+        raise InputError(f"{path}: cannot be read ({reason_of(error)}); export it again") from None
     if points is None:
         return None
     if grey is None:

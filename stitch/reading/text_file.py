@@ -69,6 +69,16 @@ def _require_size(file: Path, hint: str, largest_mb: float) -> None:
         raise InputError(f"{file}: has {size:,.0f} MB, more than {largest_mb:g}; to fix: name the right file")
 
 
+def reason_of(error: Exception) -> str:
+    """What a library says of bytes that it cannot read, on one line.
+
+    A mesh that is no mesh may be text in an encoding for which the library lacks a package: that helps nobody.
+    """
+    if isinstance(error, ImportError):
+        return "its bytes are not what its name says"
+    return shortened(" ".join(str(error).split()) or type(error).__name__)
+
+
 def shortened(value: object, most: int = 80) -> str:
     """`repr` of a value for a message, cut where it is long."""
     try:

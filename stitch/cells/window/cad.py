@@ -12,6 +12,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.reading.text_file import reason_of
 
 # Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
 _SAME_SIDE = np.cos(np.radians(45.0))
@@ -54,7 +55,7 @@ def read_cad(file: Path) -> Surface:
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:
-        raise InputError(f"{file}: cannot be read ({error or type(error).__name__}); export the mesh again") from None
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); export the mesh again") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{file}: holds no triangles; export the CAD model as a triangle mesh")
     return surface(mesh)
