@@ -18,7 +18,7 @@ WIDE = 2  # cases at a time
 
 @dataclass(frozen=True)
 class Case:
-    """A way to spoil the room and the command that meets it. Its folders: s, o clouds; p points; r, q runs of s."""
+    """A way to spoil the room and the command that meets it. Its folders: s, o clouds, p points; r, q, a: runs."""
 
     kind: str
     name: str
@@ -28,6 +28,7 @@ class Case:
     environment: dict[str, str] = field(default_factory=dict)
     largest_file: int | None = None  # bytes, as on a full disk
     holds: str = ""  # what the result on standard output must begin with
+    right: Callable[[Path], bool] | None = None  # what holds of the room where the command ends well, as it may then
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,8 @@ class _Running:
         """What is wrong with how the command ended; the room is removed."""
         out, error = (self.outer.with_suffix(e).read_text(errors="replace") for e in (".out", ".err"))
         faults = ["hang"] if code is None else list(_faults(self.case, code, out, error))
+        if code == 0 and self.case.right is not None and not self.case.right(self.room):
+            faults.append("silent")
         after = snapshot(self.outer)
         changed = {path for path in {*after, *self.before} if after.get(path) != self.before.get(path)}
         allowed = self.case.writes if code == 0 else ()
@@ -106,7 +109,7 @@ def _faults(case: Case, code: int, out: str, error: str) -> Iterator[str]:
         yield "traceback"
     elif case.fine and code:
         yield "refused though right"
-    elif not case.fine and not code:
+    elif not (code or case.fine or case.right):
         yield "silent"
     elif case.holds and not out.startswith(case.holds):
         yield "not the result alone"

@@ -17,11 +17,15 @@ from datetime import date
 from itertools import chain
 from pathlib import Path
 
+from fault_cells import cells, gone
 from fault_clouds import cloud_headers, clouds, robots
 from fault_code import effects_files, foreign_code
 from fault_folders import models, run_folders
+from fault_intake import clocks, raw_folders, spreadsheets
 from fault_kills import COMMANDS, Kills, kill_at_random
+from fault_loads import arms, boxes, loads, sessions_together
 from fault_places import command_lines, outputs
+from fault_programs import programs
 from fault_room import Case, Outcome, judge
 from fault_sessions import session_files, tables
 
@@ -44,18 +48,29 @@ _SOURCES = (
     effects_files,
     outputs,
     command_lines,
+    spreadsheets,
+    clocks,
+    raw_folders,
+    boxes,
+    loads,
+    arms,
+    sessions_together,
+    programs,
+    cells,
+    gone,
 )
 _HANG = 10.0  # seconds beyond what a good run takes here
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "limits.md"
 
 
 def make_material(folder: Path) -> float:
-    """Two small cloud sessions s and o, labelled points p, runs r of s and q of o; seconds of a run in a fork."""
+    """Two small cloud sessions s and o, labelled points p, runs r of s, q of o, a of p; seconds of a run in a fork."""
     folder.mkdir()
     # In processes of their own: this one must stay without threads, or its forks would wait for them.
     _forked(lambda: _write_sessions(folder))
     seconds = 0.0
-    for arguments in (["run", "s", "-o", "r", "--effects", "range_scale"], ["run", "o", "-o", "q"]):
+    for line in ("s -o r --effects range_scale", "o -o q", "p -o a --effects gear_eccentricity"):
+        arguments = ["run", *line.split()]
         began = time.monotonic()
         _forked(lambda arguments=arguments: (os.chdir(folder), stitch(arguments)))
         seconds = max(seconds, time.monotonic() - began)
