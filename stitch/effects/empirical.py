@@ -63,7 +63,7 @@ def _field() -> Effect:
 
     def distort(points: Array, view: ScanView, **c: float) -> Array:
         """x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"""
-        x, y, z = points.T
+        x, y, z = view.away(points).T
         ray = np.sqrt(x * x + y * y + z * z)
         at = {"a": x / z, "b": y / z, "d": ray / view.views.standoff - 1}
         moved = points.copy()

@@ -39,9 +39,10 @@ def below_titles(rows: Rows) -> Rows:
 
 def with_units(names: list[str], cells: list[str]) -> list[str] | None:
     """Names with the units that stand in a row of their own below them; None where that row is none of units."""
-    if len(cells) != len(names) or _numbers(cells):
+    if len(cells) > len(names) or _numbers(cells):
         return None
-    return [f"{name} [{cell.strip('[]() ')}]" if cell else name for name, cell in zip(names, cells, strict=True)]
+    below = [*cells, *[""] * (len(names) - len(cells))]
+    return [f"{name} [{cell.strip('[]() ')}]" if cell else name for name, cell in zip(names, below, strict=True)]
 
 
 def _numbers(cells: list[str]) -> int:

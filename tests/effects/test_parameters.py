@@ -36,7 +36,7 @@ def test_the_view_of_an_event_is_told_by_its_name(still_cells):
     # Of the views that are left, numbers and names stay those of the session.
     (without,) = (p for p in parameters_in(measurement.without([0]), EFFECTS["part_slip"]) if p.discrete)
     assert str(replace(without, value=2.0).told) == names[2]
-    assert str(replace(place, value=2.0, names=()).told) == "2 view"
+    assert str(replace(place, value=2.0, names=()).told) == "view 2, counted from 0"
 
 
 def test_unknown_and_impossible_effects_are_refused(still_cells):

@@ -61,7 +61,7 @@ def test_remarks_in_few_rows_and_units_in_a_row_of_their_own(tmp_path, units):
     (tmp_path / "t.csv").write_text(text, encoding="utf-8")
     table = read_number_table(tmp_path / "t.csv")
     assert table.numbers[:, 0].tolist() == [1.5, 2.5, 3.5] and table.numbers.shape == (3, 5)
-    assert table.header == (("x mm", "y", "z", "a", "b deg") if units else ("x", "y", "z", "a", "b"))
+    assert table.header == (("x [mm]", "y", "z", "a", "b [deg]") if units else ("x", "y", "z", "a", "b"))
     assert table.labels == (("",), ("cold",), ("",))
 
 

@@ -22,7 +22,8 @@ def smooth_sums(
     capture, half = measurement.capture, _half_field(measurement)
 
     def of_points(v: int, index: Indices) -> Array:
-        smooth = _undone(capture.scans[v].points[index], measurement.scan_views[v].cosine[index], half)
+        scan = capture.scans[v]
+        smooth = _undone(scan.points[index] - scan.eye, measurement.scan_views[v].cosine[index], half)
         if beside is None or not beside.steps:
             return smooth
         return np.concatenate([smooth, beside.at(v, freed.poses[v], index)])
@@ -45,20 +46,21 @@ def smooth_sums(
 
 def _half_field(measurement: Measurement) -> Array:
     """(2,) x/z and y/z up to which the scanner sees."""
-    slopes = np.concatenate([np.abs(scan.points[:, :2] / scan.points[:, 2:]) for scan in measurement.capture.scans])
+    away = np.concatenate([scan.points - scan.eye for scan in measurement.capture.scans])
+    slopes = np.abs(away[:, :2] / away[:, 2:])
     return np.asarray(np.maximum(np.quantile(slopes, _REACH, axis=0), 1e-6))
 
 
-def _undone(points: Array, cosine: Array, half: Array) -> Array:
-    """(K, N, 3) what undoes smooth errors along the rays of points (N, 3), scanner frame, per unit.
+def _undone(away: Array, cosine: Array, half: Array) -> Array:
+    """(K, N, 3) what undoes smooth errors along the rays (N, 3) from the scanner's eye to its points, per unit.
 
     Legendre products over the field, of unit rms together, and the slope with incidence.
     """
-    a, b = np.clip(points[:, :2] / points[:, 2:] / half, -1.2, 1.2).T
+    a, b = np.clip(away[:, :2] / away[:, 2:] / half, -1.2, 1.2).T
     powers = [legendre.legvander(x, _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1) for x in (a, b)]
     orders = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1) if 0 < i + j <= _DEGREE]
     weights = np.array([1.0 / (i + j) for i, j in orders])
     weights /= np.linalg.norm(weights)
     smooth = [w * powers[0][:, i] * powers[1][:, j] for w, (i, j) in zip(weights, orders, strict=True)]
-    rays = points / np.linalg.norm(points, axis=1)[:, None]
+    rays = away / np.linalg.norm(away, axis=1)[:, None]
     return np.asarray(-np.array([*smooth, 1 / cosine - 1])[..., None] * rays)
