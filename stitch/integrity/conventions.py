@@ -9,9 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from stitch.integrity.between_rows import between_rows
 from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
 from stitch.integrity.motion_fit import FEWEST, TRANSLATION_M, Explained, fit_motions, screened
+from stitch.integrity.parts_of_tables import parts_of_tables
 from stitch.integrity.relative_scans import RelativeScans
+from stitch.integrity.stuck_columns import stuck_columns
 from stitch.measurement.session import Session
 from stitch.units import METRES
 
@@ -33,6 +36,9 @@ def explained(session: Session, motions: RelativeScans) -> list[Explained]:
     tried = hypotheses(session)
     out = [fit_motions(tried[0], motions, length), _named_unit(fit_motions(tried[0], motions, length, scaled=True))]
     if out[0].closed < _ALL:
+        tried += stuck_columns(out[0], motions, length)
+        tried += between_rows(tried[0], motions, length)
+        tried += parts_of_tables(tried, motions, session.names)
         out += explained_by(tried, motions, session.length_unit)[1:]
     return sorted(out, key=lambda e: (e.open, e.hypothesis.kind != "stated"))
 

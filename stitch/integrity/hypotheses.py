@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.integrity.misread_positions import other_columns
+from stitch.integrity.misread_positions import other_columns, other_units
 from stitch.integrity.misread_rotations import degrees_for_radians, other_angles, other_quaternions
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Mount, Session
@@ -91,6 +91,8 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
     for name, moved in other_columns(position):
         yield Hypothesis("mirrored", frames.make(T[:, :3, :3], moved), mount, f"{name}: correct the table of poses")
+    for name, moved in other_units(position, UNITS):
+        yield Hypothesis("unit", frames.make(T[:, :3, :3], moved), mount, name)
     still = np.broadcast_to(np.eye(4), T.shape)
     yield Hypothesis(
         "mount",

@@ -1,6 +1,6 @@
 """Positions whose columns were read in another way than they were written, undone."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import permutations, product
 
 import numpy as np
@@ -24,3 +24,16 @@ def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
         if len(wrong) in (1, 2):
             have = "has" if len(wrong) == 1 else "have"
             yield f"{' and '.join(wrong)} of the positions {have} the wrong sign", position * signs
+
+
+def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[str, Array]]:
+    """Positions (V, 3) of which one column is in another unit than the rest, and what that undoes.
+
+    Args:
+        units: factors by which lengths may be too large, and how that comes about.
+    """
+    for column, axis in enumerate(_AXES):
+        for factor, words in units.items():
+            right = np.array(position)
+            right[:, column] /= factor
+            yield f"{axis} of the positions alone is in {words}: convert this column", right

@@ -35,6 +35,38 @@ def _as_text(views):
     return sorted(range(views), key=lambda v: str(v + 1))
 
 
+def _column(axis, change):
+    def apply(T):
+        T = T.copy()
+        T[:, axis, 3] = change(T[:, axis, 3])
+        return T
+
+    return _of(apply)
+
+
+def _midway(T, ahead):
+    """Poses interpolated to half a step: turned evenly, moved along lines; the last one has no neighbour."""
+    there = np.clip(np.arange(len(T)) + ahead, 0, len(T) - 1)
+    R = Rotation.from_matrix(T[:, :3, :3])
+    turned = R * Rotation.from_rotvec(0.5 * (R.inv() * R[there]).as_rotvec())
+    return frames.make(turned.as_matrix(), (T[:, :3, 3] + T[there, :3, 3]) / 2)
+
+
+def _midway_by_screws(T, ahead):
+    there = np.clip(np.arange(len(T)) + ahead, 0, len(T) - 1)
+    return T @ frames.exp(0.5 * frames.log(frames.inverse(T) @ T[there]))
+
+
+def _rows_turned(rows):
+    def change(R):
+        angles = R.as_euler("ZYX")
+        return Rotation.concatenate(
+            [Rotation.from_euler("xyz" if v in rows else "ZYX", own) for v, own in enumerate(angles)]
+        )
+
+    return _turned(change)
+
+
 MISTAKES = {
     "inverse": (_of(frames.inverse), ("inverse",)),
     # Poses without joints: the other mount is the same as poses inverted.
@@ -57,5 +89,14 @@ MISTAKES = {
     "shifted by one": (_of(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),
     "shifted by two": (_of(lambda T: np.roll(T, -2, axis=0)), ("shifted",)),
     "reversed": (_of(lambda T: T[::-1]), ("reversed",)),
+    "x in inches": (_column(0, lambda x: x / 25.4), ("unit",)),
+    "z in metres": (_column(2, lambda z: z / 1000), ("unit",)),
+    "z stuck": (_column(2, lambda z: 0 * z + 412.5), ("scale",)),
+    "y stuck": (_column(1, lambda y: 0 * y), ("scale",)),
+    "half a row late": (_of(lambda T: _midway(T, -1)), ("shifted",)),
+    "half a row early": (_of(lambda T: _midway(T, 1)), ("shifted",)),
+    "half a row late by screws": (_of(lambda T: _midway_by_screws(T, -1)), ("shifted",)),
+    "last rows in another order": (_rows_turned(range(5, 10)), ("euler",)),
+    "first rows in another order": (_rows_turned(range(4)), ("euler",)),
     "two exchanged": (_of(_exchanged), ("exchanged",)),
 }
