@@ -87,7 +87,7 @@ def admission(session: Session, measurement: Measurement, correction: Correction
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
     told = (*said_of_targets(session, own.sightings), *doubts_of(session, own, found, T_mount))
-    if not any(beyond_any_arm(session, step.rotation, step.distance) for step in found.steps):
+    if not any(beyond_any_arm(session, *step.at_least) for step in found.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         found = replace(found, steps=())
     problems = explain(session, own, T_mount, found) if found.left_out else []
@@ -121,7 +121,7 @@ def _examined(session: Session, measurement: Measurement, correction: Correction
     found = snoop(correction.captures[index], correction.model.T_mount, gate, correction.freed[index], usual)
     if len(session.views) >= MANY_VIEWS:
         # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
-        large = (step for step in found.steps if beyond_any_arm(session, step.rotation, step.distance))
+        large = (step for step in found.steps if beyond_any_arm(session, *step.at_least))
         found = replace(found, steps=tuple(large))
     return judged_by_size(session, found)
 

@@ -1,5 +1,6 @@
 """What no arm does: scatter, and displacements of single views, beyond which poses and scans contradict each other."""
 
+from stitch.integrity.amounts import off_by
 from stitch.integrity.snooping import Misplaced, Snooping
 from stitch.measurement.session import Session
 from stitch.units import METRES
@@ -38,8 +39,8 @@ def beyond_any_arm(session: Session, rotation: float, translation: float) -> boo
 
 def stands_off(session: Session, found: Misplaced) -> str:
     """How far a suspected view stands off, in words."""
-    rotation, distance = found.at_least
-    return f"stands off by at least {distance:.3g} {session.length_unit} and {1e3 * rotation:.3g} mrad"
+    amount = off_by(found.at_least, found.at_least, session.length_unit)
+    return f"stands off by at least {amount}" if amount else "stands out, by how much its surface does not tell"
 
 
 def contradicted_by(session: Session, found: Snooping) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from stitch.frames import Array
 from stitch.integrity.left_alone import left_alone
-from stitch.integrity.steps import Step
+from stitch.integrity.step import Step
 from stitch.integrity.view_test import Projector, Test, ViewModel, beside, projector, test
 from stitch.statistics.variance_components import VarianceFit
 

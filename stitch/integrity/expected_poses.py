@@ -7,8 +7,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.blunders import columns_of
 from stitch.integrity.pose_tests import PoseTests
-from stitch.integrity.view_test import ViewModel
+from stitch.integrity.smallest import smallest
+from stitch.integrity.view_test import ViewModel, projector, test
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.statistics.least_squares import least_squares
 
@@ -24,17 +26,24 @@ def expected_poses(model: ViewModel, model_poses: Array, freed: FreePoses, tests
         (V, 4, 4) T_reference_scanner.
     """
     alone = [*tests.alone, *(b.view for b in tests.found.blunders)]
+    moved = [_displaced(model, tests, alone, k) for k in range(len(tests.steps))]
+    z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
     singles = model.columns(alone)
-    common = [model.hand_eye, *(step.columns(model) for step in tests.steps)]
-    X = np.column_stack(common if singles is None else [*common, singles])
+    X = model.hand_eye if singles is None else np.column_stack([model.hand_eye, singles])
     CX = np.linalg.solve(model.mixed().covariance(tests.found.fit.variances)[0], X)
-    estimate = least_squares(X.T @ CX, -CX.T @ model.z)
-    twists = model.mount_twists @ estimate[:6]
-    for k, step in enumerate(tests.steps, start=1):
+    twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
+    for step, by in zip(tests.steps, moved, strict=True):
         own = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]
-        twists[step.start :] += own @ estimate[6 * k : 6 * k + 6]
+        twists[step.start :] += own @ by
     twists[:, :3] /= model.lever
     # Surfaces do not say where all views together stand.
     twists += np.mean(np.delete(freed.twists - twists, alone, axis=0), axis=0)
     to_centre = frames.make(np.eye(3), -model.centre)
     return np.asarray(frames.inverse(to_centre) @ frames.exp(twists) @ to_centre @ model_poses)
+
+
+def _displaced(model: ViewModel, tests: PoseTests, alone: list[int], k: int) -> Array:
+    """(6,) the least that step k may have moved, rotations in 1/lever: along itself a part slides unseen."""
+    others = columns_of(model, alone, (*tests.steps[:k], *tests.steps[k + 1 :]))
+    under = projector(model, tests.found.fit, others)
+    return smallest(test(under, tests.steps[k].columns(model)), under.degrees)

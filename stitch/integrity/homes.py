@@ -1,6 +1,6 @@
 """Where the views of a capture belong by their surfaces: freed, and those that nothing links tried wide."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,10 @@ class Homes:
     lines: list[int]  # views whose points lie in a line
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
+
+    def seen_from(self, model_poses: Array) -> "Homes":
+        """The same against other poses (V, 4, 4) by the robot."""
+        return replace(self, freed=self.freed.seen_from(model_poses))
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:

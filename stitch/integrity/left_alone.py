@@ -13,6 +13,7 @@ def left_alone(model: ViewModel, columns: Array | None, view: int) -> tuple[Test
     """
     own = model.views[view]
     under = projector(model, model.fit(beside(columns, own)), columns)
-    tested = test(under, own)
+    # Where a scan slides it rests anywhere.
+    tested = test(under, model.alone[view])
     free = max((under.degrees - tested.degrees) // 2, 1)
     return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)

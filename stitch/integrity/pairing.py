@@ -2,28 +2,27 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.amounts import off_by
 from stitch.integrity.common_step import common_step
 from stitch.integrity.linkage import only
 from stitch.integrity.one_joint import one_joint
+from stitch.integrity.other_rows import changed_places, closed_rounds, rows_of
 from stitch.integrity.placing import shows_no_surface, surface_of
 from stitch.integrity.problems import Problem
 from stitch.integrity.scan_faults import ScanFault, copies, same_poses, scale_fault, scan_fault
 from stitch.integrity.snooping import Misplaced, Snooping
-from stitch.integrity.unlinked_views import CLOSE_SHARE
 from stitch.integrity.view_names import listed
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.session import Session
 
-# A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
-# (`CLOSE_SHARE` of the part's size).
-_CLOSER = 0.2
 _TORN = (
     "a part of this scan contradicts the other scans wherever it is put: the part or the scanner moved meanwhile, or "
     "two scans are in one file; scan again or leave the view out"
+)
+_CHANGED = (
+    "the scan of {0} fits the pose of {1}, whose own scan belongs elsewhere and shows too little of the others to tell "
+    "where: exchange the clouds of {0} and {1} in views.csv, or leave both out"
 )
 _COPY = "this scan is a copy of that of {}: put the right file in its row"
 
@@ -36,7 +35,7 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
     names = session.names
-    poses = capture.poses(T_mount)
+    poses = found.expected
     out, told = [], set[int]()
     for v, w in copies(capture):
         bad = _worse(found, v, w)
@@ -44,11 +43,15 @@ def explain(session: Session, capture: Capture, T_mount: Array, found: Snooping)
         good = v if bad == w else w
         out.append(Problem("duplicate_scan", (names[v], names[w]), _COPY.format(names[good])))
     misplaced = [m for m in found.misplaced if m.view not in told]
-    rows = {m.view: _row_of(capture, poses, m) for m in misplaced if m.T is not None}
-    cycles = _cycles(rows)
+    rows = rows_of(capture, found, misplaced)
+    cycles = closed_rounds(rows)
     for cycle in cycles:
         told |= set(cycle)
         out.append(Problem("exchanged", tuple(only(cycle, names)), _exchange(cycle, rows, names)))
+    left = {v: row for v, row in rows.items() if v not in told}
+    for v, row in changed_places(left, [m for m in misplaced if m.view not in told]):
+        told |= {v, row}
+        out.append(Problem("exchanged", tuple(only(sorted((v, row)), names)), _CHANGED.format(names[v], names[row])))
     step = common_step(capture, poses, [m for m in misplaced if m.view not in told]) if not found.steps else None
     if step is not None:
         told |= set(step[0])
@@ -72,31 +75,6 @@ def _worse(found: Snooping, v: int, w: int) -> int:
     return v if v in found.left_out and w not in found.left_out else w
 
 
-def _row_of(capture: Capture, poses: Array, m: Misplaced) -> int | None:
-    """The row to whose pose a misplaced scan belongs, if to another one."""
-    assert m.T is not None
-    points = capture.scans[m.view].points[::50]
-    there = frames.transform(m.T, points)
-    off = np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1))
-    best = int(np.argmin(off))
-    close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER * off[m.view]
-    return best if close and best != m.view else None
-
-
-def _cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
-    """Closed rounds of scans that stand in each other's rows."""
-    out, seen = [], set[int]()
-    for start in sorted(rows):
-        path, at = [start], rows[start]
-        while at is not None and at not in path and at not in seen:
-            path.append(at)
-            at = rows.get(at)
-        if at == start and len(path) > 1:
-            out.append(tuple(path))
-            seen |= set(path)
-    return out
-
-
 def _exchange(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
     if len(cycle) == 2:
         return f"exchange the clouds of {names[cycle[0]]} and {names[cycle[1]]} in views.csv"
@@ -109,7 +87,7 @@ def _single(
 ) -> Problem:
     names = session.names
     own = (names[m.view],)
-    fault = _fault(capture, T_mount, found, m)
+    fault = _fault(capture, found, m)
     if fault is not None:
         return Problem(fault.kind, own, fault.fix)
     if m.kind == "torn":
@@ -118,26 +96,27 @@ def _single(
         return Problem(
             "foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out"
         )
-    amount = f"{m.distance:.4g} {session.length_unit} and {np.degrees(m.rotation):.3g}°"
+    amount = off_by((m.rotation, m.distance), m.at_least, session.length_unit)
+    off = f"off by {amount}" if amount else "off, by how much its surface does not tell"
     partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
     if partner is not None:
         joint = session.views[m.view].joints is not None and abs(partner - m.view) == 1
         kind = "joint_row" if joint else "duplicate_pose"
         what = "joint angles" if joint else "pose"
-        fix = f"{own[0]} has the {what} of {names[partner]}, and is off by {amount}: put in its own"
+        fix = f"{own[0]} has the {what} of {names[partner]}, and is {off}: put in its own"
         return Problem(kind, (*own, names[partner]), fix)
     digit = one_joint(session, capture, T_mount, m)
     if digit is not None:
         joint_name, stated, fits, neighbour = digit
         kind = "joint_row" if neighbour else "displaced"
-        reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit ({amount} off)"
+        reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit (it is {off})"
         return Problem(kind, own, f"{reads}: correct it or leave the view out")
-    return Problem("displaced", own, f"its pose is off by {amount}: correct the row, scan again or leave the view out")
+    return Problem("displaced", own, f"its pose is {off}: correct the row, scan again or leave the view out")
 
 
-def _fault(capture: Capture, T_mount: Array, found: Snooping, m: Misplaced) -> ScanFault | None:
+def _fault(capture: Capture, found: Snooping, m: Misplaced) -> ScanFault | None:
     """What is wrong with the cloud of a view, rather than with its pose."""
-    scan, T_pose = capture.scans[m.view], capture.poses(T_mount)[m.view]
+    scan, T_pose = capture.scans[m.view], found.expected[m.view]
     if shows_no_surface(scan):
         return None
     others = [v for v in found.linkage.core if v != m.view]

@@ -25,6 +25,8 @@ _FLIPS = {
 }
 # Factors that are looked for; nearer to one than the last, scanners differ from robots.
 _LEAST_SCALE, _NEAR_ONE = 0.5, 1e-3
+# Of the part's size: how far a scan may be moved whose pose is right.
+_STAYS = 0.03
 # Of the shift that a scale makes along the ray, the share that its own uncertainty may leave.
 _RANGE_LEFT = 0.3
 
@@ -46,18 +48,20 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
         needed: closure that counts as closed.
     """
 
-    def closes(points: Array, eye: Array, wide: bool) -> float:
+    def closes(points: Array, eye: Array, reach: float) -> float:
         other = prepare_view(scan.name, points, eye=eye)
-        found = [judge(other, T_pose, surface)]
-        if wide:
-            found += place(other, surface, starts_about(T_pose, other, size), size)[:1]
-        return max(f.closure if f.near > 0.3 else 0.0 for f in found)
+        found = [judge(other, T_pose, surface), *place(other, surface, starts_about(T_pose, other, size), size)[:1]]
+        middle = other.points.mean(axis=0)[None]
+        moved = [np.linalg.norm(frames.transform(f.T, middle) - frames.transform(T_pose, middle)) for f in found]
+        return max(f.closure if f.near > 0.3 and m < reach else 0.0 for f, m in zip(found, moved, strict=True))
 
-    for words, flip in _FLIPS.items():
-        if closes(scan.points @ flip, scan.eye @ flip, True) > needed:
-            return ScanFault("mirrored", f"{words} in this cloud: export it again")
+    # The pose of a mirrored scan is right: on a part that looks alike in a mirror, others close elsewhere too.
+    near = _STAYS * size
+    mirrored = [w for w, flip in _FLIPS.items() if closes(scan.points @ flip, scan.eye @ flip, near) > needed]
+    if len(mirrored) == 1:
+        return ScanFault("mirrored", f"{mirrored[0]} in this cloud: export it again")
     for factor, words in UNITS.items():
-        if closes(scan.points / factor, scan.eye / factor, True) > needed:
+        if closes(scan.points / factor, scan.eye / factor, np.inf) > needed:
             return ScanFault(
                 "unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit"
             )

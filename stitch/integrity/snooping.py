@@ -13,6 +13,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.across_steps import across_steps
 from stitch.integrity.blunders import Found, find_blunders
 from stitch.integrity.expected_poses import expected_poses
 from stitch.integrity.homes import Homes, find_homes
@@ -20,7 +21,7 @@ from stitch.integrity.least_displacement import least_displacement
 from stitch.integrity.linkage import Linkage
 from stitch.integrity.placing import judge, place, surface_of
 from stitch.integrity.pose_tests import PoseTests, pose_tests
-from stitch.integrity.steps import Step
+from stitch.integrity.step import Step
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_test import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
@@ -37,7 +38,7 @@ class Misplaced:
     distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
     p_value: float  # family-wise, 0 where it is not even linked
     T: Array | None  # (4, 4) T_reference_scanner where the surface puts it
-    at_least: tuple[float, float] = (0.0, 0.0)  # the two of the smallest displacement that is likely, of a suspect
+    at_least: tuple[float, float] = (0.0, 0.0)  # rotation and distance of the smallest displacement that is likely
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Snooping:
     model: ViewModel
     found: Found
     freed: FreePoses  # with the views where they belong
+    expected: Array  # (V, 4, 4) T_reference_scanner by the robot, steps with it
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
 
@@ -111,29 +113,30 @@ def snoop(
     """
     model_poses = capture.poses(T_mount)
     freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
-    homes = find_homes(capture, model_poses, freed)
+    homes = find_homes(capture, *across_steps(capture, T_mount, freed, usual)).seen_from(model_poses)
     model = view_model(capture, T_mount, homes.freed)
-    tests = pose_tests(model, homes, usual)
+    tests = pose_tests(model, homes.freed, (homes.homeless, list(homes.placed)), usual)
     expected = expected_poses(model, model_poses, homes.freed, tests) if tests.steps else model_poses
-    standing_out = _standing_out(capture, expected, homes, tests)
+    standing_out = [_sized(capture, model, homes, tests, m) for m in _standing_out(capture, expected, homes, tests)]
     # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
     torn = {v for v in homes.torn if v not in homes.homeless}
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
         again = find_blunders(model.with_usual(usual.twists(homes.freed)), tests.alone, tests.steps)
-        sure &= {b.view for b in again.blunders} | {b.view for b in tests.off} | torn
+        sure &= {b.view for b in again.blunders} | tests.sure | torn
     groups = homes.groups
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.homeless if (v,) in groups]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
     return Snooping(
         linkage=homes.linkage,
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
-        suspected=tuple(_suspect(capture, model, homes, tests, m) for m in standing_out if m.view not in sure),
+        suspected=tuple(m for m in standing_out if m.view not in sure),
         steps=tests.steps,
         disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
         found=tests.found,
         freed=homes.freed,
+        expected=expected,
         tolerance=homes.tolerance,
         needed=homes.needed,
     )
@@ -148,7 +151,7 @@ def _standing_out(capture: Capture, expected: Array, homes: Homes, tests: PoseTe
     return out + [_misplaced(capture, expected[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known]
 
 
-def _suspect(capture: Capture, model: ViewModel, homes: Homes, tests: PoseTests, m: Misplaced) -> Misplaced:
+def _sized(capture: Capture, model: ViewModel, homes: Homes, tests: PoseTests, m: Misplaced) -> Misplaced:
     others = [v for v in (*tests.alone, *(b.view for b in tests.found.blunders)) if v != m.view]
     middle = frames.transform(homes.freed.poses[m.view], capture.scans[m.view].points.mean(axis=0)[None])[0]
     return replace(m, at_least=least_displacement(model, tests.found, others, tests.steps, m.view, middle))

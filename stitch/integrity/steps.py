@@ -8,15 +8,12 @@ the pose is no step, so the scatter holds all by which poses of a good session m
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from stitch.frames import Array
+from stitch.integrity.step import BOTH, Step, What, likelier_step, step_columns
 from stitch.integrity.view_test import ViewModel, beside, projector, test
-from stitch.units import angle_text, length_text
-
-What = Literal["part", "scanner"]
 
 # That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
 # without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
@@ -28,39 +25,8 @@ MANY_VIEWS = 100
 _SIDE, _MOST = 2, 3
 # Fewer views than this show no step beside their scatter.
 _FEWEST = 6
-_BOTH: tuple[What, What] = ("part", "scanner")
 # Less of its columns than this outside the mean is rounding.
 _NEW = 1e-6
-# −2 log likelihood of part against scanner at odds of 20 to 1; closer ones these views do not tell apart.
-_TOLD = 2 * np.log(20)
-
-
-@dataclass(frozen=True)
-class Step:
-    """From view `start` on all views share one displacement."""
-
-    start: int
-    moved: What
-    told: bool  # the other one of the two is clearly less likely
-    rotation: float  # rad
-    distance: float  # length_unit, of the middle of the part as it is seen
-    p_value: float  # all change points counted
-
-    def said(self, names: Sequence[str], length_unit: str) -> str:
-        """What happened and what to do, in words."""
-        before, after = names[self.start - 1], names[self.start]
-        off = f"{length_text(self.distance, length_unit)} and {angle_text(self.rotation, 2)}"
-        other = "scanner" if self.moved == "part" else "part"
-        unsure = "" if self.told else f" (or the {other}: these views do not tell which)"
-        further = ", or add the effect part_slip" if self.moved == "part" and self.told else ""
-        return (
-            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {off} off at the part: no hand-eye holds "
-            f"before and after. Make two sessions of it, one up to {before} and one from {after} on{further}."
-        )
-
-    def columns(self, model: ViewModel) -> Array:
-        """(n, 6) of the displacement."""
-        return step_columns(model, self.start, self.moved)
 
 
 def find_steps(
@@ -75,14 +41,11 @@ def find_steps(
         chance: that a session without a step shows one.
     """
     found, columns = _searched(model, first, chance)
-    if singles[1] and (not found or _criterion(model, singles[0]) < _criterion(model, columns)):
-        found, _ = _searched(model, singles[0], chance)
+    if singles[1]:
+        beside_them, every = _searched(model, singles[0], chance)
+        if not found or _criterion(model, every) < _criterion(model, columns):
+            found = beside_them
     return tuple(sorted(found, key=lambda s: s.start))
-
-
-def step_columns(model: ViewModel, start: int, moved: str) -> Array:
-    """(n, 6) of a displacement that views from `start` on have in common."""
-    return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
 
 
 @dataclass(frozen=True)
@@ -91,6 +54,7 @@ class _Pick:
 
     columns: Array  # (n, 6)
     p_value: float
+    tests: int  # of which it is the likeliest
     starts: dict[What, int] | None = None  # where the step of each begins; None: a single view
 
 
@@ -106,15 +70,24 @@ def _searched(model: ViewModel, first: Array | None, chance: float) -> tuple[lis
         if pick is None:
             break
         picked.append(pick)
-        significant = len(picked) if picked[-1].p_value < chance else significant
+        p = min(pick.p_value, _together(model, first, picked)) if len(picked) > significant + 1 else pick.p_value
+        significant = len(picked) if p < chance else significant
     picked = picked[:significant]
     steps = []
     for pick in picked:
         if pick.starts is not None:
             others = _beside(first, [other for other in picked if other is not pick])
-            steps.append(_step(model, others, pick.starts))
+            steps.append(likelier_step(model, others, pick.starts, _tests(model)))
     # What was picked early may stand out no more beside the rest.
     return [step for step in steps if step.p_value < chance], _beside(first, picked)
+
+
+def _together(model: ViewModel, first: Array | None, picked: Sequence[_Pick]) -> float:
+    """Chance of the last two: each may hide in the scatter that the other makes, and then neither stands out alone."""
+    *rest, one, other = picked
+    columns = _beside(first, rest)
+    both = test(projector(model, model.fit(columns), columns), np.column_stack([one.columns, other.columns]))
+    return both.p_value * one.tests * other.tests
 
 
 def _starts(picked: Sequence[_Pick]) -> list[dict[What, int]]:
@@ -131,7 +104,7 @@ def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, in
     """The likeliest step, or the single view that is off, beside some columns; None where these leave no view."""
     under = projector(model, model.fit(columns), columns)
     starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in [k for own in taken for k in own.values()]]
-    tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in _BOTH for k in starts}
+    tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in BOTH for k in starts}
     mean = model.mixed(columns).A[0]
     alone = {v: test(under, own) for v, own in enumerate(model.views) if not _held(own, mean)}
     if not alone:
@@ -139,10 +112,10 @@ def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, in
     view = min(alone, key=lambda v: (alone[v].p_value, -alone[v].statistic))
     likelier = min(tests, key=lambda at: (tests[at].p_value, -tests[at].statistic))
     if (alone[view].p_value, -alone[view].statistic) < (tests[likelier].p_value, -tests[likelier].statistic):
-        return _Pick(model.views[view], alone[view].p_value * model.count)
-    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in _BOTH}
+        return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
+    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in BOTH}
     moved, start = likelier
-    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * _tests(model), best)
+    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * _tests(model), _tests(model), best)
 
 
 def _held(columns: Array, mean: Array) -> bool:
@@ -153,22 +126,7 @@ def _held(columns: Array, mean: Array) -> bool:
 
 def _tests(model: ViewModel) -> int:
     """How many steps are tested."""
-    return len(_BOTH) * (model.count - 2 * _SIDE + 1) * _MOST
-
-
-def _step(model: ViewModel, columns: Array | None, best: dict[What, int]) -> Step:
-    """The likelier one of the best step of the part and of the scanner, with its size."""
-    own = {moved: beside(columns, step_columns(model, best[moved], moved)) for moved in _BOTH}
-    deviance = {moved: model.deviance(own[moved]) for moved in _BOTH}
-    likelier = min(_BOTH, key=lambda moved: deviance[moved])
-    told = bool(abs(deviance["part"] - deviance["scanner"]) > _TOLD)
-    start = best[likelier]
-    displaced = step_columns(model, start, likelier)
-    p = test(projector(model, model.fit(columns), columns), displaced).p_value * _tests(model)
-    estimate = test(projector(model, model.fit(own[likelier]), columns), displaced).estimate
-    moved = (model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]) @ estimate
-    turn, shift = (float(np.median(np.linalg.norm(half, axis=1))) for half in (moved[:, :3], moved[:, 3:]))
-    return Step(start, likelier, told, turn / model.lever, shift, p)
+    return len(BOTH) * (model.count - 2 * _SIDE + 1) * _MOST
 
 
 def _criterion(model: ViewModel, columns: Array | None) -> float:

@@ -51,7 +51,8 @@ def placed_views(
     placed = placed_groups(capture, poses, linked, limits)
     for v, placement in placed.items():
         poses[v] = placement.T
-    core, waiting = [*linked.core, *placed], [v for v in linked.unlinked if v not in placed]
+    alone = [v for v in linked.unlinked if v not in placed]
+    core, waiting = [*linked.core, *placed], alone
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
         new = {}
@@ -74,7 +75,19 @@ def placed_views(
         placed |= new
         core += list(new)
         waiting = [v for v in waiting if v not in new]
-    return placed, waiting
+    unsure = {v for v in set(alone) & set(placed) if _unsure(capture, linked, model_poses, v, placed[v])}
+    return {v: at for v, at in placed.items() if v not in unsure}, sorted([*waiting, *unsure])
+
+
+def _unsure(capture: Capture, linked: Linkage, model_poses: Array, view: int, placed: Placement) -> bool:
+    """True for a view of a group that was placed alone, and at no row's pose.
+
+    What displaces the views of a group they share: where all of them together closed nowhere, each of them may still
+    close where the part looks alike.
+    """
+    in_group = any(view in group and len(group) > 1 for group in linked.components[1:])
+    far = _from_rows(capture.scans[view], [placed], model_poses)[0] > CLOSE_SHARE * part_size([capture])
+    return in_group and far
 
 
 def _likeliest(
@@ -82,12 +95,17 @@ def _likeliest(
 ) -> Placement | None:
     """Of the placements that close the one nearest to any row's pose: a part may look alike from several sides."""
     needed, size = limits
-    points = scan.points[::50]
-    rows = frames.transform(model_poses, points)
-    away = [np.sqrt(((rows - frames.transform(p.T, points)) ** 2).sum(axis=2).mean(axis=1)).min() for p in found]
+    away = _from_rows(scan, found, model_poses)
     limit = [needed * (_AT_A_ROW if a < CLOSE_SHARE * size else 1.0) for a in away]
     closed = [i for i, p in enumerate(found) if p.closure > limit[i]]
     return found[min(closed, key=lambda i: away[i])] if closed else None
+
+
+def _from_rows(scan: Scan, found: Sequence[Placement], model_poses: Array) -> list[float]:
+    """How far each placement is from the nearest row's pose, rms of the points."""
+    points = scan.points[::50]
+    rows = frames.transform(model_poses, points)
+    return [float(np.sqrt(((rows - frames.transform(p.T, points)) ** 2).sum(axis=2).mean(axis=1)).min()) for p in found]
 
 
 def _usual(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:

@@ -9,6 +9,7 @@ from scipy import stats
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
+from stitch import frames
 from stitch.integrity.blunders import find_blunders
 from stitch.integrity.least_displacement import least_displacement
 from stitch.integrity.view_test import ViewModel
@@ -57,3 +58,20 @@ def test_scans_that_slide_along_a_plate_cost_no_view_beside_backlash():
     scene = replace(scene, scanner=replace(scene.scanner, columns=120, rows=120))
     plate = with_part(scene, "curved_drill_plate", length=150.0, width=120.0, pitch=36.0, radius=150.0)
     assert run(session_of(simulated(plate, {"backlash": 3.0}, 9042, 14))).left_out == ()
+
+
+@pytest.mark.slow
+def test_views_behind_a_step_are_not_called_displaced_where_the_part_looks_alike():
+    """From half way on a plate sits 3 mm elsewhere; three right scans of its other side were called 120° off."""
+    scene = load_scene("blade-table")
+    scene = replace(scene, scanner=replace(scene.scanner, columns=120, rows=120))
+    plate = with_part(scene, "curved_drill_plate", length=150.0, width=120.0, pitch=36.0, radius=150.0)
+    session, views = session_of(simulated(plate, {}, 9086, 12)), []
+    rng = np.random.default_rng([9086, 11])
+    turn, shift = rng.standard_normal((2, 3))
+    K = frames.exp(np.r_[6e-3 * turn / np.linalg.norm(turn), 3 * shift / np.linalg.norm(shift)])
+    for v, view in enumerate(session.views):
+        T = view.T_base_flange if v < 6 else K @ view.T_base_flange
+        views.append(replace(view, T_base_flange=T, joints=None))
+    gone = run(replace(session, views=tuple(views))).left_out
+    assert gone and all("clamped anew between v005 and v006" in item.why for item in gone)

@@ -50,8 +50,8 @@ def stepped(model, *starts, times=30.0):
 def test_a_common_displacement_is_found_where_it_begins_with_its_size(start):
     (found,) = steps(stepped(direct(5), start))
     assert found.start == start and found.p_value < 1e-6
-    assert found.distance == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
-    assert found.rotation == pytest.approx(30 * np.linalg.norm(STEP[:3]), rel=0.1)
+    assert found.size[1] == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
+    assert found.size[0] == pytest.approx(30 * np.linalg.norm(STEP[:3]), rel=0.1)
 
 
 def test_part_and_scanner_that_look_alike_are_not_told_apart():
@@ -87,7 +87,7 @@ def test_one_view_in_the_middle_that_is_off_is_no_two_steps():
 def test_a_step_is_found_beside_a_view_farther_off():
     (found,) = steps(off(stepped(direct(10), 9), 4))
     assert found.start == 9
-    assert found.distance == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
+    assert found.size[1] == pytest.approx(30 * np.linalg.norm(STEP[3:]), rel=0.1)
 
 
 def test_half_of_the_views_let_go_explain_a_step_no_better_than_the_step():
