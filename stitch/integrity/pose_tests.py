@@ -1,6 +1,6 @@
 """Tests of the poses of all views: which one is off under the scatter of the others, and from where on all are."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from stitch.integrity.blunders import Blunder, Found, find_blunders, off_anyway
 from stitch.integrity.step import Step
@@ -18,7 +18,9 @@ class PoseTests:
     off: list[Blunder]  # stand off whatever the others scatter
     found: Found  # the rest of them, under the scatter of the others
     steps: tuple[Step, ...]
-    sure: set[int]  # of `off`, what effects of the arm do not explain in sizes that the others show
+    sure: set[int] = field(
+        default_factory=set
+    )  # of `off`, what effects of the arm do not explain in sizes that the others show
 
     @property
     def alone(self) -> list[int]:

@@ -140,5 +140,5 @@ def test_a_knock_of_the_scanner_is_said_in_the_first_line(good):
     found = run(knocked(good, 6, [0, 0, 0, 2.7, 0, 3.6]))
     said = run_verdict(found, model_history(found))
     assert found.left_out == () and len(found.doubts) == 1
-    assert said.startswith("From view v006 on the scanner sits elsewhere, 4.")
+    assert said.startswith("From view v006 on the scanner sits elsewhere, at least 4.")
     assert "one up to v005 and one from v006 on" in said
