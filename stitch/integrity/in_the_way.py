@@ -58,14 +58,18 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
         others = [w for w in views if w != v]
         asked = [others[i] for i in np.linspace(0, len(others) - 1, min(len(others), _ASKED)).astype(int)]
         points = scans[v].points[sample(scans[v], _PROBES)]
-        shown, through = np.zeros((2, len(points)), bool)
+        seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
+        apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
+        # Most are shown by the first scans that are asked; only the rest can be in the way.
+        alone, count = points, len(points)
         for w in asked:
-            there = np.ascontiguousarray(frames.transform(frames.inverse(poses[w]) @ poses[v], points))
-            apart = max(_APART * size, _SPACINGS * scans[w].spacing)
-            shown |= scans[w].tree.query(there, k=1)[0] < apart
-            through |= _looks_through(scans[w], looks[w], there, apart)
-        found = through & ~shown
-        shares[v] = float(found.mean()) if found.sum() >= _FEWEST else 0.0
+            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+            alone = alone[scans[w].tree.query(there, k=1)[0] >= apart[w]] if len(alone) else alone
+        through = np.zeros(len(alone), bool)
+        for w in asked if len(alone) >= _FEWEST else ():
+            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+            through |= _looks_through(scans[w], looks[w], there, apart[w])
+        shares[v] = through.sum() / count if through.sum() >= _FEWEST else 0.0
     told = tuple(v for v, share in shares.items() if share > _WORTH)
     return InTheWay(told, float(np.mean([shares[v] for v in told]))) if told else None
 
