@@ -36,7 +36,9 @@ def field_scatter(measurement: Measurement, freed: FreePoses, share: float | Non
     twists = seen_twists(sums, freed)
     if not np.isfinite(noise):
         return np.zeros_like(twists)
-    return np.asarray(twists * noise * (ShownErrors.of(sums, freed, noise).shares if share is None else share))
+    if share is None:
+        return np.asarray(twists * noise * ShownErrors.of(sums, twists, freed.overlaps.gram, noise).shares)
+    return np.asarray(twists * noise * share)
 
 
 def field_scatters(measurements: Sequence[Measurement], freed: Sequence[FreePoses]) -> list[Array]:
@@ -65,9 +67,9 @@ def field_error(
     sums, noise = smooth_sums(measurement, freed, PointSlopes.of(measurement, model, beside))
     if not np.isfinite(noise):
         return FieldError(0.0, 0.0, unusual=False, over_noise=False)
-    shown = ShownErrors.of(sums, freed, noise, sum(len(term.parameters) for term in beside))
+    further = sum(len(term.parameters) for term in beside)
+    shown = ShownErrors.of(sums, seen_twists(sums, freed), freed.overlaps.gram, noise, further)
     (share, _), free = shown.likeliest(SHARES[1])
-
     gain, over_noise = (0.5 * (shown.likeliest(most)[1] - free) for most in (ALARM_SHARE, 1.0))
     # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
     unusual, over = (0.5 * chi2_tail(2 * nats, 1) < alpha for nats in (gain, over_noise))

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from stitch.frames import Array, Indices
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.point_gram import PointGram, seen_twists
+from stitch.observations.surfaces.gram import Gram
+from stitch.observations.surfaces.point_gram import PointGram
 
 # What every scanner has, as a share of its noise along the ray, and the spread of its logarithm; what is asked at all.
 USUAL_SHARE, _SPREAD, SHARES = 0.3, 0.7, (0.01, 10.0)
@@ -30,10 +30,9 @@ class ShownErrors:
     scatter: Array  # (n,) variances of `seen` without errors
 
     @classmethod
-    def of(cls, sums: PointGram, freed: FreePoses, noise: float, beside: int = 0) -> "ShownErrors":
-        """Beside the last so many parameters of the sums, which may have any size."""
-        g = freed.overlaps.gram
-        own = seen_twists(sums, freed).reshape(g.views, 6, -1)
+    def of(cls, sums: PointGram, twists: Array, g: Gram, noise: float, beside: int = 0) -> "ShownErrors":
+        """Beside the last so many parameters of the sums, which may have any size; twists (6V, K) of their views."""
+        own = twists.reshape(g.views, 6, -1)
         # What the poses do not follow: Σ g² less what moving the views takes away.
         followed = np.einsum("pik,pil->kl", sums.vector, own[g.pairs[:, 0]] - own[g.pairs[:, 1]])
         M, pull = sums.square.sum(axis=0) - (followed + followed.T) / 2, sums.residual.sum(axis=0)
