@@ -35,6 +35,8 @@ class PointSlopes:
         return self._differences(lambda terms: shift_targets(self.measurement, terms, poses))
 
     def _differences(self, moved: Callable[[Sequence[Term]], Array]) -> Array:
+        if not self.steps:
+            return moved(())[None][:0]
         return np.array([(moved(s.up) - moved(s.down)) / s.apart for s in self.steps])
 
 

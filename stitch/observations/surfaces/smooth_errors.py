@@ -20,13 +20,12 @@ def smooth_sums(
     """Sums of K smooth errors of unit size along the ray, then of what is beside them, and the noise; NaN without
     scans."""
     capture, half = measurement.capture, _half_field(measurement)
+    further = beside or PointSlopes(measurement, ())
 
     def of_points(v: int, index: Indices) -> Array:
         scan = capture.scans[v]
         smooth = _undone(scan.points[index] - scan.eye, measurement.scan_views[v].cosine[index], half)
-        if beside is None or not beside.steps:
-            return smooth
-        return np.concatenate([smooth, beside.at(v, freed.poses[v], index)])
+        return np.concatenate([smooth, further.at(v, freed.poses[v], index)])
 
     def of_targets() -> Array:
         assert capture.sightings is not None
@@ -36,9 +35,7 @@ def smooth_sums(
         flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
         moved = _undone(flat, np.ones(len(flat)), half).reshape(-1, *points.shape)
         smooth = np.where(seen[..., None], moved, 0.0)
-        if beside is None or not beside.steps:
-            return smooth
-        return np.concatenate([smooth, beside.at_targets(freed.poses)])
+        return np.concatenate([smooth, further.at_targets(freed.poses)])
 
     sums = streamed(freed, capture.noise_factor, of_points, of_targets)
     return sums, float(np.nanmedian([scan.noise for scan in capture.scans]))
