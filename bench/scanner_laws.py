@@ -96,7 +96,8 @@ def said(m: Measured, law: Law) -> dict[str, Any]:
     except StitchError as error:
         return {"verdict": "refused", "names": [], "said": str(error)}
     kept = {
-        "field": found.of_field or bool(found.by_field),
+        "field": found.of_field or found.smooth is not None,
+        "changing": found.smooth is not None and found.smooth.changing > 0,
         "within": bool(found.within),
         "rms": found.residual_rms,
         "noise": found.noise_floor,
@@ -121,13 +122,14 @@ def table(found: list[dict[str, Any]]) -> Iterator[str]:
     by_law = defaultdict(list)
     for row in found:
         by_law[row["law"]].append(row)
-    yield "| the scanner errs by | cells | adequate | unknown | … the field said | one name | a group | refused |"
-    yield "|---|---:|---:|---:|---:|---:|---:|---:|"
+    yield "| the scanner errs by | cells | adequate | unknown | … the scans said | … every view by itself | one name | a group | refused |"
+    yield "|---|---:|---:|---:|---:|---:|---:|---:|---:|"
     for law, own in by_law.items():
         counts = [
             sum(r["verdict"] == "adequate" for r in own),
             sum(r["verdict"] == "unknown_effect" for r in own),
             sum(bool(r.get("field")) for r in own),
+            sum(bool(r.get("changing")) for r in own),
             *(sum(r["verdict"] == v for r in own) for v in ("missing_effect", "cannot_tell", "refused")),
         ]
         yield f"| {law} | {len(own)} | " + " | ".join(map(str, counts)) + " |"

@@ -27,7 +27,7 @@ from stitch.diagnosis.variance_budget import variance_budget
 from stitch.diagnosis.within_overlaps import left_within
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.scanner_field import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.state import State
 from stitch.stages.course import linearise
 from stitch.system.heap import return_large_arrays
@@ -57,13 +57,13 @@ def _diagnosed(state: State) -> Diagnosis:
     matrix = alias_matrix(linear, [r.score for r in selection.ranked])
     examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
     left_out = {e.name: e.cross_validation for e in examined}
-    selection, by_field = _held(linear, selection, left_out, limit)
+    selection, smooth = _held(linear, selection, left_out, limit)
     within = left_within(linear, state.session.scanner.noise)
     if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
     unnamed = _unnamed(linear, selection) if unknown else ()
-    of_field = unknown and (by_field is not None or follows_field(selection.empirical, unnamed))
+    of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
     rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
@@ -88,7 +88,7 @@ def _diagnosed(state: State) -> Diagnosis:
         curves=curves,
         within=within,
         of_field=of_field,
-        by_field=0.0 if by_field is None else by_field.rms,
+        smooth=smooth,
         budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))

@@ -13,6 +13,7 @@ from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.field_error import FieldError
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Diagnosis:
     curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, as other joints turn
     within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
-    by_field: float = 0.0  # the scanner's rms over that field where nothing else is missing; length_unit; 0: as usual
+    smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

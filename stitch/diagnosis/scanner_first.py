@@ -1,6 +1,6 @@
-"""A scanner that errs over its field more clearly than anything else: it is said first, and no name is given beside it.
+"""Scans that err smoothly, more clearly than anything else: it is said first, and no name is given beside it.
 
-Poses found by such a scanner are off too, and an effect that explains some of that is not thereby there.
+Poses found from such scans are off too, and an effect that explains some of that is not thereby there.
 """
 
 from dataclasses import replace
@@ -9,14 +9,14 @@ from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.within_overlaps import scanner_error
 from stitch.model.forward import moves_points
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.scanner_field import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 
 def scanner_first(linear: LinearModel, selection: Selection) -> tuple[Selection, FieldError | None]:
-    """A verdict held against what the overlaps show of the scanner's field, and that where it is part of the answer.
+    """A verdict held against what the overlaps show of smooth errors, and those where they are part of the answer.
 
     Where nothing is missing it stays beside the verdict, as long as it is smaller than the noise. A name is not given
-    where the data want the scanner's error, beside it, more than the effect itself.
+    where the data want smooth errors, beside it, more than the effect itself.
     """
     unknown = replace(selection, verdict="unknown_effect", named=(), second=None)
     if selection.verdict == "adequate":
@@ -25,8 +25,8 @@ def scanner_first(linear: LinearModel, selection: Selection) -> tuple[Selection,
     if selection.verdict != "missing_effect":
         return selection, None
     named = selection.named[0]
-    terms = [named.score.form.term]
-    found = scanner_error(linear, beside=terms if moves_points(terms) else ())
+    said = [r.score.form.term for r in (named, selection.second) if r is not None]
+    found = scanner_error(linear, beside=[term for term in said if moves_points([term])])
     if found is None or found.gain < named.score.log_bayes_factor:
         return selection, None
     return replace(unknown, notes=(f"{named.name} is less clear than that", *selection.notes)), found

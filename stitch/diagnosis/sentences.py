@@ -4,6 +4,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.smooth_sentences import beside_adequate, smooth_errors
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import amount, angle_text, length_text, rounded
@@ -16,11 +17,9 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     if d.verdict == "adequate":
         by = _judged_by(d, length_unit)
         rest = f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {by}"
-        size = length_text(d.by_field, length_unit, 2)
-        field = f"; the scanner errs by {size} rms over its field, the same in every view, which no pose corrects"
         return (
             f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
-            f"{rest if _scatters(d) else ''}{field if d.by_field else ''}{_notes(d)}."
+            f"{rest if _scatters(d) else ''}{beside_adequate(d.smooth, length_unit)}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
         return _missing(d, length_unit, now, floor, second)
@@ -51,11 +50,7 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
 def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
     start = f"No effect of the library explains what is left ({now}, noise {floor}): {_within(d, length_unit)}"
     if d.of_field:
-        size = f" ({length_text(d.by_field, length_unit, 2)} rms)" if d.by_field else ""
-        return (
-            f"{start}the scanner errs by where in its field a point is seen, the same in every view{size}; have it "
-            f"calibrated, or describe how it errs by an effect of your own{_notes(d)}."
-        )
+        return f"{start}{smooth_errors(d.smooth, length_unit)}{_notes(d)}."
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
     if d.unnamed and (d.curves or not d.implausible):

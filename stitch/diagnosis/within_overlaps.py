@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN
 from stitch.model.term import Term
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.noise_floor import noise_floor
-from stitch.observations.surfaces.scanner_field import FieldError, field_error
 from stitch.observations.surfaces.surface_model import Surfaces
 
 
@@ -32,7 +32,7 @@ def left_within(linear: LinearModel, stated: float | None = None) -> float:
 
 
 def scanner_error(linear: LinearModel, beside: Sequence[Term] = ()) -> FieldError | None:
-    """The scanner's error over its field where it is larger than every scanner's; None where overlaps show no such.
+    """Smooth errors of the scans where they are larger than every scanner's; None where overlaps show no such.
 
     It may be small beside the noise: many points average that, and not what is the same in every view.
 

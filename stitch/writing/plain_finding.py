@@ -4,6 +4,7 @@ Terminal, page, recording and review all say it so; the diagnosis' own sentence 
 """
 
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
 
@@ -16,11 +17,8 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     named = " or ".join(in_words(name) for name in found.effects)
     match found.verdict:
         case "adequate":
-            size = length_text(found.by_field, length_unit, 2)
-            field = (
-                f" The scanner itself errs by {size} over its field, which no pose corrects." if found.by_field else ""
-            )
-            return f"No effect is found missing: noise and the arm's scatter explain what is left.{field}"
+            nothing = "No effect is found missing: noise and the arm's scatter explain what is left."
+            return f"{nothing}{_scans(found.smooth, length_unit)}"
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":
@@ -33,8 +31,19 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
 
 
+def _scans(found: FieldError | None, length_unit: str) -> str:
+    """What the scans err by where nothing else is missing."""
+    if found is None:
+        return ""
+    same, changing = (length_text(size, length_unit, 2) for size in (found.rms, found.changing))
+    own = f" Every scan errs by {changing} in its own way, which no pose corrects." if found.changing else ""
+    return (f" The scanner itself errs by {same} over its field, which no pose corrects." if found.rms else "") + own
+
+
 def _where(found: Diagnosis) -> str:
     """The scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
+    if found.smooth is not None and found.smooth.changing:
+        return ": every scan errs in its own way, as if the part bent or the scanner changed"
     if found.of_field:
         return ": the scanner errs by where in its field a point is seen"
     joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))

@@ -7,7 +7,7 @@ import pytest
 from stitch.diagnosis import scanner_first
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.observations.surfaces.scanner_field import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 
 def named(gain: float) -> Selection:
@@ -24,7 +24,7 @@ def held(monkeypatch: pytest.MonkeyPatch, selection: Selection, shown: FieldErro
 
 
 def error(gain: float, over_noise: bool = True) -> FieldError:
-    return FieldError(0.02, gain, unusual=True, over_noise=over_noise)
+    return FieldError(0.02, 0.0, gain, over_noise)
 
 
 def test_the_clearer_of_the_two_is_said(monkeypatch):

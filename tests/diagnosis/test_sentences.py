@@ -21,7 +21,7 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "unnamed": (),
         "within": 0.0,
         "of_field": False,
-        "by_field": 0.0,
+        "smooth": None,
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = sentence_of(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)

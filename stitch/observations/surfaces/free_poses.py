@@ -100,23 +100,26 @@ def visible_step(g: Gram) -> Array:
 
 def answer(g: Gram, pulls: Array) -> Array:
     """(6V, K) twists H⁺b of the views when pulls (P, 6, K), Σ w Bᵀg, act on the pairs."""
+
+    def on_views(keep: Mask) -> Array:
+        b = np.zeros((g.views, 6, pulls.shape[2]))
+        v, w = g.pairs[keep].astype(np.int64).T
+        np.add.at(b, v, pulls[keep])
+        np.subtract.at(b, w, pulls[keep])
+        return b.reshape(6 * g.views, -1)
+
+    return answer_of_views(g, on_views(~g.labelled), on_views(g.labelled))
+
+
+def answer_of_views(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
+    """(6V, K) the same where pulls on the views are given: (6V, K) of surfaces, and of labelled points."""
     values, vectors, scale = visible_directions(g)
-    b = scale[:, None] * _on_views(g, pulls)
+    b, named = scale[:, None] * by_surfaces, scale[:, None] * by_targets
     if g.labelled.any():
         # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
-        named = scale[:, None] * _on_views(g, pulls * g.labelled[:, None, None])
         seen = _strong(_scaled(g, ~g.labelled, scale), _NEAR_NULL)[1]
-        b = named + seen @ (seen.T @ (b - named))
+        b = named + seen @ (seen.T @ b)
     return np.asarray(scale[:, None] * (vectors @ ((vectors.T @ b) / values[:, None])))
-
-
-def _on_views(g: Gram, pulls: Array) -> Array:
-    """(6V, K) what pulls on pairs (P, 6, K) are on their views."""
-    b = np.zeros((g.views, 6, pulls.shape[2]))
-    v, w = g.pairs.astype(np.int64).T
-    np.add.at(b, v, pulls)
-    np.subtract.at(b, w, pulls)
-    return b.reshape(6 * g.views, -1)
 
 
 def _scaled(g: Gram, keep: Mask, scale: Array) -> Array:

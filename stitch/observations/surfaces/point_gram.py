@@ -31,9 +31,23 @@ class PointGram:
         """The sums of some of the parameters."""
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
+    @property
+    def together(self) -> "PointGram":
+        """Of sums for either view of a pair its own those for parameters that all views share."""
+        P, K = len(self.residual), self.residual.shape[1] // 2
+        return PointGram(
+            self.vector.reshape(P, 6, 2, K).sum(axis=2),
+            self.residual.reshape(P, 2, K).sum(axis=1),
+            self.square.reshape(P, 2, K, 2, K).sum(axis=(1, 3)),
+        )
+
 
 def streamed(
-    freed: FreePoses, noise_factor: float, of_points: Callable[[int, Indices], Array], of_targets: Callable[[], Array]
+    freed: FreePoses,
+    noise_factor: float,
+    of_points: Callable[[int, Indices], Array],
+    of_targets: Callable[[], Array],
+    apart: bool = False,
 ) -> PointGram:
     """Stream the pairs once, a block of rows at a time.
 
@@ -41,6 +55,7 @@ def streamed(
         noise_factor: of the capture, by which labelled points count beside the surfaces.
         of_points: (K, N, 3) how far some points of view v move per unit, scanner frame.
         of_targets: (K, V, S, 3) the same for all labelled points.
+        apart: what the first view of a pair does and what the second does are parameters each: 2K, the first's first.
     """
     g = freed.overlaps.gram
 
@@ -51,7 +66,7 @@ def streamed(
 
     def of_block(block: Sequence[tuple[int, Match]]) -> list[tuple[Array, Array, Array]]:
         out, end = [], 0
-        changes = _changes([m for _, m in block], slopes)
+        changes = _by_side(_changes([m for _, m in block], slopes), apart)
         for _, m in block:
             start, end = end, end + len(m.residual)
             change, weight = changes[start:end], m.weight * tukey(m.residual, g.scale)
@@ -64,8 +79,13 @@ def streamed(
     for block in _blocks(freed.overlaps.matches):
         for (pair, _), more in zip(block, of_block(block), strict=True):
             sums[pair] = tuple(map(np.add, sums[pair], more)) if pair in sums else more
-    every = [*(sums[pair] for pair in sorted(sums)), *_of_targets(freed, noise_factor, of_targets)]
+    every = [*(sums[pair] for pair in sorted(sums)), *_of_targets(freed, noise_factor, of_targets, apart)]
     return PointGram(*(np.array([s[i] for s in every]) for i in range(3)))
+
+
+def _by_side(changes: Array, apart: bool) -> Array:
+    """(…, 2K) of changes (…, 2, K) that the two views of a pair cause; (…, K) together."""
+    return np.asarray(changes.reshape(*changes.shape[:-2], -1) if apart else changes.sum(axis=-2))
 
 
 def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
@@ -84,30 +104,32 @@ def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
 
 
 def _changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
-    """(N, K) how the distances of all N correspondences of some pairs change; each view is asked once."""
+    """(N, 2, K) how the distances of all N correspondences of some pairs change by either view; each is asked once."""
     ends = np.cumsum([len(m.residual) for m in matches])
     rows = [np.arange(end - len(m.residual), end) for m, end in zip(matches, ends, strict=True)]
     normal = np.concatenate([m.normal for m in matches])
-    sides = [(m.v, m.index_v, own, 1.0) for m, own in zip(matches, rows, strict=True)]
-    sides += [(m.w, m.index_w, own, -1.0) for m, own in zip(matches, rows, strict=True)]
-    out = np.zeros((len(normal), 0))
+    sides = [(m.v, m.index_v, own, 0) for m, own in zip(matches, rows, strict=True)]
+    sides += [(m.w, m.index_w, own, 1) for m, own in zip(matches, rows, strict=True)]
+    out = np.zeros((len(normal), 2, 0))
     for view in sorted({side[0] for side in sides}):
         index, at = (np.concatenate([side[i] for side in sides if side[0] == view]) for i in (1, 2))
-        sign = np.concatenate([np.full(len(side[2]), side[3]) for side in sides if side[0] == view])
+        second = np.concatenate([np.full(len(side[2]), side[3]) for side in sides if side[0] == view])
         moved = slopes(view, index, normal[at])
-        out = out if out.shape[1] else np.zeros((len(normal), moved.shape[1]))
-        out[at] += sign[:, None] * moved
+        out = out if out.shape[2] else np.zeros((len(normal), 2, moved.shape[1]))
+        out[at, second] = np.where(second[:, None] == 1, -moved, moved)
     return out
 
 
-def _of_targets(freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array]) -> list[tuple[Array, ...]]:
+def _of_targets(
+    freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array], apart: bool
+) -> list[tuple[Array, ...]]:
     """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
     targets, g = freed.overlaps.targets, freed.overlaps.gram
     if targets is None:
         return []
     moved = np.moveaxis(frames.rotate(freed.poses, of_targets()), 0, -1)  # (V, S, 3, K)
     (v, w), (slot_v, slot_w) = targets.views.T, targets.slots.T
-    change = moved[v, slot_v] - moved[w, slot_w]
+    change = _by_side(np.stack([moved[v, slot_v], -moved[w, slot_w]], axis=-2), apart)
     weighted = change * (noise_factor * g.variance * targets.information)[:, None, None]
     vector = by_pair(targets, np.einsum("nia,nik->nak", targets.lever(g.centre), weighted))[1]
     residual = by_pair(targets, np.einsum("ni,nik->nk", targets.apart, weighted))[1]
