@@ -122,7 +122,10 @@ def table(found: list[dict[str, Any]]) -> Iterator[str]:
     by_law = defaultdict(list)
     for row in found:
         by_law[row["law"]].append(row)
-    yield "| the scanner errs by | cells | adequate | unknown | … the scans said | … every view by itself | one name | a group | refused |"
+    yield (
+        "| the scanner errs by | cells | adequate | unknown | … the scans said | … every view by itself | one name | "
+        "a group | refused |"
+    )
     yield "|---|---:|---:|---:|---:|---:|---:|---:|---:|"
     for law, own in by_law.items():
         counts = [
