@@ -11,7 +11,7 @@ from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
-from stitch.diagnosis.scanner_first import scanner_first
+from stitch.diagnosis.scanner_first import clearer_than, scanner_first
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
@@ -63,6 +63,8 @@ def _diagnosed(state: State) -> Diagnosis:
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
     unnamed = _unnamed(linear, selection) if unknown else ()
+    if unknown and smooth is None:
+        smooth = clearer_than(linear, unnamed)
     of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
