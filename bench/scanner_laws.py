@@ -97,7 +97,7 @@ def said(m: Measured, law: Law) -> dict[str, Any]:
         return {"verdict": "refused", "names": [], "said": str(error)}
     kept = {
         "field": found.of_field or found.smooth is not None,
-        "changing": found.smooth is not None and found.smooth.changing > 0,
+        "changing": found.smooth is not None and found.smooth.by_view,
         "within": bool(found.within),
         "rms": found.residual_rms,
         "noise": found.noise_floor,

@@ -8,27 +8,36 @@ def beside_adequate(found: FieldError | None, length_unit: str) -> str:
     """What stands beside a model to which nothing is missing; empty where nothing is unusual."""
     if found is None:
         return ""
-    same, changing = (length_text(size, length_unit, 2) for size in (found.rms, found.changing))
-    said = [f"the scanner errs by {same} rms over its field, the same in every view"] if found.rms else []
-    if found.changing:
-        said.append(f"the scans err by {changing} rms, smoothly and every view by itself{_with_time(found)}")
-    return f"; {' and '.join(said)}, which no pose corrects"
+    if found.by_view:
+        size = length_text(found.changing, length_unit, 2)
+        return f"; the scans err by {size} rms, smoothly and every view by itself{_with_time(found)}, {_NO_POSE}"
+    size = length_text(found.rms, length_unit, 2)
+    return f"; the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}, {_NO_POSE}"
 
 
 def smooth_errors(found: FieldError | None, length_unit: str) -> str:
     """Where nothing is named, what the scans err by, and what to do; None: as the views' poses show it."""
-    same = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None and found.rms else ""
-    if found is None or not found.changing:
+    if found is not None and (found.by_view):
+        size = length_text(found.changing, length_unit, 2)
         return (
-            f"the scanner errs by where in its field a point is seen, the same in every view{same}; have it "
-            "calibrated, or describe how it errs by an effect of your own"
+            f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): a part that bends or moves, "
+            "an arm that still settles while a scan is read, a scanner that warms up or errs by range, brightness or a "
+            "finer law; scan the first pose again at the end: what differs then is of the part or of the time"
         )
-    size = length_text(found.changing, length_unit, 2)
+    size = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None else ""
+    more = "" if found is None else _in_part(found)
     return (
-        f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): a part that bends or moves, an "
-        "arm that still settles while a scan is read, a scanner that warms up or errs by range, brightness or a finer "
-        "law; scan the first pose again at the end: what differs then is of the part or of the time"
+        f"the scanner errs by where in its field a point is seen, the same in every view{size}{more}; have it "
+        "calibrated, or describe how it errs by an effect of your own"
     )
+
+
+_NO_POSE = "which no pose corrects"
+
+
+def _in_part(found: FieldError) -> str:
+    """What views have for themselves besides; how much is uncertain beside what they have in common."""
+    return f", and in part every view by itself{_with_time(found)}" if found.changing else ""
 
 
 def _with_time(found: FieldError) -> str:

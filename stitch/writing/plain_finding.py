@@ -35,14 +35,17 @@ def _scans(found: FieldError | None, length_unit: str) -> str:
     """What the scans err by where nothing else is missing."""
     if found is None:
         return ""
-    same, changing = (length_text(size, length_unit, 2) for size in (found.rms, found.changing))
-    own = f" Every scan errs by {changing} in its own way, which no pose corrects." if found.changing else ""
-    return (f" The scanner itself errs by {same} over its field, which no pose corrects." if found.rms else "") + own
+    if found.by_view:
+        size = length_text(found.changing, length_unit, 2)
+        return f" Every scan errs by {size} in its own way, which no pose corrects."
+    return (
+        f" The scanner itself errs by {length_text(found.rms, length_unit, 2)} over its field, which no pose corrects."
+    )
 
 
 def _where(found: Diagnosis) -> str:
     """The scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
-    if found.smooth is not None and found.smooth.changing:
+    if found.smooth is not None and found.smooth.by_view:
         return ": every scan errs in its own way, as if the part bent or the scanner changed"
     if found.of_field:
         return ": the scanner errs by where in its field a point is seen"

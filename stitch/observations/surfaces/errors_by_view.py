@@ -4,15 +4,13 @@ A part that bends, a scanner that warms up or is read line by line while the arm
 motion of the views makes them meet.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from stitch.frames import Array, Indices, Mask
 from stitch.observations.surfaces.free_poses import FreePoses, answer_of_views
 from stitch.observations.surfaces.point_gram import PointGram
 from stitch.observations.surfaces.shown_errors import ShownErrors
-from stitch.observations.surfaces.smooth_errors import DEGREE, FINER, orders, size_of_orders
+from stitch.observations.surfaces.smooth_errors import COARSE
 
 # Normals are off by up to a tenth of a radian: what moves points less than that along them, squared, is their noise.
 _TOLD = 0.01
@@ -24,16 +22,20 @@ SAME, INCIDENCE, CHANGING = range(3)
 
 
 def by_view(sums: PointGram, freed: FreePoses, noise: float, beside: int = 0) -> ShownErrors:
-    """Of sums over smooth errors and what is beside them, for either view of a pair its own (`smooth_errors.py`)."""
+    """Of sums over smooth errors for either view of a pair its own, those that all share, and what is beside them.
+
+    Args:
+        sums: of `smooth_sums`, apart.
+    """
     g, part = freed.overlaps.gram, part_of_view(freed.overlaps.gram.views)
-    at = _parameters(g.pairs, part, columns=sums.residual.shape[1] // 2)
+    at = _parameters(g.pairs, part, columns=sums.residual.shape[1])
     width = int(at.max()) + 1
     square, pull = np.zeros((width, width)), np.zeros(width)
     np.add.at(square, (at[:, :, None], at[:, None, :]), sums.square)
     np.add.at(pull, at, sums.residual)
     push = [_on_views(sums, g.views, g.pairs, at, keep, width) for keep in (~g.labelled, g.labelled)]
     square -= (push[0] + push[1]).T @ answer_of_views(g, *push)
-    causes = tuple(_causes(int(part[-1]) + 1))
+    causes = _causes(int(part[-1]) + 1, width - beside)
     return ShownErrors.of(square, pull, causes, g, noise, beside, told=_TOLD)
 
 
@@ -43,11 +45,10 @@ def part_of_view(views: int) -> Indices:
 
 
 def _parameters(pairs: Array, part: Indices, columns: int) -> Indices:
-    """(P, 2 · columns) the parameter that each column of a pair is: coarse errors part by part, the rest in common."""
-    coarse = len(orders(DEGREE))
-    common = coarse * (part[-1] + 1) + np.arange(columns - coarse)
-    own = [coarse * part[view][:, None] + np.arange(coarse) for view in pairs.astype(np.int64).T]
-    return np.hstack([np.hstack([each, np.broadcast_to(common, (len(pairs), len(common)))]) for each in own])
+    """(P, columns) the parameter that each column of a pair is: those of every part, then those that all share."""
+    own = [COARSE * part[view][:, None] + np.arange(COARSE) for view in pairs.astype(np.int64).T]
+    shared = COARSE * (part[-1] + 1) + np.arange(columns - 2 * COARSE)
+    return np.hstack([*own, np.broadcast_to(shared, (len(pairs), len(shared)))])
 
 
 def _on_views(sums: PointGram, views: int, pairs: Array, at: Indices, keep: Mask, width: int) -> Array:
@@ -60,13 +61,8 @@ def _on_views(sums: PointGram, views: int, pairs: Array, at: Indices, keep: Mask
     return np.moveaxis(out, 1, 2).reshape(6 * views, width)
 
 
-def _causes(parts: int) -> Iterator[Array]:
-    """SAME, INCIDENCE and CHANGING of unit rms, in the parameters but those beside them."""
-    coarse, fine = len(orders(DEGREE)), len(orders(FINER))
-    width = coarse * parts + fine - coarse + 1
-    everything = np.eye(width)
-    own, shared = everything[:, : coarse * parts], everything[:, coarse * parts : -1]
-    same = np.hstack([own @ np.tile(np.eye(coarse), (parts, 1)), shared])
-    yield same / np.linalg.norm(size_of_orders(FINER))
-    yield everything[:, -1:]
-    yield own
+def _causes(parts: int, width: int) -> tuple[Array, Array, Array]:
+    """SAME, INCIDENCE and CHANGING in the parameters, (width, ·) each."""
+    every = np.eye(width)
+    own, incidence, shared = np.split(every, [COARSE * parts, COARSE * parts + 1], axis=1)
+    return np.hstack([own @ np.tile(np.eye(COARSE), (parts, 1)), shared]), incidence, own

@@ -15,7 +15,7 @@ from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.point_gram import PointGram, seen_twists
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE, alike
 from stitch.observations.surfaces.shown_errors import SHARES, ShownErrors
-from stitch.observations.surfaces.smooth_errors import DEGREE, FINER, orders, smooth_sums
+from stitch.observations.surfaces.smooth_errors import COARSE, smooth_sums
 from stitch.statistics.tails import chi2_tail
 
 _ORDERS = 999
@@ -29,7 +29,8 @@ class FieldError:
     changing: float  # of what every view has for itself
     gain: float  # nats by which the clearer of both is likelier than the largest that every scanner has
     over_noise: bool  # one of the two is more systematic than random
-    with_time: bool = False  # what changes does so as the session goes on
+    by_view: bool = False  # the second is the clearer
+    with_time: bool = False  # it follows the session
 
     @property
     def unusual(self) -> bool:
@@ -52,12 +53,16 @@ def field_error(
     apart = by_view(sums, freed, noise, further)
     # Two questions, each at half of the level.
     changing = _size(apart, CHANGING, alpha / 2)
-    same = _size(apart if changing.share else _coarse(sums, freed, noise, further), SAME, alpha / 2)
+    # What all views have in common comes first: large errors of that kind move points to other partners, which looks
+    # like errors of single views.
+    alone = changing.share > 0 and changing.gain > _nats(apart, {CHANGING: ALARM_SHARE}, SAME)
+    same = _size(apart if alone else _coarse(sums, freed, noise, further), SAME, alpha / 2)
     return FieldError(
         noise * same.share,
         noise * changing.share,
         max(same.gain, changing.gain),
         same.over_noise or changing.over_noise,
+        alone or (changing.share > 0 and not same.share),
         changing.share > 0 and _with_time(apart.estimate(CHANGING, changing.shares), alpha),
     )
 
@@ -74,33 +79,38 @@ class _Size:
 
 def _size(shown: ShownErrors, cause: int, alpha: float) -> _Size:
     """The likeliest size of errors of one cause beside the others, if it is unusual."""
-    largest = [SHARES[1]] * len(shown.told)
-    shares, free = shown.likeliest(largest)
-
-    def nats(most: float) -> float:
-        return 0.5 * (shown.likeliest([*largest[:cause], most, *largest[cause + 1 :]])[1] - free)
 
     def clear(gain: float) -> bool:
         # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         return 0.5 * chi2_tail(2 * gain, 1) < alpha
 
-    gain = nats(ALARM_SHARE)
+    shares, gain = shown.likeliest(_most(shown, {}))[0], _nats(shown, {}, cause)
     if not clear(gain):
         return _Size(0.0, shares, gain, over_noise=False)
-    return _Size(float(shares[cause]), shares, gain, clear(nats(1.0)))
+    return _Size(float(shares[cause]), shares, gain, clear(_nats(shown, {}, cause, share=1.0)))
+
+
+def _nats(shown: ShownErrors, limits: dict[int, float], cause: int, share: float = ALARM_SHARE) -> float:
+    """By which errors of a cause are likelier than at most such a share, where others are limited to theirs."""
+    return 0.5 * (shown.likeliest(_most(shown, limits | {cause: share}))[1] - shown.likeliest(_most(shown, limits))[1])
+
+
+def _most(shown: ShownErrors, limits: dict[int, float]) -> list[float]:
+    """The largest share of each cause."""
+    return [limits.get(cause, SHARES[1]) for cause in range(len(shown.told))]
 
 
 def _coarse(sums: PointGram, freed: FreePoses, noise: float, beside: int) -> ShownErrors:
-    """The same in every view and of DEGREE: what is known of it where no view has errors for itself."""
-    together = sums.together
-    finer = np.arange(together.residual.shape[1])
-    coarse = together.of((finer < len(orders(DEGREE))) | (finer >= len(orders(FINER))))
+    """The same in every view, without the finer ones: what is known of it where no view has errors for itself."""
+    together = sums.together(apart=COARSE)
+    column = np.arange(together.residual.shape[1])
+    coarse = together.of((column <= COARSE) | (column >= len(column) - beside))
     return alike(coarse, seen_twists(coarse, freed), freed, noise, beside)
 
 
 def _with_time(errors: Array, alpha: float) -> bool:
     """True where errors of the views, part after part, follow their order more than other orders would have it."""
-    parts = len(errors) // len(orders(DEGREE))
+    parts = len(errors) // COARSE
     errors = errors.reshape(parts, -1)
     order = np.arange(parts) - (parts - 1) / 2
     generator = np.random.default_rng(parts)

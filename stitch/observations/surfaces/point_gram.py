@@ -31,15 +31,12 @@ class PointGram:
         """The sums of some of the parameters."""
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
-    @property
-    def together(self) -> "PointGram":
-        """Of sums for either view of a pair its own those for parameters that all views share."""
-        P, K = len(self.residual), self.residual.shape[1] // 2
-        return PointGram(
-            self.vector.reshape(P, 6, 2, K).sum(axis=2),
-            self.residual.reshape(P, 2, K).sum(axis=1),
-            self.square.reshape(P, 2, K, 2, K).sum(axis=(1, 3)),
-        )
+    def together(self, apart: int) -> "PointGram":
+        """Of sums for either view of a pair its own, in so many parameters, those for parameters that all share."""
+        shares = np.vstack([np.eye(apart), np.eye(apart)])
+        rest = self.residual.shape[1] - 2 * apart
+        A = np.block([[shares, np.zeros((2 * apart, rest))], [np.zeros((rest, apart)), np.eye(rest)]])
+        return PointGram(self.vector @ A, self.residual @ A, A.T @ self.square @ A)
 
 
 def streamed(
@@ -47,7 +44,7 @@ def streamed(
     noise_factor: float,
     of_points: Callable[[int, Indices], Array],
     of_targets: Callable[[], Array],
-    apart: bool = False,
+    apart: int = 0,
 ) -> PointGram:
     """Stream the pairs once, a block of rows at a time.
 
@@ -55,7 +52,8 @@ def streamed(
         noise_factor: of the capture, by which labelled points count beside the surfaces.
         of_points: (K, N, 3) how far some points of view v move per unit, scanner frame.
         of_targets: (K, V, S, 3) the same for all labelled points.
-        apart: what the first view of a pair does and what the second does are parameters each: 2K, the first's first.
+        apart: so many of the K are parameters of every view: the sums hold those of the first view of a pair, then
+            those of the second, then the others.
     """
     g = freed.overlaps.gram
 
@@ -83,9 +81,10 @@ def streamed(
     return PointGram(*(np.array([s[i] for s in every]) for i in range(3)))
 
 
-def _by_side(changes: Array, apart: bool) -> Array:
-    """(…, 2K) of changes (…, 2, K) that the two views of a pair cause; (…, K) together."""
-    return np.asarray(changes.reshape(*changes.shape[:-2], -1) if apart else changes.sum(axis=-2))
+def _by_side(changes: Array, apart: int) -> Array:
+    """(…, K + apart) of changes (…, 2, K) that the two views of a pair cause."""
+    own = [changes[..., side, :apart] for side in range(2)] if apart else []
+    return np.concatenate([*own, changes[..., apart:].sum(axis=-2)], axis=-1)
 
 
 def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
@@ -121,7 +120,7 @@ def _changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], A
 
 
 def _of_targets(
-    freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array], apart: bool
+    freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array], apart: int
 ) -> list[tuple[Array, ...]]:
     """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
     targets, g = freed.overlaps.targets, freed.overlaps.gram

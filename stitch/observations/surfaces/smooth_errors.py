@@ -1,4 +1,4 @@
-"""Smooth errors along the ray of a scanner, over its field and over incidence, and what they do to the overlaps."""
+"""Smooth errors of a scanner, over its field and over incidence, and what they do to the overlaps."""
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -9,30 +9,36 @@ from stitch.model.point_slopes import PointSlopes
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.point_gram import PointGram, streamed
 
-# Errors that views have for themselves are as smooth as DEGREE; those that all share may be finer.
-DEGREE, FINER = 3, 6
+# Along the ray; finer ones only where views may have errors for themselves, which are not to explain what all share.
+_DEGREE, _FINER = 3, 6
 # Corners are seen by few points.
 _REACH = 0.98
+_ORDERS = sorted(((i, j) for i in range(_FINER + 1) for j in range(_FINER + 1) if 0 < i + j <= _FINER), key=sum)
+# Along the ray over the field, coarse ones first; the slope with incidence follows them.
+COARSE = sum(sum(order) <= _DEGREE for order in _ORDERS)
 
 
 def smooth_sums(
     measurement: Measurement, freed: FreePoses, beside: PointSlopes | None = None, apart: bool = False
 ) -> tuple[PointGram, float]:
-    """Sums of K smooth errors of unit size along the ray, then of what is beside them, and the noise; NaN without
-    scans.
+    """Sums of smooth errors of unit size, then of what is beside them, and the noise; NaN without scans.
 
-    The last of the K is over incidence, the others are over the field.
+    The first are COARSE, along the ray over the field, and one over incidence.
 
     Args:
-        apart: for either view of a pair its own, and finer ones too, after those of DEGREE.
+        apart: those of COARSE for either view of a pair its own; and after the one over incidence `shared_errors`.
     """
     capture, half = measurement.capture, _half_field(measurement)
-    degree = FINER if apart else DEGREE
     further = beside or PointSlopes(measurement, ())
+    standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in capture.scans])))
+
+    def undone(away: Array, cosine: Array) -> Array:
+        own = _undone(away, cosine, half)
+        return np.concatenate([own, _shared(away, half, standoff)]) if apart else own
 
     def of_points(v: int, index: Indices) -> Array:
         scan = capture.scans[v]
-        smooth = _undone(scan.points[index] - scan.eye, measurement.scan_views[v].cosine[index], half, degree)
+        smooth = undone(scan.points[index] - scan.eye, measurement.scan_views[v].cosine[index])
         return np.concatenate([smooth, further.at(v, freed.poses[v], index)])
 
     def of_targets() -> Array:
@@ -41,11 +47,11 @@ def smooth_sums(
         seen = capture.sightings.target >= 0
         # An empty slot has no ray; nobody knows at what slant a target was seen.
         flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
-        moved = _undone(flat, np.ones(len(flat)), half, degree).reshape(-1, *points.shape)
+        moved = undone(flat, np.ones(len(flat))).reshape(-1, *points.shape)
         smooth = np.where(seen[..., None], moved, 0.0)
         return np.concatenate([smooth, further.at_targets(freed.poses)])
 
-    sums = streamed(freed, capture.noise_factor, of_points, of_targets, apart)
+    sums = streamed(freed, capture.noise_factor, of_points, of_targets, COARSE if apart else 0)
     return sums, float(np.nanmedian([scan.noise for scan in capture.scans]))
 
 
@@ -56,26 +62,35 @@ def _half_field(measurement: Measurement) -> Array:
     return np.asarray(np.maximum(np.quantile(slopes, _REACH, axis=0), 1e-6))
 
 
-def orders(degree: int) -> list[tuple[int, int]]:
-    """Of the smooth errors over the field, coarse ones first."""
-    every = [(i, j) for i in range(degree + 1) for j in range(degree + 1) if 0 < i + j <= degree]
-    return sorted(every, key=sum)
+def _undone(away: Array, cosine: Array, half: Array) -> Array:
+    """(COARSE + 1, N, 3) what undoes smooth errors along the rays (N, 3) from the scanner's eye, per unit.
 
-
-def size_of_orders(degree: int) -> Array:
-    """(K,) rms of each; those of DEGREE have unit rms together."""
-    sizes = np.array([1.0 / (i + j) for i, j in orders(degree)])
-    return np.asarray(sizes / np.linalg.norm(sizes[: len(orders(DEGREE))]))
-
-
-def _undone(away: Array, cosine: Array, half: Array, degree: int) -> Array:
-    """(K, N, 3) what undoes smooth errors along the rays (N, 3) from the scanner's eye to its points, per unit.
-
-    Legendre products over the field, those of DEGREE of unit rms together, and the slope with incidence.
+    Legendre products over the field, of unit rms together, and the slope with incidence.
     """
+    along = [*_over_field(away, half, _DEGREE), 1 / cosine - 1]
+    return np.asarray(-np.array(along)[..., None] * _unit(away))
+
+
+def _shared(away: Array, half: Array, standoff: float) -> Array:
+    """(S, N, 3) what all views may have in common besides: finer over the field, along the range, and across the ray.
+
+    Each is about as large as the others; scanners of bad axes or a bent scale are among them.
+    """
+    ray = _unit(away)
+    far = np.linalg.norm(away, axis=1) / standoff - 1
+    a, b = away[:, :2].T / away[:, 2] / half[:, None]
+    along = [*_over_field(away, half, _FINER)[COARSE:], far, far**2, far**3, far * a, far * b]
+    across = [shape[:, None] * axis for shape in (a, b, a**2, a * b, b**2, far) for axis in np.eye(3)[:2]]
+    return np.concatenate([np.array(along)[..., None] * ray, np.array(across)])
+
+
+def _over_field(away: Array, half: Array, degree: int) -> list[Array]:
+    """Legendre products (N,) over the field; those of _DEGREE have unit rms together."""
     a, b = np.clip(away[:, :2] / away[:, 2:] / half, -1.2, 1.2).T
     powers = [legendre.legvander(x, degree) * np.sqrt(2 * np.arange(degree + 1) + 1) for x in (a, b)]
-    sizes = zip(size_of_orders(degree), orders(degree), strict=True)
-    smooth = [size * powers[0][:, i] * powers[1][:, j] for size, (i, j) in sizes]
-    rays = away / np.linalg.norm(away, axis=1)[:, None]
-    return np.asarray(-np.array([*smooth, 1 / cosine - 1])[..., None] * rays)
+    unit = np.sqrt(sum(1.0 / sum(order) ** 2 for order in _ORDERS[:COARSE]))
+    return [powers[0][:, i] * powers[1][:, j] / ((i + j) * unit) for i, j in _ORDERS if i + j <= degree]
+
+
+def _unit(away: Array) -> Array:
+    return np.asarray(away / np.linalg.norm(away, axis=1)[:, None])
