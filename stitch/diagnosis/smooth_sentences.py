@@ -20,9 +20,10 @@ def smooth_errors(found: FieldError | None, length_unit: str) -> str:
     if found is not None and (found.by_view):
         size = length_text(found.changing, length_unit, 2)
         return (
-            f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): a part that bends or moves, "
-            "an arm that still settles while a scan is read, a scanner that warms up or errs by range, brightness or a "
-            "finer law; scan the first pose again at the end: what differs then is of the part or of the time"
+            f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): a part that bends or "
+            "moves, an arm that still settles while a scan is read, a scanner that warms up or errs by range, "
+            "brightness or a finer law; scan the first pose again at the end: what differs then is of the part or of "
+            "the time"
         )
     size = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None else ""
     more = "" if found is None else _in_part(found)
