@@ -11,7 +11,7 @@ from stitch.diagnosis.design.next_view import propose
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
-from stitch.diagnosis.scanner_first import clearer_than, scanner_first
+from stitch.diagnosis.scanner_first import scanner_first
 from stitch.diagnosis.selection.upheld import validated
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
@@ -24,7 +24,7 @@ from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
-from stitch.diagnosis.within_overlaps import left_within
+from stitch.diagnosis.within_overlaps import left_within, scanner_error
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError
@@ -63,8 +63,6 @@ def _diagnosed(state: State) -> Diagnosis:
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
     unnamed = _unnamed(linear, selection) if unknown else ()
-    if unknown and smooth is None:
-        smooth = clearer_than(linear, unnamed)
     of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
@@ -90,7 +88,7 @@ def _diagnosed(state: State) -> Diagnosis:
         curves=curves,
         within=within,
         of_field=of_field,
-        smooth=smooth,
+        smooth=smooth or (scanner_error(linear) if unknown else None),
         budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))

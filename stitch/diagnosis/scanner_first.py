@@ -3,11 +3,9 @@
 Poses found from such scans are off too, and an effect that explains some of that is not thereby there.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed
 from stitch.diagnosis.within_overlaps import scanner_error
 from stitch.model.forward import moves_points
 from stitch.observations.linear_model import LinearModel
@@ -32,11 +30,3 @@ def scanner_first(linear: LinearModel, selection: Selection) -> tuple[Selection,
     if found is None or found.gain < named.score.log_bayes_factor:
         return selection, None
     return replace(unknown, notes=(f"{named.name} is less clear than that", *selection.notes)), found
-
-
-def clearer_than(linear: LinearModel, unnamed: Sequence[Unnamed]) -> FieldError | None:
-    """Smooth errors of the scans where nothing can be named, if the data want them more than any errors that the
-    poses do again: poses found from such scans scatter and repeat too."""
-    found = scanner_error(linear)
-    others = max((kind.log_bayes_factor for kind in unnamed), default=0.0)
-    return found if found is not None and found.gain > others else None

@@ -4,7 +4,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.smooth_sentences import beside_adequate, smooth_errors
+from stitch.diagnosis.smooth_sentences import beside_adequate, beside_poses, smooth_errors
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import amount, angle_text, length_text, rounded
@@ -51,6 +51,7 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
     start = f"No effect of the library explains what is left ({now}, noise {floor}): {_within(d, length_unit)}"
     if d.of_field:
         return f"{start}{smooth_errors(d.smooth, length_unit)}{_notes(d)}."
+    start += beside_poses(d.smooth, length_unit)
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
     if d.unnamed and (d.curves or not d.implausible):

@@ -15,15 +15,27 @@ def beside_adequate(found: FieldError | None, length_unit: str) -> str:
     return f"; the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}, {_NO_POSE}"
 
 
+def beside_poses(found: FieldError | None, length_unit: str) -> str:
+    """What is said of the scans before what poses do that has no name; empty where nothing is unusual."""
+    if found is None:
+        return ""
+    if not found.by_view:
+        size = length_text(found.rms, length_unit, 2)
+        return f"the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}; "
+    size = length_text(found.changing, length_unit, 2)
+    return (
+        f"the scans err by {size} rms, smoothly and every view by itself{_with_time(found)} ({_CAUSES}), so that poses "
+        "found from them scatter too; "
+    )
+
+
 def smooth_errors(found: FieldError | None, length_unit: str) -> str:
     """Where nothing is named, what the scans err by, and what to do; None: as the views' poses show it."""
-    if found is not None and (found.by_view):
+    if found is not None and found.by_view:
         size = length_text(found.changing, length_unit, 2)
         return (
-            f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): a part that bends or "
-            "moves, an arm that still settles while a scan is read, a scanner that warms up or errs by range, "
-            "brightness or a finer law; scan the first pose again at the end: what differs then is of the part or of "
-            "the time"
+            f"the scans err smoothly, every view by itself ({size} rms{_with_time(found)}): {_CAUSES}; scan the first "
+            "pose again at the end: what differs then is of the part or of the time"
         )
     size = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None else ""
     more = "" if found is None else _in_part(found)
@@ -34,6 +46,10 @@ def smooth_errors(found: FieldError | None, length_unit: str) -> str:
 
 
 _NO_POSE = "which no pose corrects"
+_CAUSES = (
+    "a part that bends or moves, an arm that still settles while a scan is read, a scanner that warms up or errs by "
+    "range, brightness or a finer law"
+)
 
 
 def _in_part(found: FieldError) -> str:

@@ -38,14 +38,13 @@ def _scans(found: FieldError | None, length_unit: str) -> str:
     if found.by_view:
         size = length_text(found.changing, length_unit, 2)
         return f" Every scan errs by {size} in its own way, which no pose corrects."
-    return (
-        f" The scanner itself errs by {length_text(found.rms, length_unit, 2)} over its field, which no pose corrects."
-    )
+    size = length_text(found.rms, length_unit, 2)
+    return f" The scanner itself errs by {size} over its field, which no pose corrects."
 
 
 def _where(found: Diagnosis) -> str:
     """The scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
-    if found.smooth is not None and found.smooth.by_view:
+    if found.of_field and found.smooth is not None and found.smooth.by_view:
         return ": every scan errs in its own way, as if the part bent or the scanner changed"
     if found.of_field:
         return ": the scanner errs by where in its field a point is seen"
