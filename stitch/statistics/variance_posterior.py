@@ -47,11 +47,13 @@ class _Seen:
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """(c,) posterior means of the variances, begun at their maximum.
 
-    Among so many numbers that a round takes seconds, the maximum itself.
+    Among so many numbers that a round takes seconds, and where the mean explains all of them, the maximum itself.
     """
     if mixed.size >= _NO_ROUNDS:
         return fit.variances
     seen, rng = _without_mean(mixed), np.random.default_rng(0)
+    if not len(seen.z):
+        return fit.variances
     grids = _grids(mixed, fit.variances)
     densities = [log_density(i, np.log(grid), mixed.scales) for i, grid in enumerate(grids)]
     here, total = np.array(fit.variances), np.zeros(len(grids))
@@ -74,7 +76,7 @@ def _without_mean(mixed: MixedModel) -> _Seen:
     for blocks in mixed.components:
         C = turn @ (blocks[0] if len(blocks) == 1 else block_diag(*blocks)) @ turn.T
         values, vectors = np.linalg.eigh(C)
-        keep = values > _ROUNDING * max(float(values[-1]), 1e-300)
+        keep = values > _ROUNDING * float(np.max(values, initial=1e-300))
         roots.append(vectors[:, keep] * np.sqrt(values[keep]))
     n = len(turn)
     fixed = np.zeros((n, n)) if mixed.fixed is None else turn @ block_diag(*mixed.fixed) @ turn.T

@@ -51,3 +51,11 @@ def test_among_very_many_numbers_the_maximum_must_do(monkeypatch):
     mixed = shared_errors(1.0)
     fit = fit_variances(mixed)
     assert mean_variances(mixed, fit) == pytest.approx(fit.variances)
+
+
+def test_a_mean_that_explains_all_numbers_leaves_the_maximum():
+    """As many parameters as numbers: views of which hardly anything was seen."""
+    mixed = shared_errors(1.0)
+    mixed = MixedModel(mixed.z[:, :2], np.eye(2)[None], mixed.components[:, :, :2, :2], scales=mixed.scales)
+    fit = fit_variances(mixed)
+    assert mean_variances(mixed, fit) == pytest.approx(fit.variances)
