@@ -122,8 +122,7 @@ def snoop(
     torn = {v for v in homes.torn if v not in homes.homeless}
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
-        again = find_blunders(model.with_usual(usual.twists(homes.freed)), tests.alone, tests.steps)
-        sure &= {b.view for b in again.blunders} | tests.sure | torn
+        sure &= _beside_usual(model.with_usual(usual.twists(homes.freed)), tests) | torn
     groups = homes.groups
     foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.homeless if (v,) in groups]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
@@ -140,6 +139,12 @@ def snoop(
         tolerance=homes.tolerance,
         needed=homes.needed,
     )
+
+
+def _beside_usual(model: ViewModel, tests: PoseTests) -> set[int]:
+    """Views that stand out beside what usually happens to all of them too."""
+    again = find_blunders(model, tests.alone, tests.steps)
+    return {b.view for b in again.blunders} | tests.sure
 
 
 def _standing_out(capture: Capture, expected: Array, homes: Homes, tests: PoseTests) -> list[Misplaced]:
