@@ -13,7 +13,7 @@ from stitch.integrity.expected_poses import expected_poses
 from stitch.integrity.linkage import linkage
 from stitch.integrity.pose_tests import pose_tests
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.integrity.view_test import view_model
+from stitch.integrity.view_model import view_model
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from stitch.frames import Array
 from stitch.integrity.left_alone import left_alone
 from stitch.integrity.step import Step
-from stitch.integrity.view_test import Projector, Test, ViewModel, beside, projector, test
+from stitch.integrity.view_model import Projector, ViewModel, projector
+from stitch.integrity.view_test import Test, beside, test
 from stitch.statistics.variance_components import VarianceFit
 
 # Chance that a session without blunders loses a view.

@@ -10,7 +10,8 @@ from stitch.frames import Array
 from stitch.integrity.blunders import columns_of
 from stitch.integrity.pose_tests import PoseTests
 from stitch.integrity.smallest import smallest
-from stitch.integrity.view_test import ViewModel, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import test
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.statistics.least_squares import least_squares
 

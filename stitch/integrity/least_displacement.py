@@ -7,7 +7,8 @@ from stitch.frames import Array
 from stitch.integrity.blunders import Found, columns_of
 from stitch.integrity.smallest import smallest_parts
 from stitch.integrity.step import Step
-from stitch.integrity.view_test import ViewModel, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import test
 
 
 def least_displacement(

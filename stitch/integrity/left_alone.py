@@ -1,7 +1,8 @@
 """One view tested under the scatter that the others have without it: it cannot hide in what it inflates itself."""
 
 from stitch.frames import Array
-from stitch.integrity.view_test import Test, ViewModel, beside, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import Test, beside, test
 from stitch.statistics.tails import f_tail
 
 

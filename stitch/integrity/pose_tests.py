@@ -6,7 +6,7 @@ from stitch.integrity.blunders import Blunder, Found, find_blunders, off_anyway
 from stitch.integrity.step import Step
 from stitch.integrity.steps import CHANCE, MANY_VIEWS, find_steps
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.integrity.view_test import ViewModel
+from stitch.integrity.view_model import ViewModel
 from stitch.observations.surfaces.free_poses import FreePoses
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from stitch.frames import Array
 from stitch.integrity.blunders import FAMILY_WISE, Found
-from stitch.integrity.view_test import ViewModel
+from stitch.integrity.view_model import ViewModel
 from stitch.statistics.tails import chi2_limit, noncentral_chi2_tail, normal_limit
 
 POWER = 0.8

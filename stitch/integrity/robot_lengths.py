@@ -4,7 +4,8 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.integrity.problems import Problem
-from stitch.integrity.view_test import ViewModel, beside, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import beside, test
 
 # No scanner in use is off by this share of its lengths, and no arm.
 _SCALE = 0.01

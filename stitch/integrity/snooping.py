@@ -23,7 +23,7 @@ from stitch.integrity.placing import judge, place, surface_of
 from stitch.integrity.pose_tests import PoseTests, pose_tests
 from stitch.integrity.step import Step
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.integrity.view_test import ViewModel, view_model
+from stitch.integrity.view_model import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 

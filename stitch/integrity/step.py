@@ -9,7 +9,8 @@ import numpy as np
 from stitch.frames import Array
 from stitch.integrity.amounts import Size, off_by
 from stitch.integrity.smallest import smallest_parts
-from stitch.integrity.view_test import ViewModel, beside, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import beside, test
 
 What = Literal["part", "scanner"]
 BOTH: tuple[What, What] = ("part", "scanner")

@@ -13,7 +13,8 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.integrity.step import BOTH, Step, What, likelier_step, step_columns
-from stitch.integrity.view_test import ViewModel, beside, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import beside, test
 
 # That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
 # without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.

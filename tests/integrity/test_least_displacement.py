@@ -12,7 +12,7 @@ from data_synth.scene import load_scene
 from stitch import frames
 from stitch.integrity.blunders import find_blunders
 from stitch.integrity.least_displacement import least_displacement
-from stitch.integrity.view_test import ViewModel
+from stitch.integrity.view_model import ViewModel
 from stitch.pipeline import run
 from stitch.statistics.variance_components import at_variances
 

@@ -15,7 +15,7 @@ from stitch.integrity.blunders import find_blunders
 from stitch.integrity.expected_poses import expected_poses
 from stitch.integrity.pose_tests import PoseTests
 from stitch.integrity.steps import find_steps
-from stitch.integrity.view_test import ViewModel
+from stitch.integrity.view_model import ViewModel
 from stitch.measurement.cloud import Cloud
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.free_poses import FreePoses

@@ -8,7 +8,8 @@ from scipy import stats
 
 from stitch.integrity.blunders import find_blunders
 from stitch.integrity.reliability import blunder_sizes, noncentrality, normal_blocks, reliability
-from stitch.integrity.view_test import ViewModel, projector, test
+from stitch.integrity.view_model import ViewModel, projector
+from stitch.integrity.view_test import test
 from stitch.statistics.variance_components import at_variances
 
 test.__test__ = False  # a function of the library, not a case
