@@ -6,6 +6,7 @@ from typing import Any
 from stitch.comparison.disagreement_field import full_colour
 from stitch.comparison.model_history import ModelHistory, model_history
 from stitch.comparison.run_verdict import run_headline, run_light
+from stitch.model.hand_eye_uncertainty import stands_for
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
@@ -61,6 +62,7 @@ def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
         "first": rows[:_FIRST],
         "rest": rows[_FIRST:],
         "hand_eye": hand_eye_rows(run),
+        "uncertainty": stands_for(None),
         "hand_eye_matrix": matrix(run),
         "mount_frame": "base" if run.session.mount == "eye_to_hand" else "flange",
         "effects": effect_rows(run),

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from stitch.comparison.tables import Comparison
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of
+from stitch.model.hand_eye_uncertainty import stands_for
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
 from stitch.units import MICROMETRES
@@ -49,6 +50,7 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     why, command = next_step(found, "RUN").rsplit(": ", 1)
     then = f'<p class="evidence">{escape(why)}: <code>{escape(command)}</code>, RUN the folder of this page.</p>'
     _insert(folder / "report.html", "finding", f'<p class="finding">{escape(plain)}</p>{then}')
+    _insert(folder / "report.html", "uncertainty", f'<p class="soft">{stands_for(found.verdict)}</p>')
     add_diagnosis(found, fields, unit, folder / "recording.rrd")
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR, numbers_covariance
+from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR, numbers_covariance, stands_for
 from stitch.model.model_toml import ModelFile, read_model
-from stitch.stored.run_documents import read_result
+from stitch.stored.run_documents import read_result, verdict_of
 from stitch.units import METRES
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
@@ -86,7 +86,7 @@ def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner")
         mount=model.mount,
         parent=_plain("--parent", parent or _PARENTS[model.mount]),
         child=_plain("--child", child),
-        notes=(*_hidden(result["unobservable"]), *_left_behind(model)),
+        notes=(stands_for(verdict_of(folder)).rstrip("."), *_hidden(result["unobservable"]), *_left_behind(model)),
     )
 
 

@@ -47,3 +47,16 @@ def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covari
 def expanded(T_mount: Array, covariance: Array) -> Array:
     """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
     return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
+
+
+def stands_for(verdict: str | None) -> str:
+    """Of which model U is: a sigma counts no effect that is missing.
+
+    Args:
+        verdict: of the diagnosis; None where there is none yet.
+    """
+    told = {
+        None: "; whether an effect is missing has not been asked",
+        "adequate": "; no effect is found missing",
+    }
+    return f"U of the hand-eye holds for a complete model{told.get(verdict, ', and something is missing in this one')}."

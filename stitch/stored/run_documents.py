@@ -54,6 +54,7 @@ RESULT = _table(
     left_out=_list(_table({"view": _TEXT, "why": _TEXT})),
     linkage=_table({}, components=_list(_list(_TEXT)), weak=_list(_table({"view": _TEXT}))),
 )
+_VERDICTS = ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]
 _STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
 _VALUES = {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _NUMBER}}
 _NOTES = _list(_table({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
@@ -84,6 +85,17 @@ def read_result(folder: Path) -> dict[str, Any]:
     document = _checked(folder / "result.json", RESULT)
     assert isinstance(document, dict)
     return document
+
+
+def verdict_of(folder: Path) -> str | None:
+    """Verdict of the diagnosis in a run folder; None where there is none.
+
+    Raises:
+        InputError: a damaged diagnosis.json.
+    """
+    if not (folder / "diagnosis.json").is_file():
+        return None
+    return str(_checked(folder / "diagnosis.json", _table({"verdict": {"enum": _VERDICTS}}))["verdict"])
 
 
 def covariance_of_effects(path: Path) -> EffectsCovariance:

@@ -1,5 +1,6 @@
 """The hand-eye in the form of other programs, read back by readers that are none of ours."""
 
+import json
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -162,6 +163,24 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
         text = write(hand_eye_of(run))
         assert "Not observable from these motions, left at the coarse value: rotation about z" in text
         assert "mount_drift" in text and "flange" in text
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"),
+    [
+        (None, "whether an effect is missing has not been asked"),
+        ("adequate", "no effect is found missing"),
+        ("missing_effect", "something is missing in this one"),
+        ("unknown_effect", "something is missing in this one"),
+    ],
+)
+def test_an_uncertainty_says_of_which_model_it_is(verdict, said, tmp_path):
+    run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
+    if verdict:
+        (run / "diagnosis.json").write_text(json.dumps({"verdict": verdict}))
+    for write in FORMATS.values():
+        assert "U of the hand-eye holds for a complete model" in write(hand_eye_of(run))
+        assert said in write(hand_eye_of(run))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of, curve_text
+from stitch.model.hand_eye_uncertainty import stands_for
 from stitch.pipeline import diagnose
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
@@ -84,6 +85,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
     terminal = console()
     terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
     terminal.print(found.sentence, soft_wrap=True)
+    if found.verdict != "adequate":
+        terminal.print(stands_for(found.verdict), soft_wrap=True)
     table = Table(title="Candidate effects", title_justify="left")
     for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)

@@ -63,7 +63,7 @@ def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: s
         for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
     )
     return [
-        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2):",
+        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
         f"  position {position} mm",
         f"  rotation vector {turn} mrad",
     ]
