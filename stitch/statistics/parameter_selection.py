@@ -48,11 +48,15 @@ def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]],
         b = v[index]
         return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
-    chosen = _forward_and_back(gain, len(groups))
+    every = list(range(len(groups)))
+    # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
+    ways = (_without_idle(gain, _grown(gain, every)), _without_idle(gain, every))
+    chosen = max(ways, key=gain)
+    seen = np.linalg.norm(G, axis=0) >= 1 / UNSEEN
     for effect in dict.fromkeys(effects):
         if not any(effects[k] == effect for k in chosen):
-            own_groups = [k for k, e in enumerate(effects) if e == effect]
-            chosen.append(max(own_groups, key=lambda k: gain([*chosen, k])))
+            own_groups = [k for k in every if effects[k] == effect]
+            chosen.append(max(own_groups, key=lambda k: (seen[groups[k]].any(), gain([*chosen, k]))))
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
     return out
@@ -77,16 +81,24 @@ def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask) -> Array:
     return np.where(fitted, 0.0, rms)
 
 
-def _forward_and_back(gain: Callable[[Sequence[int]], float], count: int) -> list[int]:
-    """Add the group that gains most until none gains enough; then take out what others have made idle."""
+def _grown(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
+    """From nothing: the group that gains most is added until none gains enough."""
     chosen: list[int] = []
-    while len(chosen) < count:
-        best = max((k for k in range(count) if k not in chosen), key=lambda k: gain([*chosen, k]))
+    while left := [k for k in groups if k not in chosen]:
+        best = max(left, key=lambda k: gain([*chosen, k]))
         if gain([*chosen, best]) - gain(chosen) < _LOG_BAYES_FACTOR:
             break
         chosen.append(best)
-    for k in list(chosen):
-        rest = [other for other in chosen if other != k]
-        if gain(chosen) - gain(rest) < _LOG_BAYES_FACTOR:
-            chosen = rest
+    return chosen
+
+
+def _without_idle(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
+    """The group that is missed least is left out until all that remain gain enough beside each other."""
+    chosen = list(groups)
+    while chosen:
+        rests = [[other for other in chosen if other != k] for k in chosen]
+        rest = max(rests, key=gain)
+        if gain(chosen) - gain(rest) >= _LOG_BAYES_FACTOR:
+            break
+        chosen = rest
     return chosen

@@ -37,6 +37,26 @@ def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
     assert binomtest(others, 200, 0.05, alternative="greater").pvalue > 0.01
 
 
+def test_two_that_only_together_explain_are_found():
+    """What both do cancels nearly: alone either gains nothing, as two joints of an arm that err against each other."""
+    missed = 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        own, shared, further = rng.standard_normal((60, 6)), rng.standard_normal(60), rng.standard_normal((60, 6))
+        further[:, 1:3] = 5 * shared[:, None] + 0.4 * rng.standard_normal((60, 2))
+        z = further[:, 1] - further[:, 2] + 0.3 * rng.standard_normal(60)
+        chosen = supported(Whitened(own / 0.3, further / 0.3, z / 0.3), np.ones(6), [[i] for i in range(6)], [0] * 6)
+        missed += not (chosen[1] and chosen[2])
+    assert not missed
+
+
+def test_an_effect_keeps_a_group_that_is_seen():
+    rng = np.random.default_rng(1)
+    noise = Whitened(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), np.zeros(60))
+    noise.further[:, 0] = 0.0
+    assert not supported(noise, np.ones(3), [[0], [1], [2]], [0] * 3)[0]
+
+
 def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
     rng = np.random.default_rng(0)
     noise = Whitened(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60))
