@@ -47,7 +47,10 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
         raise InputError(f"--unit {unit}: use mm or m")
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
-        raise InputError(f"{file}: unknown kind {file.suffix!r}; known are {', '.join(_READERS)}")
+        raise InputError(
+            f"{file}: unknown kind {file.suffix!r}; known are {', '.join(_READERS)}; to fix: save it as one of these, "
+            f"or let `stitch init {file.parent}` read the folder, if it is a scan"
+        )
     text = file.read_text(encoding="utf-8-sig", errors="replace")
     if not text.strip():
         raise InputError(f"{file}: empty; export it again")

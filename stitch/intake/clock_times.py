@@ -17,6 +17,8 @@ _CLOCK = re.compile(
 _YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")
 _YEAR_LAST = re.compile(r"(\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{2})")
 DAY_S, _CENTURY = 86400.0, 2000
+# Of this century, counted in seconds since 1970.
+EPOCH_S = (0.9e9, 4.0e9)
 DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
 
 

@@ -40,7 +40,7 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
     Raises:
         InputError: so many more of one than of the other that they do not belong together.
     """
-    named = _by_text(clouds, labels) or _by_time(clouds, labels)
+    named = _by_text(clouds, labels) or _by_time(clouds, labels, numbers)
     named = named or _by_number(clouds, labels) or _by_column(clouds, numbers)
     if named is not None:
         return [named]
@@ -98,9 +98,9 @@ def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairi
     return Pairing(tuple(rows), "by the names beside the poses", True)
 
 
-def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
+def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None) -> Pairing | None:
     """The times in the clouds' names are those beside the poses, to a fraction of the time from scan to scan."""
-    found = rows_by_time(clouds, labels)
+    found = rows_by_time(clouds, labels, numbers)
     if found is None:
         return None
     rows, farthest = found

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.frames import Array
+from stitch.intake.clock_times import EPOCH_S
 from stitch.intake.layouts import Layout
 
 _TIMES = re.compile(r"(?:time|timestamp|stamp|zeit|t|sec|seconds)(?:_(s|ms|us|µs|ns|min|h))?")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-# Of this century, counted since 1970: in seconds, and in what controllers and ROS count in.
-_EPOCH_S = (0.9e9, 4.0e9)
 # Names that views.csv keeps for itself.
 _OWN = re.compile(r"view|cloud|time_s|[xyz]|q[xyzw]|j\d+_(deg|approach)")
 
@@ -39,7 +38,7 @@ def _second(times: Array, unit: str | None) -> float:
     """Seconds in one unit of a column of times: as its name says, else by the size of a time since 1970."""
     if unit is not None:
         return _SECONDS[unit]
-    return next((s for s in (1.0, 1e-3, 1e-6, 1e-9) if _EPOCH_S[0] < times[0] * s < _EPOCH_S[1]), 1.0)
+    return next((s for s in (1.0, 1e-3, 1e-6, 1e-9) if EPOCH_S[0] < times[0] * s < EPOCH_S[1]), 1.0)
 
 
 def _counts(values: Array) -> bool:

@@ -20,6 +20,7 @@ from stitch.intake.header_poses import header_poses
 from stitch.intake.joint_poses import JOINT_ANGLES, joint_layouts, joint_readings
 from stitch.intake.layouts import layouts
 from stitch.intake.mounting import Mounting, mounting
+from stitch.intake.one_frame import require_own_frames
 from stitch.intake.plausible_units import CLOUD_UNITS, cloud_units, pose_units
 from stitch.intake.program_poses import is_program, program_poses
 from stitch.intake.raw_poses import RawPoses, read_raw_poses
@@ -84,6 +85,7 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     motions = cache(lambda: relative_scans(capture))
     shown = target_motions(seen) if seen else None
     decided = decide(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
+    require_own_frames(folder, motions, decided)
     of_joints = decided.best.way.reading.rotation == JOINT_ANGLES
     settled = mounting(decided, stated.mount, stated.inverse, of_joints)
     axis, axis_guess = optical_axis(clouds)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.intake.cloud_files import clouds_among
-from stitch.intake.program_poses import PROGRAMS, read_by_its_program
-from stitch.intake.raw_poses import STRUCTURED, TABLES, natural
+from stitch.intake.layouts import layouts
+from stitch.intake.program_poses import PROGRAMS, is_program, read_by_its_program
+from stitch.intake.raw_poses import STRUCTURED, TABLES, natural, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.reading.poses_in_scans import poses_in_scans
 
@@ -128,7 +129,8 @@ def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[
         alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
     sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
     single = [files for files in alike.values() if len(files) == 1]
-    groups = sets or [g for g in single if _says_pose(g[0])] or single
+    groups = sets or [g for g in single if _says_pose(g[0])]
+    groups = groups or (len(single) > 1 and [g for g in single if _holds_poses(g[0])]) or single
     if not groups and alike:
         most = max(alike.values(), key=len)
         raise InputError(
@@ -141,6 +143,17 @@ def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[
         shown = ", ".join(str(g[0].relative_to(folder)) for g in groups[:4])
         raise InputError(f"{folder}: several files may hold the poses ({shown}); to fix: name it with --poses FILE")
     return groups[0], [f for f in candidates if f not in groups[0]]
+
+
+def _holds_poses(file: Path) -> bool:
+    """Several, whatever the file is called; what a camera's file or a remark holds is none."""
+    if is_program(file):
+        return True
+    try:
+        raw = read_raw_poses([file])
+        return len(raw.numbers) > 1 and bool(layouts(raw))
+    except InputError:
+        return False
 
 
 def _says_pose(file: Path) -> bool:

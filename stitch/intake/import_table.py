@@ -77,10 +77,15 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> Imported:
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
         )
-    rest = covariate_columns(layout, range(len(cells)))
+    rest = covariate_columns(layout, range(len(cells)), raw.time_s)
     header += rest
     cells = [[*row, *(column[i] for column in rest.values())] for i, row in enumerate(cells)]
-    return Imported("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), ())
+    return Imported("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), _warnings(raw))
+
+
+def _warnings(raw: RawPoses) -> tuple[str, ...]:
+    """How times of day were read, or why they are left out."""
+    return (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
 
 
 def _names(raw: RawPoses) -> list[str]:

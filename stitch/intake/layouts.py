@@ -7,6 +7,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.column_names import read_names
+from stitch.intake.pairs_by_time import since_1970
 from stitch.intake.raw_poses import RawPoses
 
 # A quaternion with three digits has length 1 within this.
@@ -46,7 +47,7 @@ def layouts(raw: RawPoses) -> list[Layout]:
         found = _by_name(raw)
         if found is not None:
             return [found]
-    x = _without_index(raw.numbers)
+    x, rest = _without_time(_without_index(raw.numbers))
     count = x.shape[1]
     tried = {6: _six, 7: _seven, 12: _twelve, 16: _sixteen}
     found_all = tried[count](x) if count in tried else []
@@ -57,7 +58,7 @@ def layouts(raw: RawPoses) -> list[Layout]:
             "hold no pose that is known; to fix: name each with --columns, for example --columns x,y,z,rx,ry,rz "
             "(qx,qy,qz,qw for a quaternion, j1,j2 … for joint angles, - for one to leave out)"
         )
-    return found_all
+    return [replace(layout, rest=rest) for layout in found_all]
 
 
 def _by_name(raw: RawPoses) -> Layout | None:
@@ -88,6 +89,12 @@ def _without_index(x: Array) -> Array:
     """The table without a first column that counts its rows."""
     counts = len(x) > 2 and x.shape[1] in (7, 8, 13, 17) and bool((np.diff(x[:, 0]) == 1).all())
     return x[:, 1:] if counts and x[0, 0] in (0, 1) else x
+
+
+def _without_time(x: Array) -> tuple[Array, dict[str, Array]]:
+    """The table without a first column of times since 1970, and that column by its name."""
+    timed = x.shape[1] in (7, 8, 13, 17) and len(x) > 1 and since_1970(x[:, 0]) is not None
+    return (x[:, 1:], {"time": x[:, 0]}) if timed else (x, {})
 
 
 def _six(x: Array) -> list[Layout]:

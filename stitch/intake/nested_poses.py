@@ -46,9 +46,21 @@ def _row(value: Any) -> dict[str, float] | None:
     if inner is not None:
         # The pose stands one level deeper, beside a time, a temperature or a name.
         unnamed = all(name.isdigit() for name in inner)
-        return inner if unnamed else {k: float(x) for k, x in value.items() if _is_number(x)} | inner
+        beside = _stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
+        return inner if unnamed else beside | inner
     out = _named(value)
     return out if len(out) >= _SIZES[0] else None
+
+
+def _stamp(value: dict[str, Any]) -> dict[str, float]:
+    """The time of a message of ROS, 1 or 2, from its header; nothing where none is written."""
+    header = value.get("header")
+    stamp = header.get("stamp") if isinstance(header, dict) else None
+    if not isinstance(stamp, dict):
+        return {}
+    whole, part = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs", 0))
+    told = isinstance(whole, (int, float)) and isinstance(part, (int, float)) and whole > 0
+    return {"time_s": whole + 1e-9 * part} if told else {}
 
 
 def _matrix(value: dict[str, Any]) -> list[float] | None:

@@ -1,9 +1,10 @@
-"""Poses that stand in the headers of scans: E57, Leica's PTX, PCD.
+"""Poses that stand in the headers of scans: E57, Leica's PTX, PCD; and the times that stand in those of E57.
 
 Robot cells that save such files write the flange's pose there; software that has registered the scans already writes
 the scanner's own.
 """
 
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from stitch.frames import Array
 from stitch.reading.extras import package
 
 _HEAD = 4096
+# From here E57 counts seconds (ASTM E2807).
+_GPS_EPOCH, _LATEST_S = datetime(1980, 1, 6), 1e10
 # PTX: sizes and four lines of the scanner's place stand above the matrix.
 _PTX_MATRIX = slice(6, 10)
 
@@ -40,6 +43,29 @@ def poses_in_scans(files: list[Path]) -> Array | None:
         found.append(T)
     poses = np.stack(found)
     return None if np.allclose(poses, poses[0]) else poses
+
+
+def times_in_scans(files: list[Path]) -> list[str] | None:
+    """When each scan began, as 2026-12-31T23:59:59.250000, of E57; None where one does not say it.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    if {file.suffix.lower() for file in files} != {".e57"}:
+        return None
+    seconds = [_e57_seconds(file) for file in files]
+    if not all(0 < s < _LATEST_S for s in seconds):
+        return None
+    return [(_GPS_EPOCH + timedelta(seconds=s)).isoformat(timespec="microseconds") for s in seconds]
+
+
+def _e57_seconds(file: Path) -> float:
+    """Zero where the header has no time."""
+    opened = package("pye57", file, "formats").E57(str(file))
+    try:
+        return float(opened.get_header(0).acquisitionStart_dateTimeValue)
+    except Exception:  # of libe57's own kinds: the standard lets the entry out
+        return 0.0
 
 
 def _e57(file: Path) -> Array | None:

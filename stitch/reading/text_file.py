@@ -8,6 +8,8 @@ from stitch.errors import InputError
 
 # Tables and descriptions are far smaller; a larger one is another file.
 LARGEST_MB = 200
+# How the small file begins that Git LFS leaves in place of a large one.
+_POINTER = b"version https://git-lfs"
 
 
 def require_file(file: Path, hint: str) -> None:
@@ -17,9 +19,10 @@ def require_file(file: Path, hint: str) -> None:
         hint: what to do where there is no such file.
 
     Raises:
-        InputError: no such file, or none of this kind.
+        InputError: no such file, none of this kind, or one that Git LFS has not fetched.
     """
     if file.is_file():
+        _require_no_pointer(file)
         return
     if file.is_dir():
         raise InputError(f"{file}: is a folder; to fix: {hint}")
@@ -28,6 +31,12 @@ def require_file(file: Path, hint: str) -> None:
     if file.is_symlink():
         raise InputError(f"{file}: is a link to {file.readlink()}, which does not exist; to fix: {hint}")
     raise InputError(f"{file}: not found; {hint}")
+
+
+def _require_no_pointer(file: Path) -> None:
+    with file.open("rb") as stream:
+        if stream.read(len(_POINTER)) == _POINTER:
+            raise InputError(f"{file}: Git LFS has left a pointer in place of the file; to fix: git lfs pull")
 
 
 def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:

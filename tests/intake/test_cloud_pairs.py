@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stitch.errors import InputError
@@ -62,3 +63,16 @@ def test_times_tell_though_there_are_more_poses(day):
 def test_times_that_are_not_those_of_the_scans_tell_nothing(times):
     with pytest.raises(InputError, match="3 clouds and 6 poses"):
         pairings(SCANS, [(time,) for time in times])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e9])
+def test_a_trajectory_at_a_hundred_hertz_is_met_where_a_scan_was_taken(scale):
+    """Images and ground truth as the TUM RGB-D benchmark names them: seconds since 1970, many more poses than images."""
+    taken = [1305031453.374112, 1305031460.91, 1305031471.002]
+    clouds = [Path(f"depth/{t:.6f}.png") if scale == 1 else Path(f"depth_{round(t * scale)}.ply") for t in taken]
+    times = 1305031450 + 0.01 * np.arange(2500)
+    table = np.column_stack([times * scale, *np.random.default_rng(0).normal(size=(7, 2500))])
+    (pairing,) = pairings(clouds, [()] * len(table), table)
+    assert pairing.rows == tuple(round((t - times[0]) / 0.01) for t in taken) and pairing.by_name
+    with pytest.raises(InputError, match="3 clouds and 2500 poses"):
+        pairings(clouds, [()] * len(table), table + 3600 * scale)

@@ -1,6 +1,7 @@
 """The scans tell what a table does not: on simulated cells of known truth, and on measured scans."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.raw_folders import Convention, raw_folder, session_poses
 from data_synth.write import write_session
 from stitch import frames
+from stitch.errors import InputError
 from stitch.intake.first_session import first_session
 from stitch.intake.session_draft import write_draft
 from stitch.intake.stated import StatedFolder
+from stitch.reading.clouds import read_cloud
 from stitch.reading.session_folder import load_session
 
 OBJECTS = ("david", "cone", "sphere", "rubik", "gripperopen")
@@ -52,6 +55,22 @@ def test_order_direction_unit_and_mount_are_told_by_four_small_scans(still_cells
     assert "# mount: eye_in_hand, the scanner sits at the flange; the poses are T_flange_base" in (
         (folder / "session.toml").read_text(encoding="utf-8")
     )
+
+
+def test_scans_that_lie_in_one_frame_already_are_refused(tmp_path):
+    """Moved into the base by the true hand-eye, as the scanner's software does where it knows it."""
+    measured = measured_blade(3, views=7, mount="eye_in_hand", pixels=40)
+    write_session(tmp_path / "cell", measured, "cell")
+    folder = raw_folder(tmp_path / "cell", tmp_path / "raw", Convention("xyz"))
+    T, clouds = session_poses(tmp_path / "cell")
+    for pose, name in zip(T @ measured.T_mount, clouds, strict=True):
+        file = folder / Path(name).name
+        points = frames.transform(pose, read_cloud(file).points)
+        file.unlink()
+        np.savetxt(file.with_suffix(".xyz"), points)
+    with pytest.raises(InputError, match="lie in one frame already") as refused:
+        first_session(folder, StatedFolder())
+    assert "\n" not in str(refused.value) and "to fix" in str(refused.value)
 
 
 @pytest.mark.slow

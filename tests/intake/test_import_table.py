@@ -48,6 +48,14 @@ def test_times_and_temperatures_come_along(imported):
     assert [row["scanner_temperature_c"] for row in rows] == ["20.5", "21"]
 
 
+def test_times_of_day_come_along(imported):
+    text = "view,time,x,y,z,qx,qy,qz,qw\na,09:59:58.5,100,0,500,0,0,0,1\nb,10:00:01,100,0,510,0,0,0,1\n"
+    _, rows, _ = imported("t.txt", text)
+    assert [row["time_s"] for row in rows] == ["0", "2.5"] and [row["view"] for row in rows] == ["a", "b"]
+    _, rows, said = imported("t.txt", text.replace("09:59:58.5", "11:00:00"))
+    assert "time_s" not in rows[0] and "times of day run backwards" in said
+
+
 def test_joint_angles(imported):
     code, rows, _ = imported("t.txt", JOINTS, "--angles", "rad")
     assert code == 0 and "x" not in rows[0]

@@ -11,6 +11,16 @@ from stitch.intake.layouts import layouts
 from stitch.intake.raw_poses import natural, read_raw_poses
 from stitch.intake.readings import readings
 
+POSE_OF_ROS = """  position:
+    x: 0.5
+    y: -0.25
+    z: 0.75
+  orientation:
+    x: 0.0
+    y: 0.6
+    z: 0.0
+    w: 0.8
+"""
 # github.com/zivid/zivid-python-samples, robotTransform.yaml: OpenCV's FileStorage.
 OPENCV = """%YAML:1.0
 ---
@@ -107,6 +117,24 @@ def test_ros_transforms(tmp_path):
     assert reading.rotation == "quaternion-xyzw"
     assert np.allclose(reading.T[:, :3, 3], [[0.5, -0.25, 0.75], [0.5, -0.25, 0.5]])
     assert np.allclose(reading.T[0, :3, :3], [[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]])
+
+
+def test_messages_of_ros_keep_their_time(tmp_path):
+    stamped = "header:\n  stamp:\n    sec: {}\n    nanosec: {}\n  frame_id: base\npose:\n" + POSE_OF_ROS
+    raw = read(tmp_path, "poses.yaml", "---\n".join(stamped.format(1718099007 + i, 250000000) for i in range(2)))
+    (layout,) = layouts(raw)
+    assert layout.rest["time_s"].tolist() == [1718099007.25, 1718099008.25]
+    assert only(raw).T[0, :3, 3].tolist() == [0.5, -0.25, 0.75]
+
+
+def test_times_since_1970_stand_before_poses_without_a_header(tmp_path):
+    """A trajectory as the TUM RGB-D benchmark and evo write it."""
+    rows = "1305031453.3741 0.5 -0.25 0.75 0 0.6 0 0.8\n1305031453.3842 0.5 -0.25 0.5 0 0.6 0 0.8\n"
+    for head in ("", "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"):
+        raw = read(tmp_path, "groundtruth.txt", head + rows)
+        (layout,) = layouts(raw)
+        assert [next(iter(layout.rest.values()))[1]] == [1305031453.3842]
+        assert layout.position[0].tolist() == [0.5, -0.25, 0.75] and layout.rotation[0].tolist() == [0, 0.6, 0, 0.8]
 
 
 def test_reghec_says_by_its_sizes_that_angles_come_first_in_radians(tmp_path):

@@ -47,3 +47,17 @@ def test_joint_targets_without_a_pose_are_left_out_and_said(tmp_path):
 def test_a_table_may_end_in_dat(tmp_path):
     (tmp_path / "poses.dat").write_text("1,2,3,4,5,6\n2,3,4,5,6,7\n")
     assert not is_program(tmp_path / "poses.dat") and len(read_raw_poses([tmp_path / "poses.dat"]).numbers) == 2
+
+
+def test_what_the_camera_wrote_beside_the_poses_is_no_table_of_poses(tmp_path):
+    """Neither file says in its name what it holds."""
+    for i in range(3):
+        np.savetxt(tmp_path / f"scan_{i + 1}.xyz", np.full((500, 3), i + 1.0))
+    (tmp_path / "camera_info.yaml").write_text(
+        "height: 480\nwidth: 640\nk: [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]\n"
+        "r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n"
+    )
+    (tmp_path / "remarks.txt").write_text("3 scans, gripper new, 22.5 degrees in the hall\n")
+    rows = "".join(f"{800 + i} 20 700 0.1 0.2 {0.3 * i}\n" for i in range(3))
+    (tmp_path / "run7.txt").write_text(rows)
+    assert look_into(tmp_path).poses == (tmp_path / "run7.txt",)

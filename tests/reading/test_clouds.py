@@ -125,3 +125,13 @@ def test_lzf_refuses_nonsense():
     assert lzf.decompress(b"\x02abc", 3) == b"abc"
     # Three literals, then 6 bytes from 3 back: a pattern that reads what it writes.
     assert lzf.decompress(b"\x02abc\x80\x02", 9) == b"abcabcabc"
+
+
+@pytest.mark.parametrize("name", ["s.ply", "s.pcd", "s.xyz", "s.stl", "s.e57", "s.png"])
+def test_what_git_lfs_has_not_fetched_says_how_to_fetch_it(name, tmp_path):
+    """The pointer as the specification of Git LFS has it."""
+    oid = "4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393"
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{oid}\nsize 12345\n"
+    (tmp_path / name).write_text(pointer)
+    with pytest.raises(InputError, match="git lfs pull"):
+        read_cloud(tmp_path / name)

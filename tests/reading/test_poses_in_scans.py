@@ -1,5 +1,7 @@
 """Poses in the headers of scans: files of pye57, and samples typed after the formats' descriptions."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from stitch.errors import InputError
 from stitch.intake.first_session import first_session
 from stitch.intake.stated import StatedFolder
 from stitch.reading.clouds import read_cloud
-from stitch.reading.poses_in_scans import poses_in_scans
+from stitch.reading.poses_in_scans import poses_in_scans, times_in_scans
 from tests.needs import needs
 
 POINTS = "0 0 100 0.5\n10 0 100 0.25\n0 10 100 1\n10 10 100 1\n"
@@ -51,6 +53,14 @@ def test_e57(tmp_path):
             written.write_scan_raw(columns, rotation=quarter, translation=np.array(places))
     assert np.allclose(poses_in_scans(files)[1], TURNED)
     assert np.allclose(poses_in_scans(files)[0, :3, 3], 0)
+    assert times_in_scans(files) is None  # nobody wrote them
+    sizes = {f"{axis}{end}": float(end == "Maximum") for axis in "xyz" for end in ("Minimum", "Maximum")}
+    for file, seconds in zip(files, (1_400_000_000.25, 1_400_000_007.75), strict=True):
+        with pye57.E57(str(file), mode="w") as written:
+            header = SimpleNamespace(**sizes, acquisitionStart_dateTimeValue=seconds)
+            written.write_scan_raw(columns, scan_header=header)
+    # 16,203 days, 16 h 53 min 20 s from 1980-01-06.
+    assert times_in_scans(files) == ["2024-05-17T16:53:20.250000", "2024-05-17T16:53:27.750000"]
     with pye57.E57(str(tmp_path / "two.e57"), mode="w") as written:
         written.write_scan_raw(columns)
         written.write_scan_raw(columns)
