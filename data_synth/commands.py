@@ -8,6 +8,14 @@ import typer
 
 from stitch.errors import InputError
 
+# What the judgement's entries are called for people.
+_LABELS = {
+    "in_the_model": "in the model",
+    "hand_eye_error_coarse_mm": "hand-eye error, coarse (mm)",
+    "hand_eye_error_mm": "hand-eye error (mm)",
+    "hand_eye_error_by_step_mm": "hand-eye error by step (mm)",
+}
+
 
 def synth(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A scene's name, or a TOML file.")],
@@ -66,8 +74,8 @@ def reveal(
     # Values of what is in the model follow, each beside what was found.
     judged["hidden"] = {name: {} if name in judged["in_the_model"] else own for name, own in judged["hidden"].items()}
     for key, value in judged.items():
-        # Names of effects stay as they are.
-        table.add_row(key if "." in key else key.replace("_", " "), _told(value))
+        # Names of effects and of their parameters stay as they are, as in the glossary and in every table.
+        table.add_row(_LABELS.get(key, key), _told(value))
     console().print(table)
 
 
