@@ -59,8 +59,9 @@ def _stamp(value: dict[str, Any]) -> dict[str, float]:
     if not isinstance(stamp, dict):
         return {}
     whole, part = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs", 0))
-    told = isinstance(whole, (int, float)) and isinstance(part, (int, float)) and whole > 0
-    return {"time_s": whole + 1e-9 * part} if told else {}
+    if not (isinstance(whole, (int, float)) and isinstance(part, (int, float)) and whole > 0):
+        return {}
+    return {"time_s": whole + 1e-9 * part}
 
 
 def _matrix(value: dict[str, Any]) -> list[float] | None:
