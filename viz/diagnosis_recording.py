@@ -14,6 +14,7 @@ from stitch.writing.plain_effects import in_words, what_it_is
 from stitch.writing.plain_finding import next_step, plain_finding
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
+from viz.recorded_words import words
 from viz.rerun_program import rerun_program
 from viz.rrd_file import RecordingFile, id_of
 
@@ -56,7 +57,7 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
     on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
     plain = plain_finding(found, length_unit)
-    rec.log("diagnosis/plain", rr.TextDocument(plain), static=True)
+    rec.log("diagnosis/plain", words(plain), static=True)
     lines = [f"**{plain}**", "", found.sentence, "", f"{next_step(found, 'RUN')}", ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
@@ -69,8 +70,7 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     ]
     lines += ["", *(f"- {in_words(c.name)}" for c in shown if what_it_is(c.name))]
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
-    text = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
-    rec.log("diagnosis/verdict", text, static=True)
+    rec.log("diagnosis/verdict", words("\n".join(lines)), static=True)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
     moved = np.linalg.norm(found.linear.displaced(), axis=1) * um

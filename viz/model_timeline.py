@@ -13,6 +13,7 @@ from stitch.frames import Array
 from stitch.runs.run import Run
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.model_scene import ModelScene, mean_sizes, shown_steps
+from viz.recorded_words import words
 from viz.run_figures import shown_points
 
 FRAMES = 10  # of the timeline from one step to the next
@@ -88,17 +89,17 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
     recording.log("displacements", arrows)
     means = mean_sizes((1 - share) * one.values + share * other.values) * scene.um
     recording.log("bars/views", rr.BarChart(means, color=_BAR))
-    recording.log("now", rr.TextDocument(_words(scene, k, share), media_type=rr.MediaType.MARKDOWN))
+    recording.log("now", words(_told(scene, k, share)))
 
 
-def _words(scene: ModelScene, k: int, share: float) -> str:
+def _told(scene: ModelScene, k: int, share: float) -> str:
     """What is seen at a step, or on the way from step k to the next."""
     steps = scene.history.steps
     if 0 < share < 1:
         told = "Nothing is fitted in between: colours, places and bars are drawn in proportion."
         return f"## {steps[k].name} → {steps[k + 1].name}\n{100 * share:.0f} % of the way. {told}"
     now = k + round(share)
-    noise = f"noise alone would leave {steps[now].field.noise * scene.um:.2g} µm"
+    noise = f"noise alone would leave {steps[now].field.noise * scene.um:.3g} µm"
     first = scene.history.models[0].name
     shown = f"Bars: the views in their order, from 0; behind them in grey those of {first}, darker where a view is "
     shown += "farther off than there."

@@ -18,6 +18,7 @@ from viz.model_scene import model_scene
 from viz.model_timeline import log_model
 from viz.part_camera import camera_for
 from viz.part_surface import part_surface
+from viz.recorded_words import words
 from viz.robot_scene import log_robot
 from viz.rrd_file import RecordingFile, id_of
 from viz.run_figures import view_shifts
@@ -56,10 +57,9 @@ class RerunRecorder:
         file = RecordingFile("stitch", self.path, id_of(run.session.name))
         rec, um = file.stream, MICROMETRES[run.session.length_unit]
         history = model_history(run)
-        words = run_markdown(run, history)
-        rec.log("verdict", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
+        rec.log("verdict", words(run_markdown(run, history)), static=True)
         for place in ("diagnosis/plain", "diagnosis/verdict"):
-            rec.log(place, rr.TextDocument(NOT_YET, media_type=rr.MediaType.MARKDOWN), static=True)
+            rec.log(place, words(NOT_YET), static=True)
         for stage, rms in self.rms.items():
             rec.log(f"iterations/{stage}", rr.BarChart(np.array(rms) * um, color=GREY), static=True)
         for which, colour in (("residual_rms", COLOURS_OF_FEW[0]), ("heldout_rms", COLOURS_OF_FEW[1])):
@@ -97,5 +97,4 @@ def _log_targets(rec: rr.RecordingStream, run: Run) -> None:
     factor = 0.25 * (float(np.ptp(start, axis=0).max()) or 1.0) / longest
     strips = np.stack([start, start + factor * left], axis=1).astype(np.float32)
     rec.log("targets/sticks", rr.LineStrips3D(strips, colors=[(72, 120, 168)]), static=True)
-    text = f"Sticks at the targets are {factor:.0f} times longer than they are."
-    rec.log("now", rr.TextDocument(text), static=True)
+    rec.log("now", words(f"Sticks at the targets are {factor:.0f} times longer than they are."), static=True)

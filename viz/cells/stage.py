@@ -14,6 +14,7 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
 import rerun.blueprint as rrb
 
+from viz.recorded_words import words
 from viz.rrd_file import RecordingFile
 
 Colours = NDArray[np.uint8] | Sequence[tuple[int, int, int]]
@@ -22,7 +23,7 @@ GREY, BLUE, GREEN, RED = (150, 150, 150), (72, 120, 168), (80, 150, 80), (196, 6
 
 
 @contextmanager
-def stage(path: Path, system: str, words: str) -> Iterator[rr.RecordingStream]:
+def stage(path: Path, system: str, told: str) -> Iterator[rr.RecordingStream]:
     """A recording that opens on the scene `world` with the words beside it; written when the block has ended well."""
     scene = rrb.Spatial3DView(origin="world", name=system)
     side = rrb.TextDocumentView(origin="words", name="What was found")
@@ -30,7 +31,7 @@ def stage(path: Path, system: str, words: str) -> Iterator[rr.RecordingStream]:
     file = RecordingFile(f"stitch_{system.replace(' ', '_')}", path, default=layout)
     recording = file.stream
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    recording.log("words", rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN), static=True)
+    recording.log("words", words(told), static=True)
     yield recording
     file.write()
 

@@ -83,7 +83,7 @@ function showPart(root, data, more, eye) {
     grey.textContent = signed ? "nothing to compare with" : "seen by one view only";
   }
   const digits = x => x === 0 ? "0" : Number(x.toPrecision(3)).toString();
-  const length = um => um >= 999.5 ? `${digits(um / 1e3)} mm` : `${digits(um)} µm`;
+  const length = um => um >= 999.5 ? `${digits(um / 1e3)}\u00a0mm` : `${digits(um)}\u00a0µm`;
   function names() {
     const list = root.querySelector("[data-steps]");
     choice.parentElement.hidden = choice.length < 2;

@@ -9,12 +9,16 @@ export function element(tag, attributes = {}, ...children) {
     else if (value === true) made.setAttribute(name, "");
     else if (value !== false && value != null) made.setAttribute(name, value);
   }
-  made.append(...children.filter(child => child != null && child !== false));
+  const typed = ["code", "pre"].includes(tag);  // what may be copied into a terminal stays as it is
+  made.append(...children.filter(child => child != null && child !== false).map(child => typeof child === "string" && !typed ? unbroken(child) : child));
   return made;
 }
 
 // Signs of numbers as signs, which no line breaks after: −2e−07, not -2e- 07.
 export const signed = text => text.replace(/(^|[\s=(±])-(?=\d)/g, "$1−").replace(/(\d)e-(?=\d)/g, "$1e−");
+
+// No-break spaces before units and about ±, as viz/unbroken.py sets them on the page of a run.
+export const unbroken = text => text.replace(/(?<=\d) (?=(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|%)(?![\w%])|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)/g, "\u00a0");
 
 export const at = id => document.getElementById(id);
 

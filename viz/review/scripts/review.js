@@ -1,6 +1,6 @@
 // The review: reads the run as it stands, and draws it anew whenever it changes, whoever changed it.
 import { showCandidates } from "./candidates.js";
-import { at } from "./elements.js";
+import { at, unbroken } from "./elements.js";
 import { showLedger } from "./ledger.js";
 import { heardOwn, showOwn } from "./own_effect.js";
 import { chooseOnPart, showPlots } from "./plots.js";
@@ -29,8 +29,8 @@ async function refresh() {
 
 async function draw() {
   at("name").textContent = `Review of ${state.name}`;
-  at("sentence").textContent = state.sentence;
-  at("evidence").textContent = state.evidence === state.sentence ? "" : state.evidence;
+  at("sentence").textContent = unbroken(state.sentence);
+  at("evidence").textContent = state.evidence === state.sentence ? "" : unbroken(state.evidence);
   await show(state);
   showNumbers(state);
   showPlots(state);
