@@ -8,7 +8,7 @@ import typer
 
 from stitch.errors import InputError
 
-# What the judgement's entries are called for people.
+# Of what a judge says, for people; names of effects and of their parameters stay as they are.
 _LABELS = {
     "in_the_model": "in the model",
     "hand_eye_error_coarse_mm": "hand-eye error, coarse (mm)",
@@ -73,8 +73,8 @@ def reveal(
         del judged["named"]
     # Values of what is in the model follow, each beside what was found.
     judged["hidden"] = {name: {} if name in judged["in_the_model"] else own for name, own in judged["hidden"].items()}
+    judged["verdict"] = judged["verdict"].replace("_", " ")
     for key, value in judged.items():
-        # Names of effects and of their parameters stay as they are, as in the glossary and in every table.
         table.add_row(_LABELS.get(key, key), _told(value))
     console().print(table)
 

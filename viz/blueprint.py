@@ -13,11 +13,10 @@ from viz.colour_bar import HIGH, WIDE
 from viz.model_scene import ModelScene, shown_steps
 from viz.model_timeline import FRAMES
 from viz.part_camera import Camera
+from viz.whole_picture import eye_for
 
-# Of the longest side of the part, from its middle: all of it is in the picture.
-_AWAY = 1.2
-# Tangents of half the viewer's field (55 degrees high) with a margin, in a window half as wide again as high.
-_HIGH, _WIDE = 0.47, 0.7
+# Width over height, in an ordinary window, of a picture of the part and of that of the cell.
+_OF_PART, _OF_CELL = 0.68, 1.5
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
@@ -90,10 +89,7 @@ def _part(origin: str, name: str, scene: ModelScene, camera: Camera) -> rrb.Spat
 
 def _eye(scene: ModelScene, camera: Camera) -> rrb.EyeControls3D:
     """The same eye for all views of the part."""
-    vertices = scene.surface.vertices
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    position = middle + _AWAY * float(np.ptp(vertices, axis=0).max()) * camera.towards
-    return rrb.EyeControls3D(position=position, look_target=middle, eye_up=camera.up)
+    return eye_for(scene.surface.vertices, camera.axes, camera.up, _OF_PART)
 
 
 def _bar(origin: str, name: str) -> rrb.Spatial2DView:
@@ -109,26 +105,19 @@ def _bars(origin: str, name: str, *contents: str) -> rrb.BarChartView:
 
 def _cell(points: Array) -> rrb.Vertical:
     """Everything in the picture, from the side and a little from above."""
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     across = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][-1]
     # Turned a little: the shortest way through a cell is often along the scanner's rays.
     across = np.array([[_COS, -_SIN, 0], [_SIN, _COS, 0], [0, 0, 1]]) @ across
     level = np.array([across[0], across[1], 0.0]) / max(float(np.hypot(*across[:2])), 1e-9)
     towards = np.array([level[0], level[1], 0.3]) / np.hypot(1.0, 0.3)
-    aside = np.cross([0.0, 0.0, 1.0], level)
+    up = np.array([0.0, 0.0, 1.0])
+    aside = np.cross(up, level)
     axes = np.array([aside, np.cross(towards, aside), towards])
-    for _ in range(4):
-        x, y, z = axes @ (points - middle).T
-        # The nearest place from which every point is in the picture, and what is seen then comes to its middle.
-        away = float(np.max(z + np.maximum(np.abs(x) / _WIDE, np.abs(y) / _HIGH)))
-        seen = np.array([x, y]) / (away - z)
-        middle = middle + 0.5 * away * (seen.min(axis=1) + seen.max(axis=1)) @ axes[:2]
-    eye = rrb.EyeControls3D(position=middle + away * towards, look_target=middle, eye_up=[0, 0, 1])
     view = rrb.Spatial3DView(
         origin="robot",
-        name="Arm at every view (grey lines), field of the scanner (pyramids), part (points); base frame",
+        name="Arm at every view (grey lines), scanner (pyramids, the large one its field), part (points); base frame",
         background=_GROUND,
-        eye_controls=eye,
+        eye_controls=eye_for(points, axes, up, _OF_CELL),
     )
     return rrb.Vertical(view, name="The cell")
 

@@ -16,10 +16,12 @@ _THIN = rr.Radius.ui_points(1.0)
 _GREY, _PART, _SCANNER = (110, 110, 110), (190, 195, 200), (230, 159, 0)
 _SEEN = 0.98  # share of the points that lie within the drawn field of the scanner
 _POINTS = 20_000
+# Of the field, where the scanner stood at the other views: as large as it is they would hide the part.
+_SMALL = 0.15
 
 
 def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
-    """Chain of joints where the arm is known, else the flanges; a frustum for every place of the scanner.
+    """Chain of joints where the arm is known, else the flanges; the scanner's field, small for all views but the first.
 
     Returns:
         (N, 3) some points of the cell, base frame.
@@ -32,10 +34,10 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
     in_hand = run.session.mount == "eye_in_hand"
     T_base_scanner = flange @ run.T_mount if in_hand else run.T_mount[None]
     seen = [arm]
-    for name, T, colour in zip(names, T_base_scanner, colours, strict=False):
-        lines = [frames.transform(T, strip) for strip in corners]
+    for v, (name, T, colour) in enumerate(zip(names, T_base_scanner, colours, strict=False)):
+        lines = [frames.transform(T, strip if v == 0 else _SMALL * strip) for strip in corners]
         seen.append(np.concatenate(lines))
-        shown, label = (colour, name) if in_hand else (_SCANNER, "scanner")
+        shown, label = (_SCANNER if v == 0 else colour, name) if in_hand else (_SCANNER, "scanner")
         recording.log(f"robot/scanner/{label}", rr.LineStrips3D(lines, colors=[shown], radii=_THIN), static=True)
     points = run.fused.points[
         np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _POINTS)).astype(int)

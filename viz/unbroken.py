@@ -3,7 +3,7 @@
 import re
 
 _SPACE = "\u00a0"
-_UNIT = r"(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|%)(?![\w%])"
+_UNIT = r"(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|[%σ])(?![\w%])"
 _BETWEEN = re.compile(rf"(?<=\d) (?={_UNIT}|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)")
 
 

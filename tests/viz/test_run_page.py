@@ -16,6 +16,7 @@ from stitch.writing.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.filled_templates import render
 from viz.run_page import write_report
+from viz.unbroken import unbroken
 
 LARGEST = 8_000_000  # bytes that can be mailed
 
@@ -54,8 +55,8 @@ def test_the_page_says_what_the_result_says(recorded, page):
     np.testing.assert_allclose(shown, kept, rtol=1e-9)
     for um in kept:
         assert f"<td>{um:,.0f}</td>" in page if um >= 1e3 else f"<td>{um:.3g}</td>" in page
-    assert plain_verdict(model_history(run), "mm") in page
-    assert escape(run.verdict) in page
+    assert unbroken(plain_verdict(model_history(run), "mm")) in page
+    assert escape(unbroken(run.verdict)) in page
 
 
 def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):
@@ -87,9 +88,9 @@ def test_the_headline_of_a_doubtful_session_is_short_and_what_to_do_is_folded(re
     assert said.endswith(plain_verdict(model_history(run), "mm"))
     write_report(run, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert f'<p class="verdict">{escape(said)}</p>' in page
+    assert f'<p class="verdict">{escape(unbroken(said))}</p>' in page
     folded = page[page.index('<details class="doubts">') :]
-    assert all(str(escape(doubt)) in folded[: folded.index("</details>")] for doubt in doubts)
+    assert all(str(escape(unbroken(doubt))) in folded[: folded.index("</details>")] for doubt in doubts)
 
 
 def test_words_can_be_read_on_light_and_dark():

@@ -13,6 +13,7 @@ from viz.review.residual_rows import read_rows
 from viz.review.run_review import RunReview
 from viz.review.run_snapshot import read_snapshot
 from viz.review.undo_history import undo_history
+from viz.unbroken import unbroken
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def test_what_is_shown_is_what_the_files_say(run):
     assert found.state["residual"] == pytest.approx(1e3 * result["residual_rms"])
     assert found.state["sentence"] == result["plain"] and not found.state["labelled"]
     page = (run / "report.html").read_text()
-    assert found.state["sentence"] in page
+    assert unbroken(found.state["sentence"]) in page
     assert json.loads(found.part)["steps"][1]["mean"] == pytest.approx(found.state["steps"][1]["mean"])
     assert {t["name"] for t in found.state["comparison"]} >= {"view", "range", "place on the part"}
 

@@ -18,7 +18,7 @@ export function element(tag, attributes = {}, ...children) {
 export const signed = text => text.replace(/(^|[\s=(±])-(?=\d)/g, "$1−").replace(/(\d)e-(?=\d)/g, "$1e−");
 
 // No-break spaces before units and about ±, as viz/unbroken.py sets them on the page of a run.
-export const unbroken = text => text.replace(/(?<=\d) (?=(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|%)(?![\w%])|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)/g, "\u00a0");
+export const unbroken = text => text.replace(/(?<=\d) (?=(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|[%σ])(?![\w%])|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)/g, "\u00a0");
 
 export const at = id => document.getElementById(id);
 
