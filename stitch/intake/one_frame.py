@@ -31,6 +31,6 @@ def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decid
     if still > max(0.5, decided.best.closed or 0.0):
         raise InputError(
             f"{folder}: {still:.0%} of neighbouring scans meet as they are, and not as the poses say: they lie in one "
-            "frame already, or most of what they show stands still before the scanner; to fix: export every scan in the "
-            "scanner's own frame, or cut away what stands still"
+            "frame already, or most of what they show stands still before the scanner; to fix: export every scan in "
+            "the scanner's own frame, or cut away what stands still"
         )

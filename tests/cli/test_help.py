@@ -105,7 +105,9 @@ def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
     assert sorted(path.name for path in session.iterdir()) == ["clouds", "session.toml", "views.csv"]
     # What a person needs at the end: the hand-eye with U and its frame, errors, files, what to do next.
     assert re.search(
-        r"Hand-eye T_base_scanner, in the frame of the base, ± U \(k = 2\):\n  position x -?[\d.]+ ± [\d.]+,", told
+        r"Hand-eye T_base_scanner, in the frame of the base, ± U \(k = 2\) for a complete model:\n"
+        r"  position x -?[\d.]+ ± [\d.]+,",
+        told,
     )
     assert re.search(r"rotation vector x .* mrad\n", told)
     assert re.search(r"Held-out error [\d.]+ µm \(in the fit [\d.]+ µm, noise floor [\d.]+ µm\)\.", told)
