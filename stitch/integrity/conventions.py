@@ -22,6 +22,8 @@ from stitch.units import METRES
 # from it: (1 − score) counts open motions.
 _CLOSES = 0.6
 _CLEARER, _CLEAR_OPEN = 0.6, 0.02
+# Short of that: this share under one reading, and under the stated one so little of it that chance does as much.
+_MANY, _HARDLY, _AS_MANY = 0.4, 0.2, 0.75
 # Poses whose motions nearly all close need no other convention.
 _ALL = 0.95
 # A factor is one between units if it is this near.
@@ -76,6 +78,21 @@ def verdict(found: Sequence[Explained]) -> tuple[Explained, ...]:
         return ()
     close = [e for e in found if e.open <= best.open / _CLEARER + 0.01 and e.closed >= 0.9 * best.closed]
     return tuple(e for e in close if e.hypothesis.kind != "stated" or e.scale != 1.0)
+
+
+def likeliest(found: Sequence[Explained]) -> tuple[Explained, ...]:
+    """The readings that agree with many motions where the stated one agrees with hardly any; () if none does.
+
+    Less than `verdict` asks for: a part that slides on itself closes half of the motions under any reading. So it is
+    for sessions of which views are accused anyway.
+    """
+    if not found:
+        return ()
+    stated = max(e.closed for e in found if e.hypothesis.kind == "stated" and e.scale == 1.0)
+    most = max(e.closed for e in found)
+    if most < _MANY or stated > _HARDLY * most:
+        return ()
+    return tuple(sorted((e for e in found if e.closed >= _AS_MANY * most), key=lambda e: -e.closed))
 
 
 def _named_unit(found: Explained) -> Explained:

@@ -7,7 +7,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import contradicted_by, contradicts, judged_by_size, stands_off
 from stitch.integrity.background import background
-from stitch.integrity.conventions import explained, verdict
+from stitch.integrity.conventions import explained, likeliest, verdict
 from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.linkage import only
 from stitch.integrity.motion_fit import Explained
@@ -58,13 +58,14 @@ def _of_clouds(session: Session) -> list[Problem]:
     try:
         problems, contradicted = _of_views(session, capture, found)
     except NoResultError:
-        undone = _undone(session, capture, found)
+        undone = _undone(session, capture, found) or _likeliest(session, found)
         if undone is None:
             raise
         return [undone]
     if not contradicted and not (problems and _rivalled(found)):
         return problems
     undone = _convention(session, named) if named and contradicted else _undone(session, capture, found)
+    undone = undone or _likeliest(session, found)
     return problems if undone is None else [undone]
 
 
@@ -124,6 +125,12 @@ def _undone(session: Session, capture: Capture, found: Sequence[Explained]) -> P
     if contradicts(right, snooped):
         return None
     return _named(session, best, [f.hypothesis.fix for f in fallen])
+
+
+def _likeliest(session: Session, found: Sequence[Explained]) -> Problem | None:
+    """The mistake that the motions show short of proof; None if there is none."""
+    likely = likeliest(found)
+    return _convention(session, likely) if likely else None
 
 
 def _convention(session: Session, named: tuple[Explained, ...]) -> Problem:

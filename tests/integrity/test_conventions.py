@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
-from stitch.integrity.conventions import explained, verdict
+from stitch.integrity.conventions import explained, likeliest, verdict
 from stitch.integrity.hypotheses import hypotheses
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.integrity.targets import check_targets
@@ -73,6 +73,31 @@ def test_a_carried_sensor_is_judged_alike():
     assert check_targets(session) == []
     spoil, kinds = MISTAKES["mount"]
     assert verdict(explained(spoil(session), motions(session, T_mount)))[0].hypothesis.kind in kinds
+
+
+def slid(some, share, seed=5):
+    """Of so many motions scans that slid on each other tell something else."""
+    rng = np.random.default_rng(seed)
+    T = some.T.copy()
+    wrong = rng.permutation(len(T))[: round(share * len(T))]
+    T[wrong] = T[wrong] @ frames.exp(rng.normal(size=(len(wrong), 6)) * [0.3, 0.3, 0.3, 30, 30, 30])
+    return RelativeScans(some.pairs, T, len(T))
+
+
+@pytest.mark.parametrize("mistake", ["KUKA angles as xyz", "w first", "shifted by one", "reversed"])
+def test_half_of_the_motions_are_no_proof_and_tell_the_likeliest(cell, mistake):
+    session, T_mount = cell
+    spoil, kinds = MISTAKES[mistake]
+    found = explained(spoil(session), slid(motions(session, T_mount), 0.5))
+    assert verdict(found) == () and likeliest(found)[0].hypothesis.kind in kinds
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_right_poses_have_no_likelier_ones(cell, share):
+    """Whether half of the motions agree with them, or none."""
+    session, T_mount = cell
+    for seed in range(5):
+        assert likeliest(explained(session, slid(motions(session, T_mount, seed), share, seed))) == ()
 
 
 def test_few_motions_say_nothing(cell):
