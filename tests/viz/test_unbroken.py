@@ -10,11 +10,11 @@ from viz.unbroken import unbroken
     ("text", "kept"),
     [
         ("21.9 µm: by 18.6 µm and 0.044 mrad", "21.9~µm: by 18.6~µm and 0.044~mrad"),
-        ("c2 = 0.43 ± 0.04 µrad/(N m), c3", "c2 = 0.43~±~0.04~µrad/(N~m), c3"),
-        ("g = 3 ± 1 ppm/°C", "g = 3~±~1~ppm/°C"),
+        ("c2 = 0.43 ± 0.04 µrad/(N m), c3", "c2~=~0.43~±~0.04~µrad/(N~m), c3"),
+        ("g = −3 ± 1 ppm/°C", "g~=~−3~±~1~ppm/°C"),
         ("95 % of the part, 2.5 MB, 120 °C (1 σ)", "95~% of the part, 2.5~MB, 120~°C (1~σ)"),
         ("12 views, 3 scans, 4 models, 2 hours, 5 mms", "12 views, 3 scans, 4 models, 2 hours, 5 mms"),
-        ("N = 3 minutes; [1 0 0]; k = 2", "N = 3 minutes; [1 0 0]; k = 2"),
+        ("3 minutes; [1 0 0]; x = x* + u; p = 2e-22", "3 minutes; [1 0 0]; x = x* + u; p~=~2e-22"),
     ],
 )
 def test_numbers_stay_with_their_units(text, kept):

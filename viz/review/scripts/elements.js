@@ -17,8 +17,8 @@ export function element(tag, attributes = {}, ...children) {
 // Signs of numbers as signs, which no line breaks after: −2e−07, not -2e- 07.
 export const signed = text => text.replace(/(^|[\s=(±])-(?=\d)/g, "$1−").replace(/(\d)e-(?=\d)/g, "$1e−");
 
-// No-break spaces before units and about ±, as viz/unbroken.py sets them on the page of a run.
-export const unbroken = text => text.replace(/(?<=\d) (?=(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|[%σ])(?![\w%])|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)/g, "\u00a0");
+// No-break spaces before units, about ± and =, as viz/unbroken.py sets them on the page of a run.
+export const unbroken = text => text.replace(/(?<=\d) (?=(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|[%σ])(?![\w%])|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)|(?<=\w) (?== [−-]?\d)|(?<=\w =) (?=[−-]?\d)/g, "\u00a0");
 
 export const at = id => document.getElementById(id);
 

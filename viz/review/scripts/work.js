@@ -27,12 +27,12 @@ function draw() {
   if (!job) {
     const last = [...jobs.values()].pop();
     at("doing").textContent = !last ? "Nothing is running." : last.state === "failed" ? `Failed: ${last.command}: ${last.lines[last.lines.length - 1] || ""}`
-      : `${last.state === "done" ? "Done" : "Stopped"}: ${last.command} (${Math.round(last.seconds)} s)`;
+      : `${last.state === "done" ? "Done" : "Stopped"}: ${last.command} (${Math.round(last.seconds)}\u00a0s)`;
     now.classList.toggle("failed", Boolean(last) && last.state === "failed");
     return;
   }
   now.classList.remove("failed");
-  const seconds = job.state === "running" ? ` · ${Math.round((performance.now() - begun) / 1000)} s` : " · waits";
+  const seconds = job.state === "running" ? ` · ${Math.round((performance.now() - begun) / 1000)}\u00a0s` : " · waits";
   at("doing").textContent = `${job.command}${seconds}${told(job)}`;
   const share = shareOf(job);
   if (share === null) at("bar").removeAttribute("value"); else at("bar").value = share;
