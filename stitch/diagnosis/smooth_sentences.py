@@ -12,7 +12,8 @@ def beside_adequate(found: FieldError | None, length_unit: str) -> str:
         size = length_text(found.changing, length_unit, 2)
         return f"; the scans err by {size} rms, smoothly and every view by itself{_with_time(found)}, {_NO_POSE}"
     size = length_text(found.rms, length_unit, 2)
-    return f"; the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}, {_NO_POSE}"
+    same = f"; the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}"
+    return f"{same}, {_NO_POSE}, but a calibration may"
 
 
 def beside_poses(found: FieldError | None, length_unit: str) -> str:

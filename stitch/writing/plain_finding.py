@@ -17,8 +17,7 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     named = " or ".join(in_words(name) for name in found.effects)
     match found.verdict:
         case "adequate":
-            nothing = "No effect is found missing: noise and the arm's scatter explain what is left."
-            return f"{nothing}{_scans(found.smooth, length_unit)}"
+            return f"No effect is found missing: {_rest(found.smooth, length_unit)} explain what is left."
         case "cannot_tell":
             return f"Something is missing in the model, and these views cannot tell whether it is {named}."
         case "unknown_effect":
@@ -31,15 +30,13 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
     return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
 
 
-def _scans(found: FieldError | None, length_unit: str) -> str:
-    """What the scans err by where nothing else is missing."""
-    if found is None:
-        return ""
-    if found.by_view:
-        size = length_text(found.changing, length_unit, 2)
-        return f" Every scan errs by {size} in its own way, which no pose corrects."
-    size = length_text(found.rms, length_unit, 2)
-    return f" The scanner itself errs by {size} over its field, which no pose corrects."
+def _rest(smooth: FieldError | None, length_unit: str) -> str:
+    """What explains the rest where no effect is missing."""
+    if smooth is None:
+        return "noise and the arm's scatter"
+    size = length_text(smooth.changing if smooth.by_view else smooth.rms, length_unit, 2)
+    own = f"each scan's own error ({size}" if smooth.by_view else f"the scanner's own error ({size} over its field"
+    return f"noise, the arm's scatter and {own}, which no pose corrects)"
 
 
 def _where(found: Diagnosis) -> str:

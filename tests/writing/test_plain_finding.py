@@ -6,8 +6,9 @@ import pytest
 
 from bench.page_blocks import refused
 from stitch.effects import EFFECTS
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.writing.plain_effects import in_words
-from stitch.writing.plain_finding import next_step
+from stitch.writing.plain_finding import next_step, plain_finding
 
 
 def test_every_effect_of_the_library_has_words():
@@ -24,3 +25,11 @@ def test_the_next_command_can_be_typed(verdict, curves):
     told = next_step(SimpleNamespace(verdict=verdict, curves=curves), "RUN")
     command = told.rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
+
+
+def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
+    """Beside adequate it is no second thing that contradicts the first."""
+    same = FieldError(0.017, 0.0, 9.0, over_noise=False)
+    own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
+    for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
+        assert said in plain_finding(SimpleNamespace(verdict="adequate", effects=(), smooth=smooth), "mm")
