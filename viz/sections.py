@@ -24,6 +24,7 @@ from viz.comparison_figures import comparison
 from viz.diagnosis_recording import add_diagnosis
 from viz.filled_templates import render, script_json
 from viz.page_parts import svg_address, svg_text
+from viz.unbroken import unbroken
 
 # Candidate effects in the table of the page.
 _SHOWN = 8
@@ -49,7 +50,7 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
     _insert(folder / "report.html", "diagnosis", html)
     why, command = next_step(found, "RUN").rsplit(": ", 1)
     then = f'<p class="evidence">{escape(why)}: <code>{escape(command)}</code>, RUN the folder of this page.</p>'
-    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(plain)}</p>{then}')
+    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(unbroken(plain))}</p>{then}')
     _insert(folder / "report.html", "uncertainty", f'<p class="soft">{stands_for(found.verdict)}</p>')
     add_diagnosis(found, fields, unit, folder / "recording.rrd")
 

@@ -47,7 +47,8 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     state = RunReview(run).state()
     assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
     assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])
-    assert (run / "report.html").read_text().count(finding["plain"]) == 2  # on top, and where the evidence stands
+    page = (run / "report.html").read_text()
+    assert page.count(unbroken(finding["plain"])) == 2  # on top, and where the evidence stands
     holds = "U of the hand-eye holds for a complete model"
     assert f"{holds}; whether an effect is missing has not been asked" in (before / "report.html").read_text()
     assert all(f"{holds}, and something is missing" in said for said in (diagnosed, (run / "report.html").read_text()))
