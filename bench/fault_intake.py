@@ -142,7 +142,7 @@ def clocks() -> Iterator[Case]:
         "99 minutes": ([f"9:{i}5" for i in range(4, 10)], None),
         "25 hours": ([f"{i}:00" for i in range(20, 26)], None),
         "half of them": (["9:00", "", "9:02", "", "9:04", ""], None),
-        "afternoon": ([f"0{i}:00 PM" for i in range(1, 7)], None),
+        "afternoon": ([f"0{i}:00 PM" for i in range(1, 7)], [60 * m for m in minutes]),
     }
     for name, (cells, seconds) in told.items():
         table = _german(
