@@ -66,7 +66,7 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
         )
         return f"{start}{follows}{otherwise}{_notes(d)}{_lack(d)}."
     if d.within:
-        poses = f"until that is mended nothing is known of the poses, which scatter by {scatter}"
+        poses = f"until that is corrected nothing is known of the poses, which scatter by {scatter}"
         return f"{start}{follows}{poses}{_notes(d)}{_lack(d)}."
     than = f"more than {_limits(d, length_unit)} as stated" if d.scatter_limit.stated else "which no sound arm does"
     return (
