@@ -8,26 +8,16 @@ def beside_adequate(found: FieldError | None, length_unit: str) -> str:
     """What stands beside a model to which nothing is missing; empty where nothing is unusual."""
     if found is None:
         return ""
-    if found.by_view:
-        size = length_text(found.changing, length_unit, 2)
-        return f"; the scans err by {size} rms, smoothly and every view by itself{_with_time(found)}, {_NO_POSE}"
-    size = length_text(found.rms, length_unit, 2)
-    same = f"; the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}"
-    return f"{same}, {_NO_POSE}, but a calibration may"
+    calibration = "" if found.by_view else ", but a calibration may"
+    return f"; {_said(found, length_unit)}, which no pose corrects{calibration}"
 
 
 def beside_poses(found: FieldError | None, length_unit: str) -> str:
     """What is said of the scans before what poses do that has no name; empty where nothing is unusual."""
     if found is None:
         return ""
-    if not found.by_view:
-        size = length_text(found.rms, length_unit, 2)
-        return f"the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}; "
-    size = length_text(found.changing, length_unit, 2)
-    return (
-        f"the scans err by {size} rms, smoothly and every view by itself{_with_time(found)} ({_CAUSES}), so that poses "
-        "found from them scatter too; "
-    )
+    follows = f" ({_CAUSES}), so that poses found from them scatter too" if found.by_view else ""
+    return f"{_said(found, length_unit)}{follows}; "
 
 
 def smooth_errors(found: FieldError | None, length_unit: str) -> str:
@@ -46,11 +36,19 @@ def smooth_errors(found: FieldError | None, length_unit: str) -> str:
     )
 
 
-_NO_POSE = "which no pose corrects"
 _CAUSES = (
     "a part that bends or moves, an arm that still settles while a scan is read, a scanner that warms up or errs by "
     "range, brightness or a finer law"
 )
+
+
+def _said(found: FieldError, length_unit: str) -> str:
+    """The clearer of the two kinds, with its size."""
+    if found.by_view:
+        size = length_text(found.changing, length_unit, 2)
+        return f"the scans err by {size} rms, smoothly and every view by itself{_with_time(found)}"
+    size = length_text(found.rms, length_unit, 2)
+    return f"the scanner errs by {size} rms over its field, the same in every view{_in_part(found)}"
 
 
 def _in_part(found: FieldError) -> str:

@@ -55,7 +55,7 @@ def field_error(
     changing = _size(apart, CHANGING, alpha / 2)
     # What all views have in common comes first: large errors of that kind move points to other partners, which looks
     # like errors of single views.
-    alone = changing.share > 0 and changing.gain > _nats(apart, {CHANGING: ALARM_SHARE}, SAME)
+    alone = changing.share > 0 and changing.gain > _gain_of_common(apart)
     same = _size(apart if alone else _coarse(sums, freed, noise, further), SAME, alpha / 2)
     return FieldError(
         noise * same.share,
@@ -84,15 +84,22 @@ def _size(shown: ShownErrors, cause: int, alpha: float) -> _Size:
         # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         return 0.5 * chi2_tail(2 * gain, 1) < alpha
 
-    shares, gain = shown.likeliest(_most(shown, {}))[0], _nats(shown, {}, cause)
+    shares, free = shown.likeliest(_most(shown, {}))
+
+    def nats(share: float) -> float:
+        return 0.5 * (shown.likeliest(_most(shown, {cause: share}))[1] - free)
+
+    gain = nats(ALARM_SHARE)
     if not clear(gain):
         return _Size(0.0, shares, gain, over_noise=False)
-    return _Size(float(shares[cause]), shares, gain, clear(_nats(shown, {}, cause, share=1.0)))
+    return _Size(float(shares[cause]), shares, gain, clear(nats(1.0)))
 
 
-def _nats(shown: ShownErrors, limits: dict[int, float], cause: int, share: float = ALARM_SHARE) -> float:
-    """By which errors of a cause are likelier than at most such a share, where others are limited to theirs."""
-    return 0.5 * (shown.likeliest(_most(shown, limits | {cause: share}))[1] - shown.likeliest(_most(shown, limits))[1])
+def _gain_of_common(apart: ShownErrors) -> float:
+    """Nats that errors of all views gain over usual ones where those of single views are usual."""
+    usual = {CHANGING: ALARM_SHARE}
+    deviances = [apart.likeliest(_most(apart, limits))[1] for limits in (usual | {SAME: ALARM_SHARE}, usual)]
+    return 0.5 * (deviances[0] - deviances[1])
 
 
 def _most(shown: ShownErrors, limits: dict[int, float]) -> list[float]:
