@@ -49,7 +49,7 @@ class RerunRecorder:
             self.rms[stage] = []
         self.rms.setdefault(stage, []).append(rms)
 
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+    def stage(self, result: StageResult, poses: Array) -> None:
         """Nothing: the steps are shown together at the end, by the same correspondences."""
 
     def finish(self, run: Run) -> None:

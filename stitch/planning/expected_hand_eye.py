@@ -8,7 +8,8 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
 from stitch.observations.error_model import WHITE
-from stitch.observations.surfaces.hand_eye import shares_of, weak_prior
+from stitch.observations.surfaces.hand_eye import shares_of
+from stitch.observations.surfaces.hand_eye_solution import weak_prior
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE
 from stitch.observations.surfaces.shown_errors import USUAL_SHARE
 from stitch.planning.expected_model import ExpectedModel, Seen

@@ -16,9 +16,8 @@ class Recorder(Protocol):
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Called after each iteration of a stage; `gate` is the largest distance paired."""
 
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
-        """Called at the end of a stage; `residuals` holds, per view, (N,) signed distances of the
-        view's points to the other views (NaN where no other view sees the point)."""
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Called at the end of a stage."""
 
     def finish(self, run: Run) -> None:
         """Called once, with the result."""
@@ -29,5 +28,5 @@ class Silent:
 
     def start(self, session: Session) -> None: ...
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None: ...
+    def stage(self, result: StageResult, poses: Array) -> None: ...
     def finish(self, run: Run) -> None: ...

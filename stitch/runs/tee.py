@@ -24,10 +24,10 @@ class Tee:
         for recorder in self.recorders:
             recorder.iteration(stage, index, poses, rms, gate)
 
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+    def stage(self, result: StageResult, poses: Array) -> None:
         """Pass on."""
         for recorder in self.recorders:
-            recorder.stage(result, poses, residuals)
+            recorder.stage(result, poses)
 
     def finish(self, run: Run) -> None:
         """Pass on."""

@@ -18,6 +18,7 @@ from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import assemble
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_solution import step_hand_eye
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
 from stitch.observations.surfaces.pose_channel import Repeatability, jacobian
@@ -116,36 +117,35 @@ def correct(
     """
     T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
-    T_mount, overlaps, fine = close_in(captures, T_mount, gates, samples=FINE_SAMPLES, maximum=2, recorder=recorder)
-    freed = tuple(free_poses(c, c.poses(T_mount), o.gate) for c, o in zip(captures, overlaps, strict=True))
-    first = fit_hand_eye(captures, freed, T_mount)
+    freed = tuple(free_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))
+    T_first, scatters = step_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
-    captures = [weighing(c, scatter) for c, scatter in zip(captures, first.repeatability, strict=True)]
-    freed = _freed_again(captures, freed, overlaps, first.T_mount)
+    captures = [weighing(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
+    freed = _freed_again(captures, freed, gates, T_first)
     common = None if repeating is None else repeating(freed)
-    errors = None if erring is None else erring(freed, first.T_mount)
-    hand_eye = fit_hand_eye(captures, freed, first.T_mount, repeating=common, errors=errors)
+    errors = None if erring is None else erring(freed, T_first)
+    hand_eye = fit_hand_eye(captures, freed, T_first, repeating=common, errors=errors)
     final = tuple(
-        collect(c, c.poses(hand_eye.T_mount), o.gate, [sample(s, FINE_SAMPLES) for s in c.scans])
-        for c, o in zip(captures, overlaps, strict=True)
+        collect(c, c.poses(hand_eye.T_mount), gate, [sample(s, FINE_SAMPLES) for s in c.scans])
+        for c, gate in zip(captures, gates, strict=True)
     )
     return Correction(
         model=Model(hand_eye.T_mount, (), hand_eye.covariance),
         hand_eye=hand_eye,
         overlaps=final,
         freed=freed,
-        history=(*history, *fine, pooled_rms(final)),
+        history=(*history, pooled_rms(final)),
         captures=tuple(captures),
     )
 
 
 def _freed_again(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], overlaps: Sequence[Overlaps], T_mount: Array
+    captures: Sequence[Capture], freed: Sequence[FreePoses], gates: Sequence[float], T_mount: Array
 ) -> tuple[FreePoses, ...]:
     """The freed views against another hand-eye; where clouds now weigh otherwise beside labelled points, freed anew."""
     return tuple(
-        f.seen_from(c.poses(T_mount)) if c.sightings is None else free_poses(c, c.poses(T_mount), o.gate)
-        for c, f, o in zip(captures, freed, overlaps, strict=True)
+        f.seen_from(c.poses(T_mount)) if c.sightings is None else free_poses(c, c.poses(T_mount), gate)
+        for c, f, gate in zip(captures, freed, gates, strict=True)
     )
 
 

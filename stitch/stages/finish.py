@@ -14,10 +14,9 @@ from stitch.observations.surfaces.noise_floor import noise_floor
 from stitch.observations.surfaces.overlaps import Overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability, scatter_from
 from stitch.observations.targets.target_fit import TargetFit, rms_of
-from stitch.runs.recorder import Recorder, Silent
+from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
 from stitch.stages.correction import Correction
-from stitch.stages.fuse import view_residuals
 from stitch.stages.fuse_whole import Registered, fuse_every_point
 from stitch.stages.register import register
 from stitch.stages.register_targets import register_targets
@@ -76,13 +75,13 @@ def finish_surfaces(
     poses_model = own.poses(model.T_mount)
     note = correct_note(before.rms, overlaps.gram.rms)
     corrected = _of_overlaps("correct", overlaps, len(correction.history), seconds, note)
-    show(recorder, corrected, own, poses_model)
+    recorder.stage(corrected, poses_model)
     clock.lap()
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index].poses)
     registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap())
     fused = fuse_every_point(Registered(session, measurement, model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
-    show(recorder, registered, own, registration.poses)
+    recorder.stage(registered, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
     return Finished(
         own=own,
@@ -121,8 +120,8 @@ def finish_targets(
     registered = StageResult(
         "register", rms_of(after), total, 1, clock.lap(), "each view moved by its own most likely error"
     )
-    recorder.stage(corrected, poses_model, list(distances))
-    recorder.stage(registered, poses, list(after))
+    recorder.stage(corrected, poses_model)
+    recorder.stage(registered, poses)
     scatter = scatter_from(found.variances)
     return Finished(
         own=own,
@@ -153,15 +152,6 @@ def per_view_rms(overlaps: Overlaps, views: int) -> Array:
         square[[v, w]] += s
         count[[v, w]] += n
     return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
-
-
-def show(recorder: Recorder, stage: StageResult, own: Capture, poses: Array) -> None:
-    """Hand a stage to the recorder with the distances between the views."""
-    if isinstance(recorder, Silent):
-        return
-    # The cell of the residual map must hold the step between the views.
-    cell = max(2 * own.spacing, 3 * min(stage.rms, own.spacing * 3))
-    recorder.stage(stage, poses, view_residuals(own, poses, cell))
 
 
 def _fused_rms(residual: Array) -> float:

@@ -25,7 +25,7 @@ from stitch.stages.coarse import REUSED, STATED, Coarse, coarse, given
 from stitch.stages.correct import COARSE_SAMPLES, correct
 from stitch.stages.correction import Correction
 from stitch.stages.evaluate_targets import placed_targets
-from stitch.stages.finish import Finished, finish_surfaces, show
+from stitch.stages.finish import Finished, finish_surfaces
 from stitch.stages.fit_surfaces import fit_surfaces
 from stitch.stages.fitted import BeginAt, Fitted
 from stitch.stages.outlier_removal import FittedSession, without_outliers
@@ -51,7 +51,7 @@ def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Rec
     own, poses = measurement.capture, measurement.capture.poses(begun.T_mount)
     g = collect(own, poses, begun.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
     stage = StageResult("coarse", g.rms, int(g.count.sum()), len(begun.candidates), seconds, coarse_note(begun))
-    show(recorder, stage, own, poses)
+    recorder.stage(stage, poses)
     return stage
 
 

@@ -46,7 +46,7 @@ def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Rec
     distances = rows.distances(rows.residual)
     count = int(np.isfinite(distances).sum())
     stage = StageResult("coarse", rms_of(distances), count, 1, seconds, begun.source)
-    recorder.stage(stage, own.poses(begun.T_mount), list(distances))
+    recorder.stage(stage, own.poses(begun.T_mount))
     return stage
 
 

@@ -38,30 +38,13 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
 def fused(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
     """The same of placed points, in the order of cells along `axis`; the grid is the reference frame's own."""
     cells = _Cells(points_of_views, cell, axis)
-    points, normals, _weight = cells.mean()
+    points, normals = cells.mean()
     view_cell, offset, view_weight = cells.view_means(points, normals)
     count = np.bincount(view_cell, minlength=len(points))
     square = np.bincount(view_cell, view_weight * offset**2, len(points))
     total = np.bincount(view_cell, view_weight, len(points))
     residual = np.where(count > 1, np.sqrt(square / total), np.nan)
     return FusedCloud(points, normals, residual, count.astype(np.int32))
-
-
-def view_residuals(capture: Capture, poses: Array, cell: float) -> list[Array]:
-    """Per view (N,): signed distance of its points from the other views' surface, NaN without one.
-
-    Args:
-        cell: grid size; wide enough to hold the step between the views.
-    """
-    cells = _Cells(together(_placed(capture.scans, poses)), cell)
-    points, normals, weight = cells.mean()
-    own_points, own_weight = cells.own()
-    rest = weight[cells.cell] - own_weight
-    with np.errstate(invalid="ignore", divide="ignore"):
-        others = (points[cells.cell] * weight[cells.cell][:, None] - own_points) / rest[:, None]
-        signed = np.einsum("ij,ij->i", cells.placed.points - others, normals[cells.cell])
-    signed[rest <= 1e-9 * weight[cells.cell]] = np.nan
-    return np.split(signed, np.cumsum([len(scan.points) for scan in capture.scans])[:-1])
 
 
 def weights(confidence: Array, usable: Array) -> Array:
@@ -101,20 +84,13 @@ class _Cells:
         _, self.cell = np.unique(key, return_inverse=True)
         self.cells = int(self.cell.max()) + 1
 
-    def mean(self) -> tuple[Array, Array, Array]:
-        """Weighted mean points and unit normals (C, 3), and total weight (C,)."""
+    def mean(self) -> tuple[Array, Array]:
+        """Weighted mean points and unit normals (C, 3)."""
         weight = np.bincount(self.cell, self.placed.weight, self.cells)
         points = self._sum(self.cell, self.placed.points, self.cells) / weight[:, None]
         normals = self._sum(self.cell, self.placed.normals, self.cells)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return points, normals / np.maximum(length, 1e-12), np.asarray(weight, float)
-
-    def own(self) -> tuple[Array, Array]:
-        """Per point: weighted sum of points (N, 3) and weight (N,) of its own view in its cell."""
-        _, group = np.unique(self.cell * self.views + self.placed.view, return_inverse=True)
-        size = int(group.max()) + 1
-        weight: Array = np.asarray(np.bincount(group, self.placed.weight, size), float)
-        return self._sum(group, self.placed.points, size)[group], weight[group]
+        return points, normals / np.maximum(length, 1e-12)
 
     def view_means(self, points: Array, normals: Array) -> tuple[Indices, Array, Array]:
         """Per (cell, view): its cell, the mean offset along the cell's normal, and its weight."""

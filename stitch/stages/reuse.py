@@ -17,6 +17,7 @@ from stitch.stages.correction import Correction
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
 _TIGHTENINGS = 4
+_SETTLED = 0.99
 # Of all views together.
 _QUERIES = 60_000
 
@@ -66,5 +67,7 @@ def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
     poses, overlaps = capture.poses(T_mount), None
     for _ in range(_TIGHTENINGS):
         overlaps = collect(capture, poses, gate, samples, overlaps)
-        gate = float(np.minimum(gate, next_gate(overlaps, capture)))
+        last, gate = gate, float(np.minimum(gate, next_gate(overlaps, capture)))
+        if gate > _SETTLED * last:
+            break
     return gate

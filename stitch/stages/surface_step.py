@@ -14,7 +14,8 @@ from stitch.model.term import sizes_of, split, stacked, values_of
 from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.gram import pair_squares
-from stitch.observations.surfaces.hand_eye import Columns, HandEye, fit_hand_eye
+from stitch.observations.surfaces.hand_eye import HandEye, fit_hand_eye
+from stitch.observations.surfaces.hand_eye_solution import Columns
 from stitch.observations.surfaces.pose_channel import whitened
 from stitch.observations.surfaces.scanner_field import field_scatters
 from stitch.stages.fit import WEAK, fitted_parameters

@@ -43,7 +43,7 @@ class Witness:
     def iteration(self, stage, index, poses, rms, gate):
         pass
 
-    def stage(self, result, poses, residuals):
+    def stage(self, result, poses):
         pass
 
     def finish(self, run):

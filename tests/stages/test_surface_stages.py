@@ -20,7 +20,7 @@ from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import collect
 from stitch.stages.coarse import coarse
 from stitch.stages.correct import correct
-from stitch.stages.fuse import fuse, view_residuals
+from stitch.stages.fuse import fuse
 from stitch.stages.observability import unobservable
 from stitch.stages.register import register
 
@@ -158,16 +158,6 @@ def test_fused_cloud_lies_on_the_part():
     assert np.median(np.sqrt(square)) < 0.02 / np.sqrt(3)
     assert np.isnan(fused.residual[fused.count == 1]).all()
     assert fused.count.max() <= len(capture.scans)
-
-
-def test_view_residuals_show_a_shifted_view():
-    measured, capture = captured_blade(9, repeatability=(0.0, 0.0))
-    poses = measured.T_reference_scanner.copy()
-    poses[3] = poses[3] @ frames.exp(np.array([0, 0, 0, 0, 0, 0.3]))
-    residuals = view_residuals(capture, poses, 4.0)
-    spread = [np.nanmedian(np.abs(r[s.usable])) for r, s in zip(residuals, capture.scans, strict=True)]
-    assert int(np.argmax(spread)) == 3
-    assert [len(r) for r in residuals] == [len(s.points) for s in capture.scans]
 
 
 def test_no_overlap_is_a_result_with_a_reason():

@@ -26,7 +26,7 @@ class Progress:
         within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
         live_line().begin(f"{stage} {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
 
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+    def stage(self, result: StageResult, poses: Array) -> None:
         """A stage has ended."""
 
     def finish(self, run: Run) -> None:

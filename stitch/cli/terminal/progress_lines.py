@@ -33,7 +33,7 @@ class ProgressLines:
         """One more iteration; the first is 1."""
         _say(progress=stage, iteration=index + 1, rms_um=rms * self.to_um)
 
-    def stage(self, result: StageResult, poses: Array, residuals: list[Array]) -> None:
+    def stage(self, result: StageResult, poses: Array) -> None:
         """A stage has ended."""
         _say(progress=result.name, ended=True, rms_um=result.rms * self.to_um)
 

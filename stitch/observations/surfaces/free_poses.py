@@ -15,6 +15,7 @@ from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, assemble
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import Overlaps, collect, next_gate
+from stitch.statistics.acceleration import accelerated
 
 # Queries per view.
 SAMPLES = 1500
@@ -55,15 +56,25 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
     picked = [sample(scan, SAMPLES) for scan in capture.scans]
     poses = np.array(model_poses)
     overlaps = collect(capture, poses, gate, picked)
+    last: tuple[Array, Array] | None = None
     for _ in range(_MAXIMUM_ITERATIONS):
-        step = visible_step(overlaps.gram)
-        to_centre = frames.make(np.eye(3), -overlaps.gram.centre)
-        poses = frames.inverse(to_centre) @ frames.exp(step) @ to_centre @ poses
+        g = overlaps.gram
+        step = visible_step(g)
+        if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * g.scale:
+            break
+        asked = (step * as_displacements(g)).ravel()
+        taken = asked if last is None else accelerated(asked, *last)
+        last = asked, taken
+        to_centre = frames.make(np.eye(3), -g.centre)
+        poses = frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / as_displacements(g)) @ to_centre @ poses
         gate = min(gate, next_gate(overlaps, capture))
         overlaps = collect(capture, poses, gate, picked, overlaps)
-        if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * overlaps.gram.scale:
-            break
     return FreePoses(poses, np.zeros((len(poses), 6)), overlaps).seen_from(model_poses)
+
+
+def as_displacements(g: Gram) -> Array:
+    """(6,) factors that make a twist about the centre displacements: rotations count at the correspondences' lever."""
+    return np.array([max(g.lever, 1e-300)] * 3 + [1.0] * 3)
 
 
 def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
@@ -71,7 +82,7 @@ def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
 
     Twists are scale · U · z: rotations count as displacements at the correspondences' lever.
     """
-    scale = np.tile([1 / max(g.lever, 1e-300)] * 3 + [1.0] * 3, g.views)
+    scale = np.tile(1 / as_displacements(g), g.views)
     values, vectors = _strong(_scaled(g, ~g.labelled, scale), _NEAR_NULL)
     if g.labelled.any():
         targets = _scaled(g, g.labelled, scale)

@@ -18,23 +18,14 @@ from stitch.observations.error_model import WHITE
 from stitch.observations.pose_errors import PoseErrors, white
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
 from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.hand_eye_solution import Columns, Solution, solved
 from stitch.observations.surfaces.pose_channel import Repeatability, estimate
-from stitch.observations.surfaces.rig_model import RigModel, rig_model
-from stitch.statistics.least_squares import Generalised
+from stitch.observations.surfaces.rig_model import rig_model
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
 # White scatter of more numbers is known well enough to take its maximum.
 _PLUG_IN = 300
-
-
-@dataclass(frozen=True)
-class Columns:
-    """P parameters of effects that are fitted together with the hand-eye."""
-
-    twists: tuple[Array, ...]  # per capture (6V, P): left twists about the centre of its Gram matrices
-    values: Array  # (P,) at which they were computed
-    prior: Array  # (P,) standard deviation of a weak prior about zero
 
 
 @dataclass(frozen=True)
@@ -74,45 +65,35 @@ def fit_hand_eye(
             that all views and captures have in common; they widen the covariance and change nothing else.
         errors: how the poses may err beside white scatter; None: they do not.
     """
-    columns = columns or Columns(tuple(np.zeros((6 * len(f.poses), 0)) for f in freed), np.zeros(0), np.zeros(0))
-    parts = [
-        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), extra)
-        for c, f, extra in zip(captures, freed, columns.twists, strict=True)
-    ]
-    rig, scatter = rig_model(parts), [estimate(e.channel, e.further) for e in parts]
-    prior = weak_prior(captures, freed, T_mount, columns.prior)
-    pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
-    weighed = rig.weighed(scatter, prior)
-    x = weighed.solve(rig.z, pull)
-    sources = _sources(rig, weighed, errors or white(sum(len(f.poses) for f in freed)), repeating)
-    # The rest is what the prior leaves where nothing is seen.
-    sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
+    found = solved(captures, freed, T_mount, columns)
+    sources = _sources(found, errors or white(sum(len(f.poses) for f in freed)), repeating)
     covariance = np.sum(list(sources.values()), axis=0)
     return HandEye(
-        T_mount=T_mount @ frames.exp(x[:6]),
+        T_mount=T_mount @ frames.exp(found.x[:6]),
         covariance=covariance[:6, :6],
-        inflation=_inflation(covariance, weighed.covariance),
-        repeatability=tuple(scatter),
-        heldout_ratio=_heldout_ratio(parts, scatter, (prior, pull), x),
+        inflation=_inflation(covariance, found.weighed.covariance),
+        repeatability=found.scatter,
+        heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.pull), found.x),
         shares=shares_of(sources, covariance),
-        values=columns.values + x[6:],
+        values=found.values + found.x[6:],
         values_covariance=covariance[6:, 6:],
     )
 
 
-def _sources(
-    rig: RigModel, weighed: Generalised, errors: PoseErrors, repeating: Sequence[Array] | None
-) -> dict[str, Array]:
+def _sources(found: Solution, errors: PoseErrors, repeating: Sequence[Array] | None) -> dict[str, Array]:
     """What each source does to the covariance (6 + P, 6 + P)."""
+    rig, weighed = found.rig, found.weighed
     mixed = rig.mixed(errors)
     sizes = fit_variances(mixed, both_starts=True)
     mean = sizes.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, sizes)
     names = (*WHITE, *errors.names)
-    found = zip(names, mean, mixed.components[:, 0], strict=True)
-    sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in found}
+    components = zip(names, mean, mixed.components[:, 0], strict=True)
+    sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in components}
     if repeating is not None:
         repeated = weighed.gain @ rig.reduce(repeating)
         sources["scanner field"] = repeated @ repeated.T
+    # The rest is what the prior leaves where nothing is seen.
+    sources["unseen"] = weighed.covariance @ found.prior @ weighed.covariance
     return sources
 
 
@@ -157,17 +138,3 @@ def _heldout_ratio(
                 left_out = rig.weighed([s for _, s in rest], prior[0]).solve(rig.z, prior[1])
                 outside += e.squares(fold, (left_out, x))
     return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
-
-
-def weak_prior(captures: Sequence[Capture], freed: Sequence[FreePoses], T_mount: Array, effects: Array) -> Array:
-    """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else.
-
-    Args:
-        effects: (P,) standard deviations of the prior of effects fitted with the hand-eye.
-    """
-    ranges = [
-        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
-        for c, f in zip(captures, freed, strict=True)
-    ]
-    distance = float(np.median(np.concatenate(ranges)))
-    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, effects**-2.0]))

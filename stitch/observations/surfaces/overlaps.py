@@ -18,8 +18,10 @@ FINE_SAMPLES = 3000
 # Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
 _GATE_SPACINGS = 1.5
 _GATE_SIGMAS = 4.0
-# Which pairs overlap is not asked again before a view has moved, or the gate closed, by so much of the gate.
+# Which pairs overlap is not asked again before a view has moved, or the gate opened, by so much of the gate. The pairs
+# of a gate hold those of a smaller one: asked again where they may be too many.
 _SAME_PAIRS = 0.3
+_SMALLER_GATE = 0.1
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,15 @@ def collect(
 
 
 def _little_moved(before: Overlaps, poses: Array, gate: float) -> bool:
-    """Whether no view has moved, and the gate has not changed, by enough to make other pairs overlap."""
+    """Whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
     assert before.probed is not None
     T, probed_gate = before.probed
+    if gate < _SMALLER_GATE * probed_gate:
+        return False
     to_centre = frames.make(np.eye(3), -before.gram.centre)
     twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
     moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
-    return bool(max(moved.max(), abs(probed_gate - gate)) < _SAME_PAIRS * min(gate, probed_gate))
+    return bool(max(moved.max(), gate - probed_gate) < _SAME_PAIRS * min(gate, probed_gate))
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:
