@@ -59,7 +59,8 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     for fit_on, judge_on in way:
         model = model_of(run(only(session, fit_on), effects=effects))
         found: Run = run(only(session, judge_on), model)
-        d = found.labelled.rows.distances(found.labelled.rows.residual)
+        assert found.targets is not None
+        d = found.targets.rows.distances(found.targets.rows.residual)
         distances.append(d[np.isfinite(d)])
     d = np.concatenate(distances)
     return float(np.sqrt(np.mean(d**2))), float(d.mean())

@@ -10,6 +10,7 @@ from stitch.diagnosis.initial_values import initial_terms
 from stitch.effects.in_session import known
 from stitch.integrity.admission import doubts
 from stitch.integrity.admitted_fit import admitted_fit
+from stitch.integrity.arm_here import arm_here
 from stitch.integrity.refusals import mistakes_named
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import Measurement, about_part, measurement_of
@@ -22,6 +23,7 @@ from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
 from stitch.stages.course import End, collected, course_of, linearise
+from stitch.stages.fitted import BeginAt
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
@@ -77,19 +79,28 @@ def run_rig(
             with mistakes_named(session):
                 before.append(course.begin(measurement, begun, seconds, recorder))
         clock.lap()
+
+        def with_arm(arm: ModelFile | None) -> BeginAt | None:
+            return partial(_with_effects, sessions[0], effects, arm) if effects or arm else None
+
         if model:
             fit = partial(course.apply, file=model)
         else:
-            begin_at = partial(_with_effects, sessions[0], effects, arm) if effects or arm else None
-            fit = partial(course.fit, begun=begun, begin_at=begin_at, recorder=recorders[0])
+            fit = partial(course.fit, begun=begun, begin_at=with_arm(arm), recorder=recorders[0])
         found = admitted_fit(sessions, measurements, fit, keep)
         end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
+        if arm:
+            again = partial(course.fit, found.sessions, found.measurements, begun, recorder=Silent())
+            here = arm_here(lambda other: again(begin_at=with_arm(other)), arm, found.fitted)
+            told = (here.sentence(sessions[0].length_unit),)
+            end = replace(end, notes=told) if here.holds else replace(end, doubts=told)
         runs = []
         for i, (session, own) in enumerate(zip(found.sessions, found.admissions, strict=True)):
             if len(session.views) < len(sessions[i].views):
                 recorders[i].start(session)
             out, kept = ((), own.left_out) if keep else (own.left_out, ())
-            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links, doubts=own.doubts)
+            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
+            last = replace(last, doubts=(*end.doubts, *own.doubts))
             runs.append(collected(session, i, last, before[i], recorders[i]))
         return runs
 

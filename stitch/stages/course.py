@@ -47,6 +47,7 @@ class End:
     suspected: tuple[LeftOut, ...] = ()  # views that stand out, and are fused
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole
+    notes: tuple[str, ...] = ()  # of the rig
 
 
 def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
@@ -81,6 +82,7 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         notes=(
             *view_notes(end.left_out, end.kept, end.suspected),
             *course.notes(session, fitted, index, end.begun),
+            *end.notes,
         ),
         doubts=end.doubts,
         left_out=end.left_out,

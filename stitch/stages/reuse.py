@@ -19,7 +19,7 @@ REUSE_GATE = 0.05
 _TIGHTENINGS = 4
 _SETTLED = 0.99
 # Of all views together.
-_QUERIES = 60_000
+_QUERIES = 20_000
 
 
 def reuse(captures: Sequence[Capture], model: Model) -> Correction:

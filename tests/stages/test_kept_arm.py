@@ -1,6 +1,7 @@
 """The arm of one run kept in another, under another mount: what stays, how much it helps, and what its errors cost."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,3 +93,28 @@ def test_what_cannot_be_kept_is_refused_in_one_line(tmp_path, stitch_command, mo
     line = capsys.readouterr().err
     assert told in line and line.count("\n") == 1
     assert not (tmp_path / "q").exists()
+
+
+def told_of(found):
+    """What a run says of the arm it was given: as a doubt, and as a note."""
+    return [[line for line in own if "arm of the other run" in line] for own in (found.doubts, found.notes)]
+
+
+def test_a_kept_arm_is_held_against_the_nominal_one():
+    session, *_ = labelled_cell(1, views=20, offset=OFFSET)
+    doubts, (note,) = told_of(run(session, arm=arm_of(0)))
+    assert not doubts and "where the nominal arm leaves" in note
+    other, *_ = labelled_cell(1, views=20, offset=-OFFSET)
+    (doubt,), notes = told_of(run(other, arm=arm_of(0)))
+    assert not notes and "does not hold here" in doubt and "run without --arm" in doubt
+
+
+def test_the_effect_of_a_kept_arm_that_errs_here_is_named():
+    session, *_ = labelled_cell(1, views=20, offset=OFFSET)
+    arm = arm_of(0)
+    parameter = next(iter(arm.effects["joint_offset"].values()))
+    wrong = {f"{letter}{joint}": replace(parameter, value=5e-4) for letter in "AB" for joint in (2, 3)}
+    zero = {f"{letter}{joint}": replace(parameter, value=0.0) for letter in "AB" for joint in (1, 4, 5, 6)}
+    imitated = replace(arm, effects={**arm.effects, "gear_harmonic": {**wrong, **zero}})
+    (doubt,), _ = told_of(run(session, arm=imitated))
+    assert "without its gear_harmonic" in doubt

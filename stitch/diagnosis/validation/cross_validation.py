@@ -8,6 +8,7 @@ from stitch.diagnosis.score import Score, score
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel, Trial
 from stitch.observations.response import Prior
+from stitch.statistics.shares import share_of
 
 # Of a plausible size: what was not found has some size, or its prior would have none.
 _NOTHING = 1e-6
@@ -87,18 +88,6 @@ def believed_size(linear: LinearModel, scored: Score) -> Prior:
     size = np.maximum(size, _NOTHING * scored.form.sizes)
     precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
     return Prior(precision, np.zeros(len(precision)))
-
-
-def share_of(with_it: Array, without: Array) -> tuple[float, float]:
-    """How far left-out views lie from one prediction over the other, squared, and its standard error.
-
-    Args:
-        with_it: (G,) sum of squares of each sample, a group of views or one view, under one prediction.
-        without: (G,) under the other.
-    """
-    share = float(with_it.sum() / max(without.sum(), 1e-300))
-    spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
-    return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
 
 
 def _steadiness(linear: LinearModel, trial: Trial, X: Array, whole: Array) -> float:

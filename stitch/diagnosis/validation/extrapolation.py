@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.validation.cross_validation import share_of
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import Prior
 from stitch.statistics.folds import JointEnd
+from stitch.statistics.shares import share_of
 from stitch.statistics.tails import normal_tail
 
 # Odds of three to one that an end of which nobody knows would be predicted better.

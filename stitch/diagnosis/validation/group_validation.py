@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.validation.cross_validation import believed_size, share_of
+from stitch.diagnosis.validation.cross_validation import believed_size
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import Prior
+from stitch.statistics.shares import share_of
 
 
 def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:

@@ -1,0 +1,91 @@
+"""Whether an arm that another session showed holds in this one: what it leaves beside what the nominal arm leaves.
+
+What imitates among the poses of one session may err at those of another; base, tool and targets are fitted with either
+arm, so that nothing but the arm makes the difference.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.model.model_toml import ModelFile
+from stitch.stages.finish import per_view_rms
+from stitch.stages.fitted import Fitted
+from stitch.statistics.shares import share_of
+from stitch.units import length_text
+
+# A fit of the sessions with an arm, or with the nominal one.
+FitWith = Callable[[ModelFile | None], Fitted]
+
+
+@dataclass(frozen=True)
+class ArmHere:
+    """Rms over all views with an arm, length_unit."""
+
+    effects: tuple[str, ...]
+    rms: float
+    nominal_rms: float
+    helps: bool  # it leaves less than the nominal arm, by more than a standard error
+    better_without: str | None = None  # the effect without which the rest of the arm leaves least, and less
+    without_rms: float = np.nan
+
+    @property
+    def holds(self) -> bool:
+        """True if the arm helps, and all of its effects have their part in it."""
+        return self.helps and self.better_without is None
+
+    def sentence(self, unit: str) -> str:
+        """What the arm does here; where it does not hold, a doubt."""
+        here, nominal, without = (length_text(x, unit) for x in (self.rms, self.nominal_rms, self.without_rms))
+        if self.holds:
+            return f"The arm of the other run leaves {here} where the nominal arm leaves {nominal}."
+        told = f"The arm of the other run ({', '.join(self.effects)}) does not hold here: it leaves {here}"
+        if self.better_without is None:
+            return f"{told}, the nominal arm {nominal}; calibrate it at poses like these, or run without --arm."
+        return (
+            f"{told}, the nominal arm {nominal}, and without its {self.better_without} {without} would be left; "
+            "take that out there (stitch drop)."
+        )
+
+
+def arm_here(fit: FitWith, arm: ModelFile, found: Fitted) -> ArmHere:
+    """Hold the arm that was kept against the nominal one, and against itself without one of its effects.
+
+    Args:
+        found: the fit with it.
+    """
+    own, nominal = _squares(found), _squares(fit(None))
+    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), _less(own, nominal))
+    if len(arm.effects) < 2:
+        return here
+    rest = {name: {e: p for e, p in arm.effects.items() if e != name} for name in arm.effects}
+    left = {name: _squares(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
+    best = min(left, key=lambda name: _rms(left[name]))
+    return replace(here, better_without=best, without_rms=_rms(left[best])) if _less(left[best], own) else here
+
+
+def _less(squares: Array, others: Array) -> bool:
+    """True if the first are less by more than a standard error, views as samples."""
+    seen = np.isfinite(squares) & np.isfinite(others)
+    share, sigma = share_of(squares[seen], others[seen])
+    return share < 1 - sigma
+
+
+def _rms(squares: Array) -> float:
+    return float(np.sqrt(np.nanmean(squares)))
+
+
+def _squares(fitted: Fitted) -> Array:
+    """(ΣV,) mean square distance of the targets, or of the surfaces, in every view; NaN where nothing was seen."""
+    if fitted.correction is not None:
+        every = zip(fitted.captures, fitted.correction.overlaps, strict=True)
+        return np.concatenate([per_view_rms(overlaps, len(c.scans)) ** 2 for c, overlaps in every])
+    out = []
+    for own in fitted.sessions:
+        assert own.targets is not None
+        d = own.targets.rows.distances(own.targets.rows.residual)
+        seen = np.isfinite(d).sum(axis=1)
+        out.append(np.where(seen > 0, np.nansum(d**2, axis=1) / np.maximum(seen, 1), np.nan))
+    return np.concatenate(out)

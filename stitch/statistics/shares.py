@@ -1,0 +1,17 @@
+"""What one of two models leaves of the mean square error that the other leaves."""
+
+import numpy as np
+
+from stitch.frames import Array
+
+
+def share_of(with_it: Array, without: Array) -> tuple[float, float]:
+    """What one model leaves over what another leaves, mean squares, and the standard error of that.
+
+    Args:
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under the one.
+        without: (G,) under the other.
+    """
+    share = float(with_it.sum() / max(without.sum(), 1e-300))
+    spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
+    return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
