@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import promising, score
-from stitch.diagnosis.selection.ranking import Ranked, certain, rank, ranked_one
+from stitch.diagnosis.selection.exchange import likelier_beyond
+from stitch.diagnosis.selection.ranking import Ranked, certain, conditioned, rank, ranked_one, without
 from stitch.diagnosis.thresholds import AT_ONCE, TRIED
 from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
 from stitch.observations.linear_model import LinearModel
@@ -30,20 +29,30 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
     effects are added one by one as long as one can be named beside those before; then each must hold its
     place beside all the others. Of those that err beyond the measured poses the one that errs most is left out, and
-    the search goes on: what it imitated others may explain.
+    the search goes on: what it imitated others may explain. At last one that errs at some end gives way to another that
+    does the same and is likelier to hold beyond.
     """
-    candidates = [c for c in candidates if not c.empirical]
+    every, gone = [c for c in candidates if not c.empirical], set[str]()
+    candidates = every
     chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
         chosen, beyond = _eliminated_back(linear, chosen, len(candidates))
         erring = {name: found for name, found in beyond.items() if found is not None and not found.helps}
-        if not erring:
+        if erring:
+            name = max(erring, key=lambda name: erring[name].share)
+            refused[name], instead = erring[name].objection(name), list[Ranked]()
+        elif (
+            exchange := likelier_beyond(linear, [c for c in every if c.name not in gone], chosen, beyond)
+        ) is not None:
+            name, instead = exchange.name, [exchange.instead]
+            refused.pop(exchange.instead.name, None)  # it erred beside the one that gives way
+            refused[name] = exchange.objection
+            gone.add(name)
+        else:
             return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
-        name = max(erring, key=lambda name: erring[name].share)
-        refused[name] = erring[name].objection(name)
         candidates = [c for c in candidates if c.name != name]
-        chosen = _grown(linear, candidates, [r for r in chosen if r.name != name])
+        chosen = _grown(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
 
 
 def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
@@ -82,7 +91,7 @@ def _eliminated_back(
     """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
 
     def asked(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
-        beside = _without(linear, among, r)
+        beside = without(linear, among, r)
         own = ranked_one(beside, r.score.candidate, tests)
         return own, extrapolate(beside, own.score) if certain(own) else None
 
@@ -98,23 +107,10 @@ def _eliminated_back(
             beyond[own.name] = found
     for r in kept:
         if r.name not in beyond:
-            beyond[r.name] = extrapolate(_without(linear, kept, r), r.score)
+            beyond[r.name] = extrapolate(without(linear, kept, r), r.score)
     return kept, {r.name: beyond[r.name] for r in kept}
 
 
 def _as_before(r: Ranked, again: Ranked) -> bool:
     """True if an effect is certain again, in the same form."""
     return certain(again) and again.score.form is r.score.form
-
-
-def _without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:
-    """The evidence beside all effects but one."""
-    return conditioned(linear, [r for r in chosen if r.name != one.name])
-
-
-def conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
-    """The evidence beside some effects."""
-    if not chosen:
-        return linear
-    forms = [r.score.form for r in chosen]
-    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]))

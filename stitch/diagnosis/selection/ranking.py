@@ -95,3 +95,16 @@ def contends(r: Ranked) -> bool:
 def certain(r: Ranked) -> bool:
     """Enough for an alarm."""
     return contends(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR
+
+
+def without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:
+    """The evidence beside all effects but one."""
+    return conditioned(linear, [r for r in chosen if r.name != one.name])
+
+
+def conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
+    """The evidence beside some effects."""
+    if not chosen:
+        return linear
+    forms = [r.score.form for r in chosen]
+    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]))

@@ -7,9 +7,9 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
-from stitch.diagnosis.selection.forward_selection import conditioned, forward_selection
+from stitch.diagnosis.selection.forward_selection import forward_selection
 from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
-from stitch.diagnosis.selection.ranking import Ranked, beside, certain, contends, ranked_all, ranked_one
+from stitch.diagnosis.selection.ranking import Ranked, beside, certain, conditioned, contends, ranked_all, ranked_one
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     LOG_BAYES_FACTOR,

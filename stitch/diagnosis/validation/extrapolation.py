@@ -40,6 +40,11 @@ class Extrapolation:
         """True if the ends together are predicted better by more than a standard error, and a further one probably."""
         return self.share <= 1 - self.sigma and self.likely >= _LIKELY
 
+    @property
+    def errs_somewhere(self) -> bool:
+        """True if an end is predicted worse by more than a standard error."""
+        return self.worst_share > 1 + self.worst_sigma
+
     def objection(self, name: str) -> str:
         """What speaks against an effect that explains much."""
         return (
