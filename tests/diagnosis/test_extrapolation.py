@@ -5,6 +5,7 @@ import numpy as np
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.selection.exchange import likelier_beyond
 from stitch.diagnosis.selection.ranking import certain, ranked_one
 from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
@@ -47,3 +48,33 @@ def test_gear_errors_that_imitate_another_error_are_told_by_left_out_ends():
         refused += not found.helps
     # Of bumps near the middle two periods a turn may be a fair picture.
     assert refused >= 3
+
+
+def exchanged(session, name, rivals):
+    """What takes the place of an effect that was found alone, if anything."""
+    linear = linear_model_of(state_of(run(session)))
+    every = {n: candidate_of(linear, EFFECTS[n]) for n in (name, *rivals)}
+    own = ranked_one(linear, every[name], tests=1)
+    return likelier_beyond(linear, list(every.values()), [own], {name: extrapolate(linear, own.score)})
+
+
+def test_an_imitation_gives_way_to_what_is_likelier_to_hold_beyond():
+    # What a joint's offset does, once a turn does too among the measured poses, and more than that at the ends.
+    rivals, seen = ["joint_offset", "joint_compliance", "gear_harmonic", "backlash"], 0
+    for seed in range(3):
+        session, *_ = labelled_cell(40 + seed, views=150, targets=TARGETS[:2], offset=np.array([0, 1e-3, 0, 0, 0, 0]))
+        imitation, found = stands(session, "gear_eccentricity")[1], exchanged(session, "gear_eccentricity", rivals)
+        assert (found is not None) == imitation.errs_somewhere
+        seen += found is not None
+        assert found is None or (found.name, found.instead.name) == ("gear_eccentricity", "joint_offset")
+    assert seen
+
+
+def test_an_effect_that_is_there_gives_way_to_nothing():
+    def gears(q):
+        return 8e-4 * np.array([0, np.sin(2 * q[1] + 0.4), np.cos(2 * q[2]), 0, 0, 0])
+
+    rivals = ["joint_offset", "joint_compliance", "gear_eccentricity", "backlash"]
+    for seed in range(3):
+        session, *_ = labelled_cell(50 + seed, views=150, targets=TARGETS[:2], gears=gears)
+        assert exchanged(session, "gear_harmonic", rivals) is None
