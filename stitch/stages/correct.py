@@ -20,13 +20,13 @@ from stitch.observations.surfaces.gram import assemble
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.hand_eye_solution import step_hand_eye
 from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, common_samples, next_gate, pooled_rms
 from stitch.observations.surfaces.pose_channel import Repeatability, jacobian
 from stitch.runs.recorder import Recorder, Silent
 from stitch.stages.correction import Correction
 from stitch.statistics.least_squares import least_squares
 
-# Queries per view while the gate closes; the final normal equations take FINE_SAMPLES.
+# Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES.
 COARSE_SAMPLES = 600
 _MAXIMUM_ITERATIONS = 40
 # A step that moves the part by less than this share of the robust sigma changes nothing.
@@ -66,7 +66,7 @@ def close_in(
         T_mount (4, 4), the last overlaps per capture and the rms per iteration.
     """
     recorder = recorder or Silent()
-    picked = [[sample(scan, samples) for scan in capture.scans] for capture in captures]
+    picked = [common_samples(capture.scans, samples) for capture in captures]
     gates, history = list(gates), []
     before: Sequence[Overlaps | None] = [None] * len(captures)
     for index in range(maximum):

@@ -14,8 +14,7 @@ from stitch.model.model_toml import ModelFile
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.overlaps import collect, common_samples
 from stitch.observations.surfaces.scanner_field import field_scatters
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.targets.target_fit import TargetFit
@@ -49,7 +48,7 @@ def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file
 def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Recorder) -> StageResult:
     """How well the views of one session meet under the coarse hand-eye."""
     own, poses = measurement.capture, measurement.capture.poses(begun.T_mount)
-    g = collect(own, poses, begun.gate, [sample(scan, COARSE_SAMPLES) for scan in own.scans]).gram
+    g = collect(own, poses, begun.gate, common_samples(own.scans, COARSE_SAMPLES)).gram
     stage = StageResult("coarse", g.rms, int(g.count.sum()), len(begun.candidates), seconds, coarse_note(begun))
     recorder.stage(stage, poses)
     return stage

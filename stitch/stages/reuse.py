@@ -10,7 +10,7 @@ from stitch.model.model import Model
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.hand_eye import HandEye, scatter_of
 from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate, pooled_rms
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, common_samples, next_gate, pooled_rms
 from stitch.stages.correct import weighing
 from stitch.stages.correction import Correction
 
@@ -18,8 +18,6 @@ from stitch.stages.correction import Correction
 REUSE_GATE = 0.05
 _TIGHTENINGS = 4
 _SETTLED = 0.99
-# Of all views together.
-_QUERIES = 20_000
 
 
 def reuse(captures: Sequence[Capture], model: Model) -> Correction:
@@ -58,12 +56,12 @@ def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlap
 
 
 def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
-    """The distance that partners may have, from one that is too large; a scale needs no more queries with more views.
+    """The distance that partners may have, from one that is too large.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    samples = [sample(scan, min(FINE_SAMPLES, _QUERIES // len(capture.scans))) for scan in capture.scans]
+    samples = common_samples(capture.scans, FINE_SAMPLES)
     poses, overlaps = capture.poses(T_mount), None
     for _ in range(_TIGHTENINGS):
         overlaps = collect(capture, poses, gate, samples, overlaps)

@@ -17,7 +17,7 @@ _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Queries that decide whether two views overlap, and the share that must find a partner.
 _PROBES = 250
 # Views in which one point of another view is asked for.
-_MOST_PARTNERS = 20
+MOST_PARTNERS = 12
 _MINIMUM_OVERLAP = 0.04
 
 
@@ -85,11 +85,13 @@ def match(
     pairs: Sequence[tuple[int, int]],
     gate: float,
     samples: Sequence[Indices],
+    partners: int = MOST_PARTNERS,
 ) -> Iterator[Match]:
     """Stream the correspondences of `pairs`: each sampled point with its nearest point of the other.
 
-    Where a view overlaps with more than 20 others, its points take turns: each is asked for in 20 of them. What a point
-    says of its own view it says to the first few already, so that many views cost what they are and not their square.
+    Where a view overlaps with more than `partners` others, its points take turns: each is asked for in so many of them.
+    What a point says of its own view it says to the first few already, so that many views cost what they are and not
+    their square.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
@@ -97,7 +99,7 @@ def match(
         samples: per view the indices that search (see `sample`).
     """
 
-    turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
+    turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // partners)
 
     def of_pair(pair: tuple[int, int]) -> Match | None:
         v, w = pair

@@ -9,12 +9,15 @@ from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
+from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.gram import Gram, gram, robust_scale
-from stitch.observations.surfaces.match import Match, match, overlapping_pairs
+from stitch.observations.surfaces.match import MOST_PARTNERS, Match, match, overlapping_pairs, sample
 from stitch.observations.surfaces.target_pairs import TargetPairs, joined, target_pairs
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000
+# Queries of all views together where they answer one question, a hand-eye or a scale.
+_TOGETHER = 20_000
 # Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
 _GATE_SPACINGS = 1.5
 _GATE_SIGMAS = 4.0
@@ -37,13 +40,19 @@ class Overlaps:
 
 
 def collect(
-    capture: Capture, poses: Array, gate: float, samples: Sequence[Indices], before: Overlaps | None = None
+    capture: Capture,
+    poses: Array,
+    gate: float,
+    samples: Sequence[Indices],
+    before: Overlaps | None = None,
+    partners: int = MOST_PARTNERS,
 ) -> Overlaps:
     """Match all overlapping pairs within `gate` and accumulate their normal equations.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         before: of an iteration before; its pairs serve again where little has moved since they were found.
+        partners: views in which a point is asked for, at most.
 
     Raises:
         NoResultError: no two views overlap.
@@ -53,7 +62,7 @@ def collect(
     else:
         pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
         probed = np.array(poses), gate
-    matches = list(match(capture.scans, poses, pairs, gate, samples))
+    matches = list(match(capture.scans, poses, pairs, gate, samples, partners))
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
@@ -75,6 +84,15 @@ def _little_moved(before: Overlaps, poses: Array, gate: float) -> bool:
     twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
     moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
     return bool(max(moved.max(), gate - probed_gate) < _SAME_PAIRS * min(gate, probed_gate))
+
+
+def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
+    """Per view the points that ask where all views say one thing: of many views each needs fewer.
+
+    Args:
+        most: of one view.
+    """
+    return [sample(scan, min(most, _TOGETHER // len(scans))) for scan in scans]
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:
