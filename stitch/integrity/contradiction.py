@@ -13,7 +13,8 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.shown import Shown, shown_by
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.match import near_pairs, sample
+from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.overlapping_pairs import near_pairs
 from stitch.statistics.tails import binomial_tail
 
 # Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their

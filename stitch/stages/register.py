@@ -28,8 +28,6 @@ from stitch.statistics.acceleration import accelerated
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
-# Views in which a point is asked for: here the noise of single views counts, which more partners average.
-_PARTNERS = 20
 # Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
 Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 
@@ -74,7 +72,7 @@ def register(
     recorder = recorder or Silent()
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
     poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
-    overlaps = collect(capture, poses, gate, picked, partners=_PARTNERS)
+    overlaps = collect(capture, poses, gate, picked)
     last: tuple[Array, Array] | None = None
     for index in range(_MAXIMUM_ITERATIONS):
         g = overlaps.gram
@@ -90,7 +88,7 @@ def register(
         taken = asked if last is None else accelerated(asked, *last)
         last, gate = (asked, taken), tighter
         poses = frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / as_displacements(g)) @ to_centre @ poses
-        overlaps = collect(capture, poses, gate, picked, overlaps, _PARTNERS)
+        overlaps = collect(capture, poses, gate, picked, overlaps)
     return Registration(poses, overlaps, tuple(history))
 
 

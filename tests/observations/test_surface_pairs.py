@@ -11,7 +11,8 @@ from stitch import frames
 from stitch.observations.surfaces.free_poses import free_poses
 from stitch.observations.surfaces.gram import assemble, gram, pair_squares
 from stitch.observations.surfaces.hand_eye import scatter_of
-from stitch.observations.surfaces.match import match, overlapping_pairs, sample
+from stitch.observations.surfaces.match import match, sample
+from stitch.observations.surfaces.overlapping_pairs import overlapping_pairs
 from stitch.observations.surfaces.overlaps import collect
 from stitch.observations.surfaces.pose_channel import jacobian
 

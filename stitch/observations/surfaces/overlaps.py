@@ -11,7 +11,8 @@ from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
 from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.gram import Gram, gram, robust_scale
-from stitch.observations.surfaces.match import MOST_PARTNERS, Match, match, overlapping_pairs, sample
+from stitch.observations.surfaces.match import Match, match, sample
+from stitch.observations.surfaces.overlapping_pairs import overlapping_pairs
 from stitch.observations.surfaces.target_pairs import TargetPairs, joined, target_pairs
 
 # Queries per view for the final normal equations and statistics.
@@ -45,14 +46,12 @@ def collect(
     gate: float,
     samples: Sequence[Indices],
     before: Overlaps | None = None,
-    partners: int = MOST_PARTNERS,
 ) -> Overlaps:
     """Match all overlapping pairs within `gate` and accumulate their normal equations.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         before: of an iteration before; its pairs serve again where little has moved since they were found.
-        partners: views in which a point is asked for, at most.
 
     Raises:
         NoResultError: no two views overlap.
@@ -62,7 +61,7 @@ def collect(
     else:
         pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
         probed = np.array(poses), gate
-    matches = list(match(capture.scans, poses, pairs, gate, samples, partners))
+    matches = list(match(capture.scans, poses, pairs, gate, samples))
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "

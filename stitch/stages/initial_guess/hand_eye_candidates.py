@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import chain
 
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.match import sample, search
+from stitch.observations.surfaces.asking import Asking, asking
+from stitch.observations.surfaces.match import sample
 from stitch.stages.initial_guess.centroids import scanner_centre
 from stitch.system.threads import parallel
 
@@ -38,16 +39,18 @@ def consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> fl
     for c in captures:
         poses = c.poses(T_mount)
         picked = [sample(scan, SEARCH_SAMPLES) for scan in c.scans]
-        pairs = [(v, w) for v, w in permutations(range(len(c.scans)), 2) if len(picked[v])]
+        every = asking(c.scans, poses, picked)
 
-        def mean_square(
-            pair: tuple[int, int], c: Capture = c, poses: Array = poses, picked: list[Indices] = picked
-        ) -> float:
-            v, w = pair
-            distance, _, facing = search(c.scans[v], c.scans[w], picked[v], poses[v], poses[w], limit)
-            return float(np.mean(np.where(facing, distance, limit) ** 2))
+        def mean_squares(w: int, every: Asking = every) -> list[float]:
+            parts = [(v, slice(None)) for v in range(len(every.scans)) if v != w and len(every.index[v])]
+            if not parts:
+                return []
+            _, points, normals = every.together(parts)
+            distance, _, facing = every.search(w, points, normals, limit)
+            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.lengths(parts))[:-1])
+            return [float(np.mean(own)) for own in by_view]
 
-        squares += parallel(mean_square, pairs)
+        squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
     return float(np.sqrt(np.mean(squares)))
 
 
