@@ -16,15 +16,14 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.free_poses import as_displacements
 from stitch.observations.surfaces.gram import Gram, assemble, gram
 from stitch.observations.surfaces.match import Match, sample
+from stitch.observations.surfaces.moved_views import LastStep, moved, settled
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.surfaces.target_pairs import joined
 from stitch.runs.recorder import Recorder, Silent
 from stitch.stages.correspondence_weights import plane_weights
-from stitch.statistics.acceleration import accelerated
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 1e-2
@@ -73,21 +72,19 @@ def register(
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
     poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
     overlaps = collect(capture, poses, gate, picked)
-    last: tuple[Array, Array] | None = None
+    last: LastStep = None
     for index in range(_MAXIMUM_ITERATIONS):
         g = overlaps.gram
         history.append(g.rms)
         recorder.iteration("register", index, poses, g.rms, gate)
         to_centre = frames.make(np.eye(3), -g.centre)
-        moved = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
-        step = _step(_weighed(overlaps, capture, weigh(overlaps.matches, capture, poses)), capture, scatter, moved)
+        off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
+        step = _step(_weighed(overlaps, capture, weigh(overlaps.matches, capture, poses)), capture, scatter, off)
         tighter = min(gate, next_gate(overlaps, capture))
-        if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * g.scale and tighter > 0.9 * gate:
+        if settled(g, step, _CONVERGED) and tighter > 0.9 * gate:
             break
-        asked = (step * as_displacements(g)).ravel()
-        taken = asked if last is None else accelerated(asked, *last)
-        last, gate = (asked, taken), tighter
-        poses = frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / as_displacements(g)) @ to_centre @ poses
+        poses, last = moved(poses, g, step, last)
+        gate = tighter
         overlaps = collect(capture, poses, gate, picked, overlaps)
     return Registration(poses, overlaps, tuple(history))
 
@@ -105,12 +102,12 @@ def _held(start: Array, model_poses: Array) -> Array:
     return np.asarray(frames.exp(-common) @ start)
 
 
-def _step(g: Gram, capture: Capture, scatter: Repeatability, moved: Array) -> Array:
-    """(V, 6) Gauss–Newton step of data and prior, about the centre, of views `moved` (V, 6) off the robot's."""
+def _step(g: Gram, capture: Capture, scatter: Repeatability, off: Array) -> Array:
+    """(V, 6) Gauss–Newton step of data and prior, about the centre, of views that stand `off` (V, 6) the robot's."""
     H, b = assemble(g)
     variance, prior = g.variance * scatter.noise_factor, prior_precision(capture, scatter, g.centre)
     views = len(prior)
-    H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, moved).reshape(-1)
+    H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
     for v in range(views):
         H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += prior[v]
     return np.asarray(np.linalg.solve(H, -b).reshape(views, 6))

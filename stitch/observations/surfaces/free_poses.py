@@ -14,8 +14,8 @@ from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, assemble
 from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.moved_views import LastStep, as_displacements, moved, settled
 from stitch.observations.surfaces.overlaps import Overlaps, collect, next_gate
-from stitch.statistics.acceleration import accelerated
 
 # Queries per view.
 SAMPLES = 1500
@@ -56,25 +56,15 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
     picked = [sample(scan, SAMPLES) for scan in capture.scans]
     poses = np.array(model_poses)
     overlaps = collect(capture, poses, gate, picked)
-    last: tuple[Array, Array] | None = None
+    last: LastStep = None
     for _ in range(_MAXIMUM_ITERATIONS):
-        g = overlaps.gram
-        step = visible_step(g)
-        if np.sqrt(np.mean(step[:, 3:] ** 2)) < _CONVERGED * g.scale:
+        step = visible_step(overlaps.gram)
+        if settled(overlaps.gram, step, _CONVERGED):
             break
-        asked = (step * as_displacements(g)).ravel()
-        taken = asked if last is None else accelerated(asked, *last)
-        last = asked, taken
-        to_centre = frames.make(np.eye(3), -g.centre)
-        poses = frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / as_displacements(g)) @ to_centre @ poses
+        poses, last = moved(poses, overlaps.gram, step, last)
         gate = min(gate, next_gate(overlaps, capture))
         overlaps = collect(capture, poses, gate, picked, overlaps)
     return FreePoses(poses, np.zeros((len(poses), 6)), overlaps).seen_from(model_poses)
-
-
-def as_displacements(g: Gram) -> Array:
-    """(6,) factors that make a twist about the centre displacements: rotations count at the correspondences' lever."""
-    return np.array([max(g.lever, 1e-300)] * 3 + [1.0] * 3)
 
 
 def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
