@@ -1,6 +1,7 @@
 """Figures of a run on labelled points, by matplotlib; each function returns a Figure."""
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from stitch.frames import Array
@@ -18,15 +19,15 @@ def sticks(run: Run) -> Figure:
     """Where every view puts each target, as magnified sticks from the target's place, in three planes."""
     assert run.targets is not None
     target, residual = residual_vectors(run)
-    place = run.targets.landmarks.positions
+    place, unit = run.targets.landmarks.positions, run.session.length_unit
     size = float(np.nanmax(np.ptp(place[target], axis=0))) or 1.0
     magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(residual, axis=1), 0.99)), 1e-300)
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):
-        start, end = place[target], place[target] + magnified * residual
-        axes.plot([start[:, a], end[:, a]], [start[:, b], end[:, b]], color=BLUE, lw=0.4, alpha=0.35)
+        ends = np.stack([place[target], place[target] + magnified * residual], axis=1)[:, :, [a, b]]
+        axes.add_collection(LineCollection(ends.tolist(), colors=BLUE, linewidths=0.4, alpha=0.35))
         axes.plot(place[:, a], place[:, b], "o", ms=4, color=ORANGE)
-        axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({run.session.length_unit})", ylabel="xyz"[b])
+        axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({unit})", ylabel=f"{'xyz'[b]} ({unit})")
     figure.suptitle(f"sticks {magnified:.0f} times longer than they are", fontsize=9)
     return plain(figure)
 

@@ -4,6 +4,7 @@ One wrong name shows as an outlier. Where all names of a view are mixed up, what
 beside clouds it holds the scan in a wrong place, so that the scan is blamed.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -82,15 +83,19 @@ def _asked(place: Array) -> Indices:
 
 def _off(places: Array, asked: Sequence[Indices]) -> tuple[Array, float]:
     """(V,) by how much a distance of each view is off what it usually is, at the most, and the median of all."""
-    off = [np.zeros(0)]
-    for v, targets in enumerate(asked):
-        apart = distances(places[:, targets])[:, *np.triu_indices(len(targets), 1)]
-        few = np.isfinite(apart).sum(axis=0) < _VIEWS
-        own = np.abs(apart[v] - median_of_known(apart))
-        off.append(np.where(few, np.nan, own) if len(targets) >= _TARGETS else np.zeros(0))
+    worst, off = np.zeros(len(asked)), [np.zeros(0)]
+    alike = defaultdict[tuple[int, ...], list[int]](list)
+    for v, shown in enumerate(asked):
+        alike[tuple(shown)].append(v)
+    for targets, views in alike.items():
+        if len(targets) >= _TARGETS:
+            apart = distances(places[:, list(targets)])[:, *np.triu_indices(len(targets), 1)]
+            few = np.isfinite(apart).sum(axis=0) < _VIEWS
+            own = np.where(few, np.nan, np.abs(apart[views] - median_of_known(apart)))
+            worst[views] = np.nanmax(own, axis=1, initial=0.0)
+            off.append(own.ravel())
     every = np.concatenate(off)
-    usually = float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
-    return np.array([np.nanmax(own, initial=0.0) for own in off[1:]]), usually
+    return worst, float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
 
 
 def _usual(places: Array) -> Array:
