@@ -26,7 +26,7 @@ from stitch.runs.recorder import Recorder, Silent
 from stitch.stages.correspondence_weights import plane_weights
 
 _MAXIMUM_ITERATIONS = 25
-_CONVERGED = 1e-2
+_CONVERGED = 5e-3
 # Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
 Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 

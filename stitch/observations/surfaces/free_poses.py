@@ -20,7 +20,7 @@ from stitch.observations.surfaces.overlaps import Overlaps, collect, next_gate
 # Queries per view.
 SAMPLES = 1500
 _MAXIMUM_ITERATIONS = 12
-_CONVERGED = 1e-2
+_CONVERGED = 5e-3
 # Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
 # little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
 # sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
