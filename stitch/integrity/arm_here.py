@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from stitch.frames import Array
 from stitch.model.model_toml import ModelFile
@@ -16,6 +17,8 @@ from stitch.stages.fitted import Fitted
 from stitch.statistics.shares import share_of
 from stitch.units import length_text
 
+# That an arm which is right is doubted.
+_CHANCE = 0.01
 # A fit of the sessions with an arm, or with the nominal one.
 FitWith = Callable[[ModelFile | None], Fitted]
 
@@ -27,14 +30,14 @@ class ArmHere:
     effects: tuple[str, ...]
     rms: float
     nominal_rms: float
-    helps: bool  # it leaves less than the nominal arm, by more than a standard error
+    worse: bool  # the nominal arm leaves less, beyond chance
     better_without: str | None = None  # the effect without which the rest of the arm leaves least, and less
     without_rms: float = np.nan
 
     @property
     def holds(self) -> bool:
-        """True if the arm helps, and all of its effects have their part in it."""
-        return self.helps and self.better_without is None
+        """True unless the arm, or an effect of it, makes it worse."""
+        return not self.worse and self.better_without is None
 
     def sentence(self, unit: str) -> str:
         """What the arm does here; where it does not hold, a doubt."""
@@ -57,20 +60,21 @@ def arm_here(fit: FitWith, arm: ModelFile, found: Fitted) -> ArmHere:
         found: the fit with it.
     """
     own, nominal = _squares(found), _squares(fit(None))
-    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), _less(own, nominal))
+    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), _less(nominal, own))
     if len(arm.effects) < 2:
         return here
     rest = {name: {e: p for e, p in arm.effects.items() if e != name} for name in arm.effects}
     left = {name: _squares(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
     best = min(left, key=lambda name: _rms(left[name]))
-    return replace(here, better_without=best, without_rms=_rms(left[best])) if _less(left[best], own) else here
+    less = _less(left[best], own, len(left))
+    return replace(here, better_without=best, without_rms=_rms(left[best])) if less else here
 
 
-def _less(squares: Array, others: Array) -> bool:
-    """True if the first are less by more than a standard error, views as samples."""
+def _less(squares: Array, others: Array, tests: int = 1) -> bool:
+    """True if the first are less beyond chance, views as samples and the likeliest of so many tests."""
     seen = np.isfinite(squares) & np.isfinite(others)
     share, sigma = share_of(squares[seen], others[seen])
-    return share < 1 - sigma
+    return bool(share < 1 - ndtri(1 - _CHANCE / tests) * sigma)
 
 
 def _rms(squares: Array) -> float:
