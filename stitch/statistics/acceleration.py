@@ -13,7 +13,7 @@ _FARTHEST, _NEAREST = 1.0, -0.5
 
 
 def accelerated(step: Array, last_step: Array, last_taken: Array) -> Array:
-    """(N,) the step to take, from what one iteration asks for now and asked for before.
+    """(N,) the step to take, from what two iterations in turn ask for.
 
     Args:
         step: (N,) what the present iteration asks for, all components in one unit.

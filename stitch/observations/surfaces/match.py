@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,16 @@ class Match:
 
     def part(self, at: slice) -> "Match":
         """Some of them."""
-        return Match(self.v, self.w, *(value[at] for value in list(vars(self).values())[2:]))
+        return Match(self.v, self.w, *(value[at] for value in self.columns))
+
+    @property
+    def columns(self) -> list[Any]:
+        """All arrays, in the order of the fields."""
+        return list(vars(self).values())[2:]
+
+    def turned(self) -> "Match":
+        """The same as the other view sees it."""
+        return replace(self, v=self.w, w=self.v, residual=-self.residual, index_v=self.index_w, index_w=self.index_v)
 
 
 def sample(scan: Scan, count: int) -> Indices:
@@ -69,7 +79,7 @@ def match(
     for v, w in pairs:
         found = [of for of in (answers[w].pop(v), answers[v].pop(w).turned()) if len(of.residual)]
         if found:
-            yield Match(v, w, *(np.concatenate(own) for own in zip(*(vars(of).values() for of in found), strict=True)))
+            yield Match(v, w, *(np.concatenate(own) for own in zip(*(of.columns for of in found), strict=True)))
 
 
 def distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
@@ -87,24 +97,8 @@ def distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -
     return np.concatenate(out)
 
 
-@dataclass(frozen=True)
-class _Answers:
-    """What points of one view found in another; arrays as in `Match`, the view that asks in place of v."""
-
-    middle: Array
-    normal: Array
-    residual: Array
-    weight: Array
-    index_v: Indices
-    index_w: Indices
-
-    def turned(self) -> "_Answers":
-        """The same as the other view sees it."""
-        return replace(self, residual=-self.residual, index_v=self.index_w, index_w=self.index_v)
-
-
-def _answers(every: Asking, w: int, parts: Sequence[Part], gate: float) -> dict[int, _Answers]:
-    """Per view that asks, what its points found in view w: all that ask one view are looked for at once."""
+def _answers(every: Asking, w: int, parts: Sequence[Part], gate: float) -> dict[int, Match]:
+    """Per view v that asks, what its points found in view w: all that ask one view are looked for at once."""
     if not parts:
         return {}
     index, p, n = every.together(parts)
@@ -120,5 +114,5 @@ def _answers(every: Asking, w: int, parts: Sequence[Part], gate: float) -> dict[
         # Copies: a part of a whole would keep all of it.
         i, j = index[start:end].copy(), partner[start:end].copy()
         m, n, r = (own[start:end].copy() for own in (middle, normal, residual))
-        found[v] = _Answers(m, n, r, weight[start:end] * every.scans[v].confidence[i], index_v=i, index_w=j)
+        found[v] = Match(v, w, m, n, r, weight=weight[start:end] * every.scans[v].confidence[i], index_v=i, index_w=j)
     return found
