@@ -28,6 +28,12 @@ def angle_text(value: float, digits: int = 3) -> str:
     return f"{_plain(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
 
 
+def duration_text(seconds: float) -> str:
+    """Seconds, minutes or hours, whichever leaves a number below a hundred or so."""
+    size, unit = next((own for own in ((1, "s"), (60, "min")) if seconds < 120 * own[0]), (3600, "h"))
+    return f"{_plain(seconds / size, 2)} {unit}"
+
+
 def known_text(value: float, U: float) -> str:
     """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
     if not np.isfinite(U) or U <= 0:

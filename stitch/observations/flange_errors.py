@@ -53,7 +53,11 @@ def near_in_time(measurements: Sequence[Measurement], memory: float) -> Array:
 
 def in_steps(measurement: Measurement) -> Array:
     """(V,) times of the views in usual steps from one to the next; their numbers where no time is stated."""
-    views = measurement.views
-    steps = np.diff(views.time)
-    usual = float(np.median(steps)) if views.has("time") and (steps > 0).any() else 0.0
-    return np.asarray(views.time / usual if usual > 0 else np.arange(views.count, dtype=float))
+    views, step = measurement.views, usual_step(measurement)
+    return np.asarray(views.time / step if step > 0 else np.arange(views.count, dtype=float))
+
+
+def usual_step(measurement: Measurement) -> float:
+    """From one view to the next, s; 0 where no time is stated."""
+    steps = np.diff(measurement.views.time)
+    return float(np.median(steps)) if measurement.views.has("time") and (steps > 0).any() else 0.0

@@ -12,7 +12,7 @@ from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import score
 from stitch.diagnosis.selection.ranking import Ranked, certain, contends, rank, ranked_one
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown import joint_laws
+from stitch.diagnosis.unknown import rivals
 from stitch.observations.linear_model import LinearModel
 
 
@@ -60,7 +60,7 @@ def wanted_group(linear: LinearModel, candidates: Sequence[Candidate], tests: in
         removed.add(max(others, key=lambda name: _factor(linear.without({*removed, name}), known[best.name])))
     base = linear.without(removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
-    if joint_laws.log_posterior(base) > again[0].log_posterior - ODDS:
+    if rivals.log_posterior(base) > again[0].log_posterior - ODDS:
         return ()
     near = [r for r in again if contends(r) and r.log_posterior > again[0].log_posterior - ODDS]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.

@@ -17,7 +17,7 @@ from stitch.diagnosis.thresholds import (
     ODDS,
     PRIOR_PHYSICAL,
 )
-from stitch.diagnosis.unknown import joint_laws, unnamed_courses
+from stitch.diagnosis.unknown import rivals, unnamed_courses
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
 from stitch.observations.linear_model import LinearModel
 
@@ -52,7 +52,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         return unknown
     best, second, refused = contenders[0], None, dict[str, str]()
     others: Sequence[Ranked] = ()
-    stray, law = stray and rescored(base, stray), joint_laws.log_posterior(base)
+    stray, law = stray and rescored(base, stray), rivals.log_posterior(base)
     ranked = beside(ranked, best, law)
     adequate, unknown = replace(adequate, ranked=ranked), replace(unknown, ranked=ranked)
     if linear.measurement.views.count >= MANY_VIEWS:
