@@ -25,7 +25,7 @@ from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
 from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
-from stitch.statistics.kernels import SmoothErrors, alike_in_joints, alike_in_way, same_stop, spread_over
+from stitch.statistics.kernels import SmoothErrors, alike_closely, alike_in_joints, alike_in_way, same_stop, spread_over
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
@@ -52,8 +52,10 @@ class PoseErrors:
     components: Array  # (c, 6V, 6V) per unit of each
     scales: Array  # (c,) that their σ usually has
     effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
-    # What each joint alone may do without a name, in none of the components: by its angles, and by the way it came.
+    # What each joint alone may do without a name, in none of the components: by all angles, by its own within a few
+    # degrees, and by the way it came.
     of_joints: SmoothErrors | None = None
+    of_teeth: SmoothErrors | None = None
     of_ways: SmoothErrors | None = None
 
     def reduced(self, reduction: Array) -> "PoseErrors":
@@ -78,7 +80,7 @@ class PoseErrors:
                 components.append(self.components[i] if untouched else np.sum([own @ own.T for own in those], axis=0))
         n = self.components.shape[1]
         names, kept = tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n)
-        return PoseErrors(names, kept, self.scales[keep], left, self.of_joints, self.of_ways)
+        return replace(self, names=names, components=kept, scales=self.scales[keep], effects=left)
 
     def beside(self, name: str, component: Array, scale: float) -> "PoseErrors":
         """The same with a further component (n, n)."""
@@ -101,7 +103,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white(sum(m.views.count for m in measurements))
     found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
-    of_joints = of_ways = None
+    of_joints = of_teeth = of_ways = None
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
@@ -115,6 +117,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found["smooth"] = (spread_over(links, alike), _SMOOTH)
         if constant[0].name == _CONSTANT[0]:
             of_joints = SmoothErrors(links[:, : joints.shape[1]], alike)
+            of_teeth = replace(of_joints, alike=np.array([alike_closely(q, q) for q in joints.T]))
             came = joints - np.concatenate([m.views.previous for m in measurements])
             of_ways = replace(of_joints, alike=np.array(list(map(alike_in_way, joints.T, came.T))))
     flange = flange_twists(measurements, centres)
@@ -126,7 +129,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
-    return PoseErrors(tuple(found), components, scales, members, of_joints, of_ways)
+    return PoseErrors(tuple(found), components, scales, members, of_joints, of_teeth, of_ways)
 
 
 def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:

@@ -8,8 +8,8 @@ from stitch.frames import Array, Mask
 
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
-# How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike.
-REACH = 1.0
+# How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike; and what a tooth or a seal does to it.
+REACH, SHORT_REACH = 1.0, 0.2
 
 
 def alike_in_joints(joints: Array, others: Array | None = None, reach: float = REACH) -> Array:
@@ -31,6 +31,11 @@ def alike_joint_by_joint(some: Array, others: Array, reach: float = REACH) -> Ar
     """(S, O, n) factors of that product between joints (S, n) and (O, n), rad; alike as far as `reach`, rad."""
     apart = some[:, None, :] - others[None, :, :]
     return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
+
+
+def alike_closely(some: Array, others: Array) -> Array:
+    """(S, O) of a function of one joint's angle alone, (S,) and (O,) rad, that may change within a few degrees."""
+    return np.asarray(2 * alike_joint_by_joint(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1)
 
 
 def alike_in_way(joint: Array, came: Array) -> Array:

@@ -74,8 +74,8 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if _order_open(base, best, empirical):
         return unknown
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
-    rivals = (r for r in likely if r.name != best.name and r.name not in refused)
-    group = (best, *(() if second is not None else rivals))
+    near = (r for r in likely if r.name != best.name and r.name not in refused)
+    group = (best, *(() if second is not None else near))
     if len(group) > 1 and linear.measurement.views.count < MANY_VIEWS:
         two = _both(linear, candidates, best)
         if two is not None:

@@ -9,7 +9,7 @@ from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array
 from stitch.model.term import term_of
-from stitch.statistics.kernels import alike_joint_by_joint
+from stitch.statistics.kernels import alike_closely, alike_joint_by_joint
 
 _PLACES = 25  # over the range of a joint
 # Courses that carry less of what the joint does by its law say nothing about where.
@@ -48,9 +48,10 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
     for law in laws:
         joints, errors = law.model.measurement.views.joints, law.model.pose_errors
         assert errors is not None and errors.of_joints is not None
-        alike = errors.of_joints.alike
+        own = law.joint - 1
+        alike = alike_closely(joints[:, own], joints[:, own]) if law.closely else errors.of_joints.alike
         whole = float(_given_views(law, alike, alike)[0].var())
-        found += [_course(law, j, whole) for j in range(joints.shape[1])]
+        found += [_course(law, j, whole) for j in ([own] if law.closely else range(joints.shape[1]))]
     return tuple(sorted((c for c in found if c.share > _WORTH), key=lambda c: -c.share))
 
 
@@ -58,12 +59,8 @@ def _course(law: JointLaw, j: int, whole: float) -> JointCurve:
     """Along joint j, counted from 0; `whole` is the variance over the views of all that the law does, rad²."""
     joints = law.model.measurement.views.joints
     angle, views = np.linspace(joints[:, j].min(), joints[:, j].max(), _PLACES), len(joints)
-    factors = alike_joint_by_joint(joints, joints)
-    # Of the function averaged over where the other joints stood.
-    others = np.prod(np.delete(factors, j, axis=2), axis=2)
     places = np.append(angle, joints[:, j])
-    with_views = others.mean(axis=0) * alike_joint_by_joint(places[:, None], joints[:, [j]])[:, :, 0]
-    with_places = others.mean() * alike_joint_by_joint(places[:, None], places[:, None])[:, :, 0]
+    with_views, with_places = _alike(law, j, places)
     centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_PLACES, views])
     mean, covariance = _given_views(law, centred @ with_views, centred @ with_places @ centred.T)
     return JointCurve(
@@ -74,6 +71,18 @@ def _course(law: JointLaw, j: int, whole: float) -> JointCurve:
         error=mean[:_PLACES],
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),
     )
+
+
+def _alike(law: JointLaw, j: int, places: Array) -> tuple[Array, Array]:
+    """(G, V) and (G, G) covariances of the law at places (G,) of joint j, rad, with the views and with each other."""
+    joints = law.model.measurement.views.joints
+    if law.closely:
+        return alike_closely(places, joints[:, j]), alike_closely(places, places)
+    # Of the function averaged over where the other joints stood.
+    others = np.prod(np.delete(alike_joint_by_joint(joints, joints), j, axis=2), axis=2)
+    along = places[:, None]
+    with_views = others.mean(axis=0) * alike_joint_by_joint(along, joints[:, [j]])[:, :, 0]
+    return with_views, others.mean() * alike_joint_by_joint(along, along)[:, :, 0]
 
 
 def _given_views(law: JointLaw, with_views: Array, prior: Array) -> tuple[Array, Array]:

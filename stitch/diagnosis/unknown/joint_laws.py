@@ -2,9 +2,10 @@
 
 A name is worth no more than what it is compared with. All joints and links following the pose at once (`smooth` in the
 prior of pose errors) is a poor rival: it may do so much that it is believed to do little of anything. One joint that is
-off by a smooth function of the joint angles is what a coupling, a hose, a worn tooth or a gear with play really does,
-and where it explains the views about as well as an effect of the library, these views cannot tell which it is. Likewise
-one joint that is off by any function of the way it came, as by friction, which is neither play nor settling.
+off by a smooth function of the joint angles is what a coupling, a hose or a gear with play really does, and where it
+explains the views about as well as an effect of the library, these views cannot tell which it is. Likewise one joint
+that is off by a function of its own angle that changes within a few degrees, as by a worn tooth or a wave of a gear, or
+by any function of the way it came, as by friction, which is neither play nor settling.
 """
 
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ class JointLaw:
     """One joint that follows the joint angles by a law without a name."""
 
     joint: int  # counted from 1
+    closely: bool  # its own angle, within a few degrees; or all angles, smoothly
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size
     model: LinearModel  # with the law as the last of its pose errors, all sizes fitted
 
@@ -39,11 +41,15 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `log_posterior` charges it for the width of its prior.
     """
-    return _laws(base, None if base.pose_errors is None else base.pose_errors.of_joints)
+    errors = base.pose_errors
+    if errors is None:
+        return ()
+    laws = _laws(base, errors.of_joints) + _laws(base, errors.of_teeth, closely=True)
+    return tuple(sorted(laws, key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
-    """Of the likeliest law of a joint, by its angles or by the way it came, as those of effects in the same model
+    """Of the likeliest law of a joint, by the angles or by the way it came, as those of effects in the same model
     (`Ranked`); −∞ where there is none."""
     laws = joint_laws(base)
     laws += _laws(base, None if base.pose_errors is None else base.pose_errors.of_ways)
@@ -56,17 +62,17 @@ def log_prior(laws: int) -> float:
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints, by the angles and by the way they came, at usual size."""
+    """(n, n) in the channel of the laws of all joints, by the angles, closely, and by the way they came, at usual size."""
     errors = base.pose_errors
     if errors is None or errors.of_joints is None:
         return []
     usual = float(errors.scales[errors.names.index("smooth")])
-    kinds = [smooth for smooth in (errors.of_joints, errors.of_ways) if smooth is not None]
+    kinds = [smooth for smooth in (errors.of_joints, errors.of_teeth, errors.of_ways) if smooth is not None]
     every = [smooth.of(k) for smooth in kinds for k in range(smooth.count)]
     return [usual**2 * base.reduce(base.reduce(law).T) for law in every]
 
 
-def _laws(base: LinearModel, smooth: SmoothErrors | None) -> tuple[JointLaw, ...]:
+def _laws(base: LinearModel, smooth: SmoothErrors | None, closely: bool = False) -> tuple[JointLaw, ...]:
     errors = base.pose_errors
     if errors is None or smooth is None:
         return ()
@@ -78,8 +84,8 @@ def _laws(base: LinearModel, smooth: SmoothErrors | None) -> tuple[JointLaw, ...
         mixed = with_errors(base.mixed, every)
         fit = _fit(base, mixed, scale**2)
         model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
-        found.append(JointLaw(k + 1, 0.5 * (base.null.deviance - fit.deviance), model))
-    return tuple(sorted(found, key=lambda law: -law.log_bayes_factor))
+        found.append(JointLaw(k + 1, closely, 0.5 * (base.null.deviance - fit.deviance), model))
+    return tuple(found)
 
 
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:

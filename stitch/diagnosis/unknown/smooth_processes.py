@@ -12,18 +12,12 @@ from stitch.model.jacobian import twists
 from stitch.model.term import term_of
 from stitch.observations.flange_errors import WANDERING, flange_twists, in_steps
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import REACH, alike_in_joints, alike_in_time
+from stitch.statistics.kernels import REACH, SHORT_REACH, alike_in_joints, alike_in_time
 
 # Columns of a process, and the share of its largest variance that the last of them has at least.
 _MOST, _LEAST = 96, 1e-3
 # Of so many views the covariance is drawn apart, and the others follow these.
 _KNOTS = 400
-# How far, rad, what a tooth or a seal does to a joint reaches.
-_SHORT = 0.2
-# Whole swings that a session must have seen, and per step: faster ones look like slower ones.
-_LEAST_SWINGS, _FASTEST = 2.0, 0.45
-# Frequencies nearer to each other than half a swing over the session look alike, and so many of them are tried.
-_APART, _MOST_FREQUENCIES = 0.5, 100
 
 
 @dataclass(frozen=True)
@@ -53,7 +47,7 @@ def alone(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
     out = []
     for k, motion in enumerate(motions):
         own, came = views.joints[:, [k]], views.previous[:, [k]]
-        courses = (every, _following(own, _SHORT), _following(np.hstack([own, came])))
+        courses = (every, _following(own, SHORT_REACH), _following(np.hstack([own, came])))
         out.append([SmoothProcess(k + 1, motion, shapes) for shapes in courses])
     return out
 
@@ -73,16 +67,6 @@ def wandering(linear: LinearModel) -> SmoothProcess:
     alike = alike_in_time(time, WANDERING["slowly wandering"], time[knots])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
     return SmoothProcess(None, carried, _shapes(alike, knots, _MOST // 6))
-
-
-def swinging(linear: LinearModel) -> Iterator[tuple[float, SmoothProcess]]:
-    """A flange that swings to and fro in time, with the period in steps from view to view."""
-    measurement, time = linear.measurement, in_steps(linear.measurement)
-    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
-    span = max(float(np.ptp(time)), 1.0)
-    for frequency in np.arange(_LEAST_SWINGS / span, _FASTEST, _APART / span)[:_MOST_FREQUENCIES]:
-        phase = 2 * np.pi * frequency * time
-        yield float(1 / frequency), SmoothProcess(None, carried, np.stack([np.cos(phase), np.sin(phase)], axis=1))
 
 
 def _following(angles: Array, reach: float = REACH) -> Array:

@@ -6,13 +6,12 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
-from stitch.diagnosis.unknown.swings import clear_swing
+from stitch.diagnosis.unknown.time_laws import clear_time_law
 from stitch.diagnosis.unknown.unnamed_courses import clear_course
-from stitch.observations.flange_errors import WANDERING, usual_step
+from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import VarianceFit, fit_variances
 from stitch.statistics.variance_prior import NOISE
-from stitch.units import duration_text
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
 _JOINTS, _TIME = "follow the joints", "wander in time"
@@ -41,7 +40,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     """
     if linear.pose_errors is None:
         return _course(linear)
-    laws = [own for own in (_clear_law(linear), _swing(linear)) if own is not None]
+    laws = [own for own in (_clear_law(linear), _time_law(linear)) if own is not None]
     # Where each can stand in for the other, the likelier alone is said to be there.
     law = max(laws, key=lambda own: own.log_bayes_factor, default=None)
     if _gain(linear, linear.scatter_only.null.deviance) < ODDS:
@@ -70,19 +69,10 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
     return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, True, laws) if laws else None
 
 
-def _swing(linear: LinearModel) -> Unnamed | None:
+def _time_law(linear: LinearModel) -> Unnamed | None:
     """That of the flange in time."""
-    found = clear_swing(linear)
-    if found is None:
-        return None
-    period, swing = found
-    return Unnamed(f"swing to and fro {_every(linear, period)}", swing.log_bayes_factor, False, rest=swing.fit)
-
-
-def _every(linear: LinearModel, period: float) -> str:
-    """A period in steps from view to view, in words."""
-    step = usual_step(linear.measurement)
-    return f"every {period:.2g} views" + (f" ({duration_text(period * step)})" if step > 0 else "")
+    law = clear_time_law(linear)
+    return None if law is None else Unnamed(law.words, law.log_bayes_factor, joints=False, rest=law.fitted.fit)
 
 
 def _course(linear: LinearModel) -> tuple[Unnamed, ...]:

@@ -1,0 +1,54 @@
+"""Laws without a name in time: a flange that swings to and fro, or that for a stretch of views stands off and comes back.
+
+A cabinet that cools in turns, air that is conditioned in turns, a draught, somebody who leans on the cell. Errors half
+a period apart are opposite, and a stretch of large errors lies amid small ones: no process that forgets and is everywhere
+of one size does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was
+adequate; or an effect that goes with time got its name from a part of a swing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
+from stitch.diagnosis.unknown.time_processes import time_processes
+from stitch.observations.linear_model import LinearModel
+
+# Of all courses those whose size is sought with all variances.
+_FITTED = 3
+# What a size that is wanted costs beside one that is known, nats: as of a joint's law (`joint_laws.py`).
+_WIDTH = 3.0
+
+
+@dataclass(frozen=True)
+class TimeLaw:
+    """The flange errs in one course of time."""
+
+    words: str  # what they do: "they …"
+    log_bayes_factor: float  # over everything else, charged for all courses that were tried and for any size
+    fitted: FittedProcess
+
+
+def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
+    """The likeliest beside a model; None where poses have no prior of errors, or a session is too short for any."""
+    if linear.pose_errors is None:
+        return None
+    courses = time_processes(linear)
+    sized = [at_likeliest_size(linear, course.process) for course in courses]
+    likeliest = sorted(range(len(sized)), key=lambda k: -sized[k].gain)[:_FITTED]
+    found = [(courses[k].words, fitted(linear, sized[k], len(sized))) for k in likeliest]
+    laws = [TimeLaw(words, own.log_bayes_factor - _WIDTH, own) for words, own in found]
+    return max(laws, key=lambda law: law.log_bayes_factor, default=None)
+
+
+def log_posterior(linear: LinearModel) -> float:
+    """Of the likeliest, as those of effects in the same model (`Ranked`); −∞ where there is none."""
+    law = likeliest_time_law(linear)
+    return -np.inf if law is None else law.log_bayes_factor + float(np.log(PRIOR_UNKNOWN))
+
+
+def clear_time_law(linear: LinearModel) -> TimeLaw | None:
+    """The likeliest, where it is 20 to 1 likelier than none."""
+    law = likeliest_time_law(linear)
+    return law if law is not None and law.log_bayes_factor > ODDS else None
