@@ -66,7 +66,8 @@ def _diagnosed(state: State) -> Diagnosis:
     of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
-    rotation, translation = _scatter(linear, unnamed if curves or not beyond else ())
+    said = unnamed if not beyond or any(u.of_one for u in unnamed) else ()
+    rotation, translation = _scatter(linear, said)
     found = Diagnosis(
         verdict=selection.verdict,
         effects=tuple(r.name for r in selection.named),

@@ -54,7 +54,7 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
     start += beside_poses(d.smooth, length_unit)
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
-    if d.unnamed and (d.curves or not d.implausible):
+    if d.unnamed and (not d.implausible or any(u.of_one for u in d.unnamed)):
         again = " and ".join(u.words for u in d.unnamed)
         return (
             f"{start}{follows}the errors of the poses repeat, they {again}{_repeating(d, length_unit)}, and scatter by "

@@ -8,7 +8,7 @@ from stitch.frames import Array, Mask
 
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
-# How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike; and what a tooth or a seal does to it.
+# How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike, and what a tooth does to it.
 REACH, SHORT_REACH = 1.0, 0.2
 
 

@@ -83,7 +83,10 @@ def test_poses_that_wander_get_no_name(cell):
         assert found.verdict == "unknown_effect" and not found.named
 
 
-@pytest.mark.parametrize(("law", "seed", "joint"), [("dress_pack", 2, 2), ("coupling", 1, 3), ("coupling", 3, 2)])
+@pytest.mark.parametrize(
+    ("law", "seed", "joint"),
+    [("dress_pack", 2, 2), ("coupling", 1, 3), ("coupling", 3, 2), ("ripple", 4, 4), ("ripple", 1, 3), ("spall", 3, 5)],
+)
 def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law, seed, joint):
     """0.3 mrad by laws of no library, which beside all joints and links at once look like one of them."""
     measured, *_ = cell
@@ -156,3 +159,17 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
     # Where views stood the sigma is worth something: a fifth of what there is.
     inside = course.sigma[(course.angle > np.quantile(q[:, 3], 0.1)) & (course.angle < np.quantile(q[:, 3], 0.9))]
     assert inside.max() < 0.2 * np.ptp(true)
+
+
+def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
+    """Seven periods a turn: no smooth function of all joints, and told along the joint's own angle alone."""
+    measured, *_ = cell
+    q = measured.plan.joints
+    off = np.zeros_like(q)
+    off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])
+    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
+    (course,) = joint_curves(clear_laws(linear))
+    true = 4e-4 * np.sin(7 * course.angle) - off[:, 4].mean()
+    assert (course.joint, course.name) == (5, "j5_deg")
+    assert np.all(np.abs(course.error - true) < 4 * course.sigma)
+    assert np.corrcoef(course.error, true)[0, 1] > 0.9

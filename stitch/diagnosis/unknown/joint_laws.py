@@ -62,7 +62,7 @@ def log_prior(laws: int) -> float:
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints, by the angles, closely, and by the way they came, at usual size."""
+    """(n, n) in the channel of the laws of all joints, by the angles, closely, and by the way they came; usual size."""
     errors = base.pose_errors
     if errors is None or errors.of_joints is None:
         return []
@@ -92,12 +92,13 @@ def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Laws of single joints of which one is there beside all that the prior holds; likeliest first, () if none is.
 
     The best must be 20 to 1 likelier than none though it is the best of all joints'; with it come those that 20 to 1
-    does not tell from it.
+    does not tell from it, of every joint the likelier kind.
     """
     laws = joint_laws(linear)
     if not laws or laws[0].log_bayes_factor < ODDS + np.log(len(laws)):
         return ()
-    return tuple(law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS)
+    likely = {law.joint: law for law in reversed(laws) if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS}
+    return tuple(law for law in laws if law is likely.get(law.joint))
 
 
 def _fit(base: LinearModel, mixed: MixedModel, usual: float) -> VarianceFit:

@@ -1,8 +1,8 @@
-"""Laws without a name in time: a flange that swings to and fro, or that for a stretch of views stands off and comes back.
+"""Laws without a name in time: a flange that swings to and fro, or that stands off for a stretch of views.
 
 A cabinet that cools in turns, air that is conditioned in turns, a draught, somebody who leans on the cell. Errors half
-a period apart are opposite, and a stretch of large errors lies amid small ones: no process that forgets and is everywhere
-of one size does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was
+a period apart are opposite, and a stretch of large errors lies amid small ones: no process that forgets and has one
+size throughout does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was
 adequate; or an effect that goes with time got its name from a part of a swing.
 """
 
@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.diagnosis.unknown.joint_laws import WIDTH
 from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
 from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.observations.linear_model import LinearModel
 
 # Of all courses those whose size is sought with all variances.
 _FITTED = 3
-# What a size that is wanted costs beside one that is known, nats: as of a joint's law (`joint_laws.py`).
-_WIDTH = 3.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     sized = [at_likeliest_size(linear, course.process) for course in courses]
     likeliest = sorted(range(len(sized)), key=lambda k: -sized[k].gain)[:_FITTED]
     found = [(courses[k].words, fitted(linear, sized[k], len(sized))) for k in likeliest]
-    laws = [TimeLaw(words, own.log_bayes_factor - _WIDTH, own) for words, own in found]
+    laws = [TimeLaw(words, own.log_bayes_factor - WIDTH, own) for words, own in found]
     return max(laws, key=lambda law: law.log_bayes_factor, default=None)
 
 

@@ -25,6 +25,7 @@ class Unnamed:
     words: str  # "they …"
     log_bayes_factor: float  # over the same errors without it
     joints: bool  # follows the pose rather than time
+    of_one: bool = False  # one joint, or one course of time, stands out beside all that the prior holds
     laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
     rest: VarianceFit | None = None  # of the views beside it, where the null counts it as scatter
 
@@ -40,9 +41,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     """
     if linear.pose_errors is None:
         return _course(linear)
-    laws = [own for own in (_clear_law(linear), _time_law(linear)) if own is not None]
-    # Where each can stand in for the other, the likelier alone is said to be there.
-    law = max(laws, key=lambda own: own.log_bayes_factor, default=None)
+    law = _likelier(_clear_law(linear), _time_law(linear))
     if _gain(linear, linear.scatter_only.null.deviance) < ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
@@ -59,20 +58,33 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     wanted = sorted((u for u in found if u.log_bayes_factor > ODDS), key=lambda u: -u.log_bayes_factor)
     if law is not None:
         return (law, *(u for u in wanted if u.joints != law.joints))
+    # Where each can stand in for the other, the likelier alone is said to be there.
     return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
 
 
 def _clear_law(linear: LinearModel) -> Unnamed | None:
     """That of one joint beside all that the prior holds."""
     laws = clear_laws(linear)
+    if not laws:
+        return None
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
-    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, True, laws) if laws else None
+    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
 
 
 def _time_law(linear: LinearModel) -> Unnamed | None:
     """That of the flange in time."""
     law = clear_time_law(linear)
-    return None if law is None else Unnamed(law.words, law.log_bayes_factor, joints=False, rest=law.fitted.fit)
+    if law is None:
+        return None
+    return Unnamed(law.words, law.log_bayes_factor, joints=False, of_one=True, rest=law.fitted.fit)
+
+
+def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
+    """Of a joint's law and one in time, which can stand in for each other; both where 20 to 1 tells neither."""
+    found = sorted((u for u in (joint, time) if u is not None), key=lambda u: -u.log_bayes_factor)
+    if len(found) == 2 and found[0].log_bayes_factor - found[1].log_bayes_factor < ODDS:
+        return replace(found[0], words=f"{found[0].words}, or {found[1].words}")
+    return found[0] if found else None
 
 
 def _course(linear: LinearModel) -> tuple[Unnamed, ...]:

@@ -1,0 +1,108 @@
+"""What a flange does in time by no law of the library: it swings, or stands off for a stretch of views."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
+
+from data_synth.fixtures.blade_cells import captured, measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch import frames
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.thresholds import IMPLAUSIBLE
+from stitch.diagnosis.unknown.joint_laws import WIDTH
+from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_law
+from stitch.diagnosis.unknown.time_processes import time_processes
+from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.effects.contract import EFFECTS
+from stitch.measurement.measurement import measurement_of
+from stitch.model.model import Model
+from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.surface_model import surface_model
+from stitch.statistics.variance_prior import log_prior
+
+VIEWS = 18
+# Of the flange in its own frame, rad and mm: 0.4 mrad and 0.12 mm, where poses scatter by 20 µrad and 20 µm.
+DIRECTION = np.array([2.2e-4, -1.5e-4, 2.8e-4, 0.08, 0.05, -0.07])
+SCATTER = np.array([2e-5, 0.02])
+ASKED = ("robot_thermal_growth", "mount_drift", "mount_warmup", "fixture_drift", "part_slip")
+
+
+@pytest.fixture(scope="module")
+def cell():
+    """A blade on the flange and its freed views under the true hand-eye."""
+    measured = measured_blade(4, views=VIEWS, pixels=60)
+    capture = captured(measured)
+    freed = free_poses(capture, capture.poses(measured.T_mount), 1.0)
+    return measured, measurement_of(session_of(measured), capture), freed
+
+
+def linear_of(cell, errors):
+    """The views where the flange errs by so much (V, 6), in its own frame."""
+    measured, measurement, freed = cell
+    true = measured.T_base_flange @ frames.exp(errors)
+    to_centre = frames.make(np.eye(3), -freed.overlaps.gram.centre)
+    model = measurement.capture.poses(measured.T_mount)
+    moved = frames.log(to_centre @ frames.inverse(true) @ measured.T_mount @ frames.inverse(to_centre @ model))
+    seen = replace(freed, twists=freed.twists + moved)
+    return surface_model(measurement, Model(measured.T_mount), measurement.capture, seen)
+
+
+def verdict_of(linear):
+    candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
+    return concluded(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
+
+
+@pytest.mark.parametrize("period", [4.0, 5.5, 8.0])
+def test_a_flange_that_swings_is_said_to_with_its_period(cell, period):
+    swing = np.sin(2 * np.pi * np.arange(VIEWS) / period + 1.0)
+    linear = linear_of(cell, swing[:, None] * DIRECTION)
+    found = verdict_of(linear)
+    assert found.verdict == "unknown_effect" and not found.named
+    words = unnamed_errors(linear)[0].words
+    assert words.startswith("swing to and fro every ")
+    said = float(words.split()[5])
+    # Two frequencies that fit half a swing more or less into the session are next to each other.
+    assert abs(1 / said - 1 / period) < 0.5 / (VIEWS - 1)
+
+
+def test_a_stretch_of_views_that_stands_off_is_said_to(cell):
+    stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 1.7) ** 2)
+    linear = linear_of(cell, 2 * stretch[:, None] * DIRECTION)
+    found = verdict_of(linear)
+    assert found.verdict == "unknown_effect" and not found.named
+    words = unnamed_errors(linear)[0].words
+    assert words.startswith("are off for a stretch of 3.5 views") and words.endswith(("v009", "v010", "v011"))
+
+
+def test_scatter_follows_no_course_of_time(cell):
+    linear = linear_of(cell, np.zeros((VIEWS, 6)))
+    assert clear_time_law(linear) is None and verdict_of(linear).verdict == "adequate"
+
+
+def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
+    """Against the density of what the hand-eye leaves, by scipy, and Powell's search over every size at once."""
+    swing = np.sin(2 * np.pi * np.arange(VIEWS) / 6.0)
+    linear = linear_of(cell, swing[:, None] * DIRECTION)
+    found, scales = likeliest_time_law(linear), linear.pose_errors.scales
+    free = null_space(linear.mixed.A[0].T).T
+    every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
+    fixed = 0 if linear.mixed.fixed is None else free @ linear.mixed.fixed[0] @ free.T
+    columns = free @ found.fitted.columns
+
+    def likely(log_variances, size):
+        covariance = np.tensordot(np.exp(log_variances), every, axes=1) + fixed + size**2 * columns @ columns.T
+        density = multivariate_normal(cov=covariance, allow_singular=True).logpdf(free @ linear.mixed.z[0])
+        return density - 0.5 * log_prior(log_variances, scales)[0]
+
+    without = likely(np.log(linear.null.variances), 0.0)
+    begun = np.log([*SCATTER**2, 1.0, *(1e-2 * scales**2), 3.0])
+    search = minimize(lambda x: -likely(x[:-1], np.exp(x[-1])), begun, method="Powell", options={"ftol": 1e-6})
+    counted = np.log(len(time_processes(linear))) + WIDTH
+    assert -search.fun - without > 10
+    assert found.log_bayes_factor + counted == pytest.approx(-search.fun - without, abs=0.3)
