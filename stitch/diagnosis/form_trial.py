@@ -1,9 +1,15 @@
-"""One form of a candidate beside a model: what it gains, and its free amplitudes."""
+"""One form of a candidate beside a model: what it gains, and its free amplitudes.
+
+How large an effect is if it is there nobody knows before: its parameters are of plausible size, or all alike a third or
+a tenth of it, each as likely. With plausible sizes alone, six numbers of which the views show a tenth of that were
+charged for all that they could have been, and effects beyond chance (p = 1e-9) counted for nothing.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.frames import Array
@@ -11,6 +17,8 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import at_variances, fit_variances
 
+# Of plausible sizes, where a prior of pose errors stands beside; labelled points show sizes whatever their prior.
+SCALES = (1.0, 0.3, 0.1)
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
 # Among more numbers than this the variances are the same under both priors, and a fit takes half a second.
@@ -28,10 +36,19 @@ class FormTrial:
     variances: Array | None = None  # (c,)
 
 
-def try_form(linear: LinearModel, form: Form, start: Array) -> FormTrial:
-    """One form with its variances estimated anew."""
+@dataclass(frozen=True)
+class Gain:
+    """Log Bayes factor of a form at given variances over all its scales, and the likeliest of these."""
+
+    log_bayes_factor: float
+    scale: float = 1.0
+    others: float = 0.0  # of it, what the other scales add, less the share of the prior that the likeliest has
+
+
+def try_form(linear: LinearModel, form: Form, start: Array, gain: Gain) -> FormTrial:
+    """One form with its variances estimated anew, at the scale that was likeliest before."""
     mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
-    integrated = fit_variances(mixed, G, form.sizes, start=start)
+    integrated = fit_variances(mixed, G, gain.scale * form.sizes, start=start)
     if mixed.size > LONG or linear.pose_errors is not None:
         free = at_variances(mixed, integrated.variances, G, wide)
     else:
@@ -41,7 +58,8 @@ def try_form(linear: LinearModel, form: Form, start: Array) -> FormTrial:
     rank, square = _wald(theta, covariance, form.sizes)
     rest = max(mixed.size - a - rank, 1)
     p = f_tail(square / max(rank, 1), max(rank, 1), rest)
-    return FormTrial(0.5 * (linear.null.deviance - integrated.deviance), p, theta, covariance, integrated.variances)
+    gained = 0.5 * (linear.null.deviance - integrated.deviance) + gain.others
+    return FormTrial(gained, p, theta, covariance, integrated.variances)
 
 
 def residuals(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
@@ -54,12 +72,16 @@ def residuals(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
         yield white[:, form.keep[whole.keep]]
 
 
-def gain_at_null(linear: LinearModel, form: Form, white: Array) -> float:
-    """Log Bayes factor at the null's variances: cheap, and an upper hand for what cannot help."""
+def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
+    """At the null's variances: cheap, and an upper hand for what cannot help."""
     white = white * form.sizes
-    information = np.eye(white.shape[1]) + white.T @ white
-    b = white.T @ linear.white_residual
-    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
+    told, b = white.T @ white, white.T @ linear.white_residual
+    scales = np.array(SCALES if linear.pose_errors is not None else SCALES[:1])
+    information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
+    squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
+    found = 0.5 * (squares - np.linalg.slogdet(information)[1])
+    whole, likeliest = float(logsumexp(found) - np.log(len(scales))), int(found.argmax())
+    return Gain(whole, float(scales[likeliest]), whole - float(found[likeliest]))
 
 
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:

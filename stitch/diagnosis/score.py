@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.form_trial import LONG, FormTrial, gain_at_null, residuals, try_form
+from stitch.diagnosis.form_trial import LONG, FormTrial, Gain, gain_at_null, residuals, try_form
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
@@ -69,15 +69,15 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     base = linear.without([candidate.name])
     starts = (base, *base.elsewhere)
     gained, shown = zip(*(_quick(base, at, candidate) for at in starts), strict=True)
-    quick, seen = np.array(gained).T, any(shown)
+    quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
     likely = quick.max(axis=1)
     least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [
-        try_form(base, form, starts[int(quick[i].argmax())].null.variances)
+        try_form(base, form, starts[start].null.variances, gained[start][i])
         if i in worth and candidate.forms[i].columns.any()
         else FormTrial(float(likely[i]))
-        for i, form in enumerate(candidate.forms)
+        for i, (form, start) in enumerate(zip(candidate.forms, quick.argmax(axis=1), strict=True))
     ]
     weights = form_weights(candidate)
     k = max(range(len(tried)), key=lambda i: tried[i].log_bayes_factor)
@@ -106,14 +106,15 @@ def _beside(base: LinearModel, best: FormTrial) -> LinearModel | None:
     return replace(base, null=at_variances(base.mixed, best.variances))
 
 
-def _quick(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[float], bool]:
-    """Log Bayes factors (F,) of its forms over the base at given variances, which refitted variances can only raise;
-    and whether the first form, of all its parameters, is seen."""
-    gains, seen = list[float](), False
+def _quick(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[Gain], bool]:
+    """What its forms (F,) gain over the base at given variances, which refitted variances can only raise; and whether
+    the first form, of all its parameters, is seen."""
+    gains, seen = list[Gain](), False
     for form, white in zip(candidate.forms, residuals(at, candidate), strict=True):
         if not gains:
             seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN).any())
-        gains.append(gain_at_null(at, form, white) + 0.5 * (base.null.deviance - at.null.deviance))
+        gain, here = gain_at_null(at, form, white), 0.5 * (base.null.deviance - at.null.deviance)
+        gains.append(replace(gain, log_bayes_factor=gain.log_bayes_factor + here))
     return gains, seen
 
 
@@ -125,7 +126,8 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
     """
 
     def gain(c: Candidate) -> float:
-        return max(gain_at_null(linear, f, w) for f, w in zip(c.forms, residuals(linear, c), strict=True))
+        pairs = zip(c.forms, residuals(linear, c), strict=True)
+        return max(gain_at_null(linear, form, white).log_bayes_factor for form, white in pairs)
 
     gains = np.array(list(parallel(gain, candidates)))
     return [(candidates[k], float(gains[k])) for k in np.argsort(-gains, kind="stable")[:count]]

@@ -15,7 +15,6 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unknown.joint_laws import WIDTH
 from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_law
 from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
@@ -103,6 +102,6 @@ def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
     without = likely(np.log(linear.null.variances), 0.0)
     begun = np.log([*SCATTER**2, 1.0, *(1e-2 * scales**2), 3.0])
     search = minimize(lambda x: -likely(x[:-1], np.exp(x[-1])), begun, method="Powell", options={"ftol": 1e-6})
-    counted = np.log(len(time_processes(linear))) + WIDTH
+    counted = np.log(len(time_processes(linear)))
     assert -search.fun - without > 10
     assert found.log_bayes_factor + counted == pytest.approx(-search.fun - without, abs=0.3)

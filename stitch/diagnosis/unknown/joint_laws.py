@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stitch.diagnosis.form_trial import SCALES
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
@@ -22,8 +23,8 @@ from stitch.statistics.variance_components import VarianceFit, at_variances, fit
 
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
-# What a size that is wanted costs beside one that is known: ∫ of its prior over log σ against the value at the maximum.
-WIDTH = 3.0
+# What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
+ANY_SIZE = float(np.log(len(SCALES)))
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class JointLaw:
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
     """What such a law of each joint explains beside a model, likeliest first; () without joints or prior of errors.
 
-    Its size is fitted with all others; `log_posterior` charges it for the width of its prior.
+    Its size is fitted with all others; `log_posterior` charges it for that.
     """
     errors = base.pose_errors
     if errors is None:
@@ -57,8 +58,8 @@ def log_posterior(base: LinearModel) -> float:
 
 
 def log_prior(laws: int) -> float:
-    """What the likeliest of so many laws is charged: its share of the prior, and the width of that of its size."""
-    return float(np.log(PRIOR_UNKNOWN / max(laws, 1))) - WIDTH
+    """What the likeliest of so many laws is charged: its share of the prior, and that its size is not known."""
+    return float(np.log(PRIOR_UNKNOWN / max(laws, 1))) - ANY_SIZE
 
 
 def law_covariances(base: LinearModel) -> list[Array]:

@@ -11,13 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
-from stitch.diagnosis.unknown.joint_laws import WIDTH
+from stitch.diagnosis.unknown.joint_laws import ANY_SIZE
 from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
 from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.observations.linear_model import LinearModel
 
 # Of all courses those whose size is sought with all variances.
 _FITTED = 3
+# What a size without a prior costs where the question is whether there is anything, nats: ∫ of the prior that other
+# pose errors have over log σ, against its value at the maximum (`variance_prior.py`).
+_WIDTH = 3.0
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class TimeLaw:
     """The flange errs in one course of time."""
 
     words: str  # what they do: "they …"
-    log_bayes_factor: float  # over everything else, charged for all courses that were tried and for any size
+    log_bayes_factor: float  # over everything else at its likeliest size, charged for all courses that were tried
     fitted: FittedProcess
 
 
@@ -37,17 +40,17 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     sized = [at_likeliest_size(linear, course.process) for course in courses]
     likeliest = sorted(range(len(sized)), key=lambda k: -sized[k].gain)[:_FITTED]
     found = [(courses[k].words, fitted(linear, sized[k], len(sized))) for k in likeliest]
-    laws = [TimeLaw(words, own.log_bayes_factor - WIDTH, own) for words, own in found]
+    laws = [TimeLaw(words, own.log_bayes_factor, own) for words, own in found]
     return max(laws, key=lambda law: law.log_bayes_factor, default=None)
 
 
 def log_posterior(linear: LinearModel) -> float:
     """Of the likeliest, as those of effects in the same model (`Ranked`); −∞ where there is none."""
     law = likeliest_time_law(linear)
-    return -np.inf if law is None else law.log_bayes_factor + float(np.log(PRIOR_UNKNOWN))
+    return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(PRIOR_UNKNOWN))
 
 
 def clear_time_law(linear: LinearModel) -> TimeLaw | None:
     """The likeliest, where it is 20 to 1 likelier than none."""
     law = likeliest_time_law(linear)
-    return law if law is not None and law.log_bayes_factor > ODDS else None
+    return law if law is not None and law.log_bayes_factor - _WIDTH > ODDS else None
