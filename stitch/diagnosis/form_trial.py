@@ -17,12 +17,17 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import at_variances, fit_variances
 
-# Of plausible sizes, where a prior of pose errors stands beside; labelled points show sizes whatever their prior.
+# Where a prior of pose errors stands beside; labelled points show sizes whatever their prior.
 SCALES = (1.0, 0.3, 0.1)
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
 # Among more numbers than this the variances are the same under both priors, and a fit takes half a second.
 LONG = 250
+
+
+def scales_of(linear: LinearModel) -> tuple[float, ...]:
+    """Of the plausible sizes of an effect's parameters, equally likely."""
+    return SCALES if linear.pose_errors is not None else SCALES[:1]
 
 
 @dataclass(frozen=True)
@@ -41,14 +46,26 @@ class Gain:
     """Log Bayes factor of a form at given variances over all its scales, and the likeliest of these."""
 
     log_bayes_factor: float
-    scale: float = 1.0
-    others: float = 0.0  # of it, what the other scales add, less the share of the prior that the likeliest has
+    scale: float
 
 
-def try_form(linear: LinearModel, form: Form, start: Array, gain: Gain) -> FormTrial:
-    """One form with its variances estimated anew, at the scale that was likeliest before."""
+def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> FormTrial:
+    """One form with its variances estimated anew.
+
+    Args:
+        start: (c,) variances to begin with.
+        scale: the one that is likeliest there.
+    """
     mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
-    integrated = fit_variances(mixed, G, gain.scale * form.sizes, start=start)
+    integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
+    scales, found = scales_of(linear), [integrated.deviance]
+    if len(scales) > 1:
+        # What the form explains is no scatter: beside less of it another scale may be the likeliest.
+        found = [at_variances(mixed, integrated.variances, G, s * form.sizes).deviance for s in scales]
+        best = int(np.argmin(found))
+        if scales[best] != scale:
+            integrated = fit_variances(mixed, G, scales[best] * form.sizes, start=integrated.variances)
+            found[best] = integrated.deviance
     if mixed.size > LONG or linear.pose_errors is not None:
         free = at_variances(mixed, integrated.variances, G, wide)
     else:
@@ -58,7 +75,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, gain: Gain) -> FormT
     rank, square = _wald(theta, covariance, form.sizes)
     rest = max(mixed.size - a - rank, 1)
     p = f_tail(square / max(rank, 1), max(rank, 1), rest)
-    gained = 0.5 * (linear.null.deviance - integrated.deviance) + gain.others
+    gained = 0.5 * linear.null.deviance + float(logsumexp(-0.5 * np.array(found)) - np.log(len(found)))
     return FormTrial(gained, p, theta, covariance, integrated.variances)
 
 
@@ -76,12 +93,11 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
     """At the null's variances: cheap, and an upper hand for what cannot help."""
     white = white * form.sizes
     told, b = white.T @ white, white.T @ linear.white_residual
-    scales = np.array(SCALES if linear.pose_errors is not None else SCALES[:1])
+    scales = np.array(scales_of(linear))
     information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
     squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
     found = 0.5 * (squares - np.linalg.slogdet(information)[1])
-    whole, likeliest = float(logsumexp(found) - np.log(len(scales))), int(found.argmax())
-    return Gain(whole, float(scales[likeliest]), whole - float(found[likeliest]))
+    return Gain(float(logsumexp(found) - np.log(len(scales))), float(scales[found.argmax()]))
 
 
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:

@@ -74,7 +74,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [
-        try_form(base, form, starts[start].null.variances, gained[start][i])
+        try_form(base, form, starts[start].null.variances, gained[start][i].scale)
         if i in worth and candidate.forms[i].columns.any()
         else FormTrial(float(likely[i]))
         for i, (form, start) in enumerate(zip(candidate.forms, quick.argmax(axis=1), strict=True))

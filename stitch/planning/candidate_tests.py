@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.form_trial import scales_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME
 from stitch.frames import Array, Mask
@@ -21,10 +22,10 @@ _TOLD = 1e-2
 
 @dataclass(frozen=True)
 class _FormTest:
-    """One form with p columns beside a model: turns what is seen into its log Bayes factor and its squares."""
+    """One form at one scale, with p columns: turns what is seen into its log Bayes factor and its squares."""
 
     weight: float  # share of the candidate's prior
-    against: Array  # (p, n) Wᵀ of whitened columns at plausible sizes
+    against: Array  # (p, n) Wᵀ of whitened columns at the sizes of its scale
     inverse: Array  # (p, p) of 1 + WᵀW
     occam: float  # ½ log det of that
     solved: Array  # (r, p) whitens Wᵀz over the combinations that are seen
@@ -55,8 +56,13 @@ def candidate_test(linear: LinearModel, candidate: Candidate, tests: int) -> Can
     Args:
         linear: the candidate is none of its pose errors.
     """
-    forms = zip(candidate.forms, form_weights(candidate), strict=True)
-    return CandidateTest(linear, tuple(_form_test(linear, f.columns * f.sizes, float(w), tests) for f, w in forms))
+    forms, scales = zip(candidate.forms, form_weights(candidate), strict=True), scales_of(linear)
+    found = [
+        _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, len(scales))
+        for form, weight in forms
+        for scale in scales
+    ]
+    return CandidateTest(linear, tuple(found))
 
 
 def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> tuple[CandidateTest, ...]:
@@ -65,8 +71,8 @@ def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> t
     return tuple(CandidateTest(linear, (_form_test(linear, sigma * half, 1.0, 1),)) for sigma in sigmas)
 
 
-def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int) -> _FormTest:
-    """Of columns (n, p) at plausible sizes."""
+def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, scales: int = 1) -> _FormTest:
+    """Of columns (n, p) at one of so many scales, equally likely; all of them are one test."""
     rest = max(linear.mixed.size - linear.mixed.A.shape[2] - 1, 1)
     white = linear.residual(columns)
     information = white.T @ white
@@ -76,7 +82,7 @@ def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int) -
     limit = keep.sum() * f_limit(ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), rest)
     with_prior = np.eye(len(values)) + information
     return _FormTest(
-        weight,
+        weight / scales,
         against=white.T,
         inverse=np.asarray(np.linalg.inv(with_prior), float),
         occam=float(np.linalg.slogdet(with_prior)[1]) / 2,

@@ -3,7 +3,7 @@
 What planned views would see is drawn: an effect of a given size, beside everything that poses err by otherwise. Every
 candidate effect is then judged as a diagnosis judges it (`diagnosis/selection`), at the expected variances: family-wise
 p, Bayes factor, and odds over every rival in the model in which neither of the two is among the errors that remain, and
-over each joint that follows the joint angles, or the way it came, by no law.
+over each joint that follows the joint angles, or the way it came, by no law; not over laws in time.
 What a diagnosis asks of views left out is not drawn.
 """
 
@@ -95,7 +95,7 @@ class ExpectedDiagnosis:
         laws = self._laws[k]
         if not laws:
             return np.ones(numbers.shape[1], bool)
-        rival = np.max([law.evaluate(numbers)[0] for law in laws], axis=0) + log_prior(len(laws) // len(TIMES))
+        rival = np.max([law.evaluate(numbers)[0] for law in laws], axis=0) + log_prior(own.linear)
         return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:

@@ -13,14 +13,25 @@ import numpy as np
 from scipy.optimize import brentq
 
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.form_trial import scales_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_limit, noncentral_f_tail
 
+# Squares, in units of the scatter, beyond which an effect is of no plausible size: its prior holds back all of it.
+_BEYOND = 1e6
 
-def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degrees_of_freedom: float) -> float:
+
+def least_noncentrality(
+    white: Array,
+    weight: float,
+    tests: int,
+    rest: int,
+    degrees_of_freedom: float,
+    scales: Sequence[float] = (1.0,),
+) -> float:
     """θᵀIθ that a form needs to be detected.
 
     Args:
@@ -29,14 +40,18 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degr
         tests: number of candidates.
         rest: numbers that are left beside the model.
         degrees_of_freedom: degrees of freedom of the scatter along the columns.
+        scales: of the plausible sizes, equally likely (`form_trial.py`).
     """
     information = np.linalg.eigvalsh(white.T @ white)
     rank = int((information > 1e-2).sum())
     if rank == 0:
         return float("inf")
     by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1))
-    factor = LOG_BAYES_FACTOR - float(np.log(weight)) + 0.5 * float(np.log1p(information.clip(0)).sum())
-    needed = max(by_p, degrees_of_freedom * float(np.expm1(2 * factor / degrees_of_freedom)))
+    factor = LOG_BAYES_FACTOR - float(np.log(weight)) + float(np.log(len(scales)))
+    by_factor = [_squares_for(factor, scale**2 * information.clip(0), degrees_of_freedom) for scale in scales]
+    needed = max(by_p, min(by_factor))
+    if needed > _BEYOND:
+        return float("inf")
 
     def missed(shift: float) -> float:
         return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - POWER
@@ -48,6 +63,17 @@ def least_noncentrality(white: Array, weight: float, tests: int, rest: int, degr
     return float(brentq(missed, 1e-9, enough))
 
 
+def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -> float:
+    """Squared length of the projection at which a form gains that log Bayes factor beside what it could have been.
+
+    Args:
+        information: (p,) of its parameters per unit of their prior; where it is little, the prior keeps back a share.
+    """
+    kept = float(np.sum(information**2 / (1 + information)) / max(float(information.sum()), 1e-300))
+    charged = (factor + 0.5 * float(np.log1p(information).sum())) / max(kept, 1e-3)
+    return degrees_of_freedom * float(np.expm1(min(2 * charged / degrees_of_freedom, 500.0)))
+
+
 @dataclass(frozen=True)
 class Shown:
     """What the views show of one form of a candidate."""
@@ -57,6 +83,7 @@ class Shown:
     sizes: Array  # (p,) plausible ones
     weight: float  # share of the candidate's prior
     degrees_of_freedom: float  # of the scatter along the columns
+    scales: tuple[float, ...] = (1.0,)  # of the plausible sizes, equally likely
 
 
 def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
@@ -66,7 +93,8 @@ def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
         white = linear.residual(form.columns)
         known = linear.satterthwaite.of(linear.in_blocks(white))
-        shown.append(Shown(tuple(p.name for p in form.free), white, form.sizes, float(weight), known))
+        names = tuple(p.name for p in form.free)
+        shown.append(Shown(names, white, form.sizes, float(weight), known, scales_of(linear)))
     mixed = linear.mixed
     return smallest_sizes(shown, tests, mixed.size - mixed.A.shape[2] - int(candidate.forms[0].keep.sum()))
 
@@ -75,7 +103,8 @@ def smallest_sizes(forms: Sequence[Shown], tests: int, rest: int) -> dict[str, f
     """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
     for form in forms:
-        least = least_noncentrality(form.white * form.sizes, form.weight, tests, rest, form.degrees_of_freedom)
+        white, known = form.white * form.sizes, form.degrees_of_freedom
+        least = least_noncentrality(white, form.weight, tests, rest, known, form.scales)
         for name, length in zip(form.names, np.linalg.norm(form.white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
             found.setdefault(name, {}).setdefault(form.names, []).append(size)

@@ -54,12 +54,13 @@ def log_posterior(base: LinearModel) -> float:
     (`Ranked`); −∞ where there is none."""
     laws = joint_laws(base)
     laws += _laws(base, None if base.pose_errors is None else base.pose_errors.of_ways)
-    return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(len(laws))
+    return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(base)
 
 
-def log_prior(laws: int) -> float:
-    """What the likeliest of so many laws is charged: its share of the prior, and that its size is not known."""
-    return float(np.log(PRIOR_UNKNOWN / max(laws, 1))) - ANY_SIZE
+def log_prior(base: LinearModel) -> float:
+    """What the likeliest law is charged: its share of the prior, which the joints divide and each kind of law has, and
+    that its size is not known."""
+    return float(np.log(PRIOR_UNKNOWN / max(base.measurement.views.joints.shape[1], 1))) - ANY_SIZE
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
