@@ -90,7 +90,7 @@ def _diagnosed(state: State) -> Diagnosis:
         within=within,
         of_field=of_field,
         smooth=smooth or (scanner_error(linear) if unknown else None),
-        budget=variance_budget(linear, [r.score for r in selection.named[:1]]),
+        budget=variance_budget(linear, [r.score for r in selection.named[:1]], said[0].process if said else None),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
 
@@ -102,7 +102,8 @@ def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:
 
 def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:
     """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
-    null = (said[0].rest or linear.null) if said else linear.scatter_only.null
+    process = said[0].process if said else None
+    null = process.fit if process else linear.null if said else linear.scatter_only.null
     rotation, translation = np.sqrt(null.variances[:2])
     return float(rotation), float(translation)
 

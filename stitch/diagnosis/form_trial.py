@@ -39,6 +39,7 @@ class FormTrial:
     values: Array | None = None  # (p,) free fit; None where the form was not worth one
     covariance: Array | None = None
     variances: Array | None = None  # (c,)
+    scale: float = 1.0  # of the plausible sizes, the likeliest
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     """
     mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
-    scales, found = scales_of(linear), [integrated.deviance]
+    scales, found, best = scales_of(linear), [integrated.deviance], 0
     if len(scales) > 1:
         # What the form explains is no scatter: beside less of it another scale may be the likeliest.
         found = [at_variances(mixed, integrated.variances, G, s * form.sizes).deviance for s in scales]
@@ -76,7 +77,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     rest = max(mixed.size - a - rank, 1)
     p = f_tail(square / max(rank, 1), max(rank, 1), rest)
     gained = 0.5 * linear.null.deviance + float(logsumexp(-0.5 * np.array(found)) - np.log(len(found)))
-    return FormTrial(gained, p, theta, covariance, integrated.variances)
+    return FormTrial(gained, p, theta, covariance, integrated.variances, scales[best])
 
 
 def residuals(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:

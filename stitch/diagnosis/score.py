@@ -42,6 +42,7 @@ class Score:
     log_bayes_factor: float  # over everything else that may be there
     values: Array  # (p,) of the best form, free fit
     covariance: Array  # (p, p); NaN where no form was worth a fit
+    scale: float = 1.0  # of the plausible sizes of its parameters, the likeliest
     beside: LinearModel | None = None  # with the pose errors that remain beside the best form, where these have a prior
 
     @property
@@ -89,7 +90,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         values, covariance = nothing, np.diag(nothing + np.nan)
     else:
         p, total, values, covariance = p if seen else 1.0, total if seen else 0.0, best.values, best.covariance
-    return Score(candidate, seen, form, p, total, values=values, covariance=covariance, beside=_beside(base, best))
+    return Score(candidate, seen, form, p, total, values, covariance, best.scale, _beside(base, best))
 
 
 def _refitted(linear: LinearModel) -> int:

@@ -1,4 +1,4 @@
-"""What the poses leave, by source: named effects, smooth errors without a name, wandering, white scatter, noise."""
+"""What the poses leave, by source: named effects, a course of time, smooth errors, wandering, white scatter, noise."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.score import Score
+from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.frames import Array
 from stitch.observations.error_model import WHITE
 from stitch.observations.flange_errors import WANDERING
@@ -40,11 +41,14 @@ class BudgetLine:
     unit: str
 
 
-def variance_budget(linear: LinearModel, named: Sequence[Score] = ()) -> tuple[BudgetLine, ...]:
+def variance_budget(
+    linear: LinearModel, named: Sequence[Score] = (), course: FittedProcess | None = None
+) -> tuple[BudgetLine, ...]:
     """Shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
 
     Args:
         named: candidates that are said to be missing: what they explain is theirs.
+        course: of the flange in time, where one is said to be there.
     """
     if linear.pose_errors is None:
         return ()
@@ -54,7 +58,11 @@ def variance_budget(linear: LinearModel, named: Sequence[Score] = ()) -> tuple[B
         squares[term.name] = _square(hand_eye, linear.reduce(response.columns) @ term.values)
     for score in named:
         squares[score.name] = _square(hand_eye, score.form.columns @ score.values)
-    for name, square in _remaining(linear, linear.pose_errors, [s.form.columns for s in named]):
+    explained = [s.form.columns for s in named]
+    if course is not None:
+        squares["one course of time"] = _square(hand_eye, course.numbers)
+        explained.append(course.columns)
+    for name, square in _remaining(linear, linear.pose_errors, explained):
         squares[name] = squares.get(name, 0.0) + square
     total, unit, n = sum(squares.values()), linear.measurement.length_unit, linear.mixed.size
     lines = [BudgetLine(s, x / max(total, 1e-300), float(np.sqrt(max(x, 0.0) / n)), unit) for s, x in squares.items()]

@@ -1,15 +1,12 @@
 """Names hold against what arms do that no library has; and what has no name is said to have none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
 from data_synth import kinematics
-from data_synth.fixtures.blade_cells import captured, measured_blade
-from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.freed_blade import freed_blade
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
@@ -21,10 +18,6 @@ from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.joint_laws import clear_laws, joint_laws
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.measurement import measurement_of
-from stitch.model.model import Model
-from stitch.observations.surfaces.free_poses import free_poses
-from stitch.observations.surfaces.surface_model import surface_model
 from stitch.statistics.variance_prior import NOISE, log_prior
 
 # Effects that move views as wholes; those of points take longer to ask for.
@@ -45,29 +38,18 @@ ASKED = (
 @pytest.fixture(scope="module")
 def cell():
     """A blade on the flange and its freed views under the true hand-eye."""
-    measured = measured_blade(4, views=14, pixels=60)
-    capture = captured(measured)
-    return (
-        measured,
-        measurement_of(session_of(measured), capture),
-        free_poses(capture, capture.poses(measured.T_mount), 1.0),
-    )
+    return freed_blade(4, 14)
 
 
 def said_of(cell, T_base_flange):
     """Verdict and linear model where the flange truly is there."""
-    measured, measurement, freed = cell
-    to_centre = frames.make(np.eye(3), -freed.overlaps.gram.centre)
-    model = measurement.capture.poses(measured.T_mount)
-    moved = frames.log(to_centre @ frames.inverse(T_base_flange) @ measured.T_mount @ frames.inverse(to_centre @ model))
-    seen = replace(freed, twists=freed.twists + moved)
-    linear = surface_model(measurement, Model(measured.T_mount), measurement.capture, seen)
+    linear = cell.seen(T_base_flange)
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
     return concluded(linear, candidates, ScatterLimit(*IMPLAUSIBLE)), linear
 
 
 def test_an_offset_of_one_joint_is_named(cell):
-    measured, *_ = cell
+    measured = cell.measured
     q = measured.plan.joints + np.array([0, 0, 0, 1.5e-3, 0, 0])
     found, _ = said_of(cell, kinematics.flange(measured.plan.arm, q))
     assert found.verdict in ("missing_effect", "cannot_tell")
@@ -76,7 +58,7 @@ def test_an_offset_of_one_joint_is_named(cell):
 
 def test_poses_that_wander_get_no_name(cell):
     """0.6 mm and 0.6 mrad that every view hands on to the next: no drift, no settling, no growth."""
-    measured, *_ = cell
+    measured = cell.measured
     for seed in range(2):
         wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([6e-4, 0.6], 3)
         found, _ = said_of(cell, measured.T_base_flange @ frames.exp(wander))
@@ -89,7 +71,7 @@ def test_poses_that_wander_get_no_name(cell):
 )
 def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law, seed, joint):
     """0.3 mrad by laws of no library, which beside all joints and links at once look like one of them."""
-    measured, *_ = cell
+    measured = cell.measured
     off = 2 * UNNAMED[law](measured.plan, np.random.default_rng(seed))
     assert np.flatnonzero(np.abs(off).sum(axis=0)) + 1 == joint
     found, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
@@ -100,7 +82,7 @@ def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law
 def test_friction_is_neither_play_nor_settling(cell):
     """A joint that follows its last reversals as dry friction on a spring does; play and settling of it keep their
     names."""
-    measured, measurement, _ = cell
+    measured, measurement = cell.measured, cell.measurement
     q, views = measured.plan.joints, measurement.views
     found, _ = said_of(
         cell,
@@ -115,7 +97,7 @@ def test_friction_is_neither_play_nor_settling(cell):
 
 def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     """Against the density of what the hand-eye leaves, by scipy: scatter, the law at many sizes, of all else little."""
-    measured, *_ = cell
+    measured = cell.measured
     off = 2 * UNNAMED["coupling"](measured.plan, np.random.default_rng(1))
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
     law, errors = joint_laws(linear)[0], linear.pose_errors
@@ -141,13 +123,13 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
 
 
 def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):
-    measured, *_ = cell
+    measured = cell.measured
     _, linear = said_of(cell, measured.T_base_flange)
     assert max(law.log_bayes_factor for law in joint_laws(linear)) < 1
 
 
 def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
-    measured, *_ = cell
+    measured = cell.measured
     q = measured.plan.joints
     off = np.zeros_like(q)
     off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
@@ -163,7 +145,7 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
 
 def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
     """Seven periods a turn: no smooth function of all joints, and told along the joint's own angle alone."""
-    measured, *_ = cell
+    measured = cell.measured
     q = measured.plan.joints
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])

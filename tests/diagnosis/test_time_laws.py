@@ -1,15 +1,12 @@
 """What a flange does in time by no law of the library: it swings, or stands off for a stretch of views."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from data_synth.fixtures.blade_cells import captured, measured_blade
-from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.freed_blade import freed_blade
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
@@ -19,10 +16,6 @@ from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_la
 from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.measurement import measurement_of
-from stitch.model.model import Model
-from stitch.observations.surfaces.free_poses import free_poses
-from stitch.observations.surfaces.surface_model import surface_model
 from stitch.statistics.variance_prior import log_prior
 
 VIEWS = 18
@@ -35,21 +28,12 @@ ASKED = ("robot_thermal_growth", "mount_drift", "mount_warmup", "fixture_drift",
 @pytest.fixture(scope="module")
 def cell():
     """A blade on the flange and its freed views under the true hand-eye."""
-    measured = measured_blade(4, views=VIEWS, pixels=60)
-    capture = captured(measured)
-    freed = free_poses(capture, capture.poses(measured.T_mount), 1.0)
-    return measured, measurement_of(session_of(measured), capture), freed
+    return freed_blade(4, VIEWS)
 
 
 def linear_of(cell, errors):
     """The views where the flange errs by so much (V, 6), in its own frame."""
-    measured, measurement, freed = cell
-    true = measured.T_base_flange @ frames.exp(errors)
-    to_centre = frames.make(np.eye(3), -freed.overlaps.gram.centre)
-    model = measurement.capture.poses(measured.T_mount)
-    moved = frames.log(to_centre @ frames.inverse(true) @ measured.T_mount @ frames.inverse(to_centre @ model))
-    seen = replace(freed, twists=freed.twists + moved)
-    return surface_model(measurement, Model(measured.T_mount), measurement.capture, seen)
+    return cell.seen(cell.measured.T_base_flange @ frames.exp(errors))
 
 
 def verdict_of(linear):
@@ -64,8 +48,8 @@ def test_a_flange_that_swings_is_said_to_with_its_period(cell, period):
     found = verdict_of(linear)
     assert found.verdict == "unknown_effect" and not found.named
     words = unnamed_errors(linear)[0].words
-    assert words.startswith("swing to and fro every ")
-    said = float(words.split()[5])
+    assert words.startswith("swing to and fro about every ")
+    said = float(words.split()[6])
     # Two frequencies that fit half a swing more or less into the session are next to each other.
     assert abs(1 / said - 1 / period) < 0.5 / (VIEWS - 1)
 

@@ -37,6 +37,11 @@ class FittedProcess:
         """That follows it, counted from 1; None: the flange, in time."""
         return self.process.joint
 
+    @property
+    def numbers(self) -> Array:
+        """(n,) of the channel that it explains."""
+        return np.asarray(self.columns @ self.fit.mean[-self.columns.shape[1] :])
+
 
 def at_likeliest_size(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
     """Its size at the null's variances.

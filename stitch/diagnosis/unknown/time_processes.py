@@ -43,7 +43,7 @@ def _swings(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
     for frequency in np.arange(_LEAST_SWINGS / span, _FASTEST, _APART / span)[:_MOST_FREQUENCIES]:
         phase = 2 * np.pi * frequency * time
         shapes = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-        yield f"swing to and fro every {_lasting(linear, 1 / frequency)}", shapes
+        yield f"swing to and fro about every {_lasting(linear, 1 / frequency)}", shapes
 
 
 def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:

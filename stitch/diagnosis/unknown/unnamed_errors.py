@@ -6,11 +6,12 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
+from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.diagnosis.unknown.time_laws import clear_time_law
 from stitch.diagnosis.unknown.unnamed_courses import clear_course
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.variance_components import VarianceFit, fit_variances
+from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
@@ -27,7 +28,7 @@ class Unnamed:
     joints: bool  # follows the pose rather than time
     of_one: bool = False  # one joint, or one course of time, stands out beside all that the prior holds
     laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
-    rest: VarianceFit | None = None  # of the views beside it, where the null counts it as scatter
+    process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
 
 
 def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
@@ -76,7 +77,7 @@ def _time_law(linear: LinearModel) -> Unnamed | None:
     law = clear_time_law(linear)
     if law is None:
         return None
-    return Unnamed(law.words, law.log_bayes_factor, joints=False, of_one=True, rest=law.fitted.fit)
+    return Unnamed(law.words, law.log_bayes_factor, joints=False, of_one=True, process=law.fitted)
 
 
 def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
@@ -93,7 +94,7 @@ def _course(linear: LinearModel) -> tuple[Unnamed, ...]:
     if course is None:
         return ()
     words = _TIME if course.joint is None else f"{_JOINTS}, joint {course.joint} above all"
-    return (Unnamed(words, course.log_bayes_factor, course.joint is not None, rest=course.fit),)
+    return (Unnamed(words, course.log_bayes_factor, course.joint is not None, process=course),)
 
 
 def _gain(linear: LinearModel, deviance: float) -> float:

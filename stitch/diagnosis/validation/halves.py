@@ -6,7 +6,6 @@ than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 
 among all the views has another size or sign in each half. All of it beside the pose errors that remain with the effect.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +65,7 @@ def halves(scored: Score) -> Halves | None:
     ways = halves_of(surfaces.capture.T_reference_mount, surfaces.freed.overlaps.gram.lever)
     for way in ways:
         bases = [explained_beside(base, surfaces, other) for other in reversed(way)]
-        gains.append(sum(_predicted(base, scored.candidate.forms, *pair) for pair in (bases, bases[::-1])))
+        gains.append(sum(_predicted(scored, base, *pair) for pair in (bases, bases[::-1])))
         a, b = (_seen(base, U, scored.form) for U in bases)
         p_values.append(_same_size(a, b, scored.form.sizes))
         shares.append(_smallest_share(a, b, scored.form.sizes))
@@ -85,16 +84,14 @@ def _seen(base: LinearModel, explained: Array, form: Form) -> _Seen:
     return _Seen(white.T @ white, white.T @ base.white_z)
 
 
-def _predicted(base: LinearModel, forms: Sequence[Form], chosen_in: Array, judged_in: Array) -> float:
-    """Log Bayes factor in one half of the form that the other half prefers, at the sizes found there."""
-    seen = [_seen(base, chosen_in, form) for form in forms]
-    best = max(range(len(forms)), key=lambda i: _gain(seen[i], np.zeros(len(forms[i].sizes)), _prior(forms[i])))
-    mean, precision = seen[best].fitted(forms[best].sizes)
+def _predicted(scored: Score, base: LinearModel, chosen_in: Array, judged_in: Array) -> float:
+    """Log Bayes factor in one half of the form that the other half prefers, at the sizes found there; before any view
+    these are of the scale that all views together prefer."""
+    forms = scored.candidate.forms
+    seen, priors = [_seen(base, chosen_in, form) for form in forms], [scored.scale * form.sizes for form in forms]
+    best = max(range(len(forms)), key=lambda i: _gain(seen[i], 0 * priors[i], np.diag(priors[i] ** -2)))
+    mean, precision = seen[best].fitted(priors[best])
     return _gain(_seen(base, judged_in, forms[best]), mean, precision)
-
-
-def _prior(form: Form) -> Array:
-    return np.diag(form.sizes**-2)
 
 
 def _gain(seen: _Seen, mean: Array, precision: Array) -> float:

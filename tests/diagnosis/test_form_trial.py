@@ -1,0 +1,52 @@
+"""How much likelier an effect makes the views: against densities by scipy, at every size that it may be of."""
+
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from data_synth.fixtures.freed_blade import freed_blade
+from stitch import frames
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.form_trial import SCALES, try_form
+from stitch.diagnosis.score import score
+from stitch.effects.contract import EFFECTS
+from stitch.statistics.variance_prior import log_prior
+
+VIEWS = 16
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """A mount that drifts by 0.1 mm and 0.1 mrad over the session, a twentieth of what would be plausible."""
+    cell = freed_blade(7, VIEWS)
+    drift = np.linspace(-1, 1, VIEWS)[:, None] * np.array([6e-5, -4e-5, 5e-5, 0.05, -0.06, 0.05])
+    return cell.seen(frames.exp(drift) @ cell.measured.T_base_flange)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(linear, scale):
+    candidate = candidate_of(linear, EFFECTS["mount_drift"])
+    form = candidate.forms[0]
+    found = try_form(linear, form, linear.null.variances, scale)
+    free = null_space(linear.mixed.A[0].T).T
+    every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
+    fixed, columns = free @ linear.mixed.fixed[0] @ free.T, free @ form.columns
+
+    def likely(variances, sizes):
+        covariance = np.tensordot(variances, every, axes=1) + fixed + (columns * sizes**2) @ columns.T
+        density = multivariate_normal(cov=covariance).logpdf(free @ linear.mixed.z[0])
+        return density - 0.5 * log_prior(np.log(variances), linear.pose_errors.scales)[0]
+
+    with_it = logsumexp([likely(found.variances, s * form.sizes) for s in SCALES]) - np.log(len(SCALES))
+    without = likely(linear.null.variances, 0 * form.sizes)
+    assert found.log_bayes_factor == pytest.approx(with_it - without, abs=0.1)
+
+
+def test_an_effect_far_below_what_is_plausible_counts(linear):
+    """At plausible size alone its six numbers would be charged more than they gain."""
+    candidate = candidate_of(linear, EFFECTS["mount_drift"])
+    found = score(linear, candidate)
+    assert found.p_value < 1e-5 and found.log_bayes_factor > 3
+    assert found.scale < 1
