@@ -41,7 +41,8 @@ def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(line
 
     with_it = logsumexp([likely(found.variances, s * form.sizes) for s in SCALES]) - np.log(len(SCALES))
     without = likely(linear.null.variances, 0 * form.sizes)
-    assert found.log_bayes_factor == pytest.approx(with_it - without, abs=0.1)
+    # The other scales count at the variances of the first search.
+    assert found.log_bayes_factor == pytest.approx(with_it - without, abs=0.25)
 
 
 def test_an_effect_far_below_what_is_plausible_counts(linear):
