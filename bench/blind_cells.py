@@ -13,6 +13,7 @@ from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.form_trial import scales_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
 from stitch.effects import EFFECTS
@@ -116,7 +117,12 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
             white = linear.residual(form.columns)
             degrees_of_freedom = linear.satterthwaite.of(linear.in_blocks(white))
             least = least_noncentrality(
-                white * form.sizes, float(weight), tests, e.size - e.A.shape[2], degrees_of_freedom
+                white * form.sizes,
+                float(weight),
+                tests,
+                e.size - e.A.shape[2],
+                degrees_of_freedom,
+                scales_of(linear),
             )
             found.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
     nearest = min(off for off, _ in found)
