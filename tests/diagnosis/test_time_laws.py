@@ -1,5 +1,7 @@
 """What a flange does in time by no law of the library: it swings, or stands off for a stretch of views."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import null_space
@@ -89,3 +91,24 @@ def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
     counted = np.log(len(time_processes(linear)))
     assert -search.fun - without > 10
     assert found.log_bayes_factor + counted == pytest.approx(-search.fun - without, abs=0.3)
+
+
+def test_a_break_of_weeks_leaves_few_courses_to_try(cell):
+    """Two minutes from view to view, and a month between the first nine and the others."""
+    linear = linear_of(cell, np.zeros((VIEWS, 6)))
+    views = linear.measurement.views
+    time = 120.0 * np.arange(VIEWS) + 30 * 86400.0 * (np.arange(VIEWS) >= 9)
+    later = replace(linear, measurement=replace(linear.measurement, views=replace(views, time=time)))
+    courses = time_processes(later)
+    stretches = [course for course in courses if course.words.startswith("are off")]
+    assert len(courses) < 300 and stretches
+    assert all(np.count_nonzero(course.process.shapes > 0.5) >= 2 for course in stretches)
+
+
+def test_stretches_are_tried_all_over_a_session_without_breaks(cell):
+    linear = linear_of(cell, np.zeros((VIEWS, 6)))
+    views = linear.measurement.views
+    even = replace(linear.measurement, views=replace(views, time=90.0 * np.arange(VIEWS)))
+    middles = [course.process.shapes[:, 0] for course in time_processes(replace(linear, measurement=even))]
+    width = [shape for shape in middles if np.isclose(shape.max(), 1, atol=0.1) and np.count_nonzero(shape > 0.5) < 5]
+    assert len(width) == len(np.arange(1.5, 17 - 0.75, 1.5))

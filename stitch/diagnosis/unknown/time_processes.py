@@ -13,10 +13,11 @@ from stitch.units import duration_text
 
 # Whole swings that a session must have seen, and per step: faster ones look like slower ones.
 _LEAST_SWINGS, _FASTEST = 2.0, 0.45
-# Frequencies nearer to each other than half a swing over the session look alike, and so many of them are tried.
-_APART, _MOST_FREQUENCIES = 0.5, 100
-# Standard deviation of the shortest stretch in steps, three views or so, and of the longest as a share of the session.
-_SHORTEST, _LONGEST = 1.5, 0.2
+# Frequencies nearer to each other than half a swing over the session look alike; of a session with long breaks there
+# would be thousands.
+_APART, _MOST_FREQUENCIES = 0.5, 150
+# Standard deviation of the shortest stretch in steps, and of the longest as a share of the session; views in each.
+_SHORTEST, _LONGEST, _LEAST_VIEWS = 1.5, 0.2, 2
 # Of a Gaussian its full width at half maximum.
 _FULL_WIDTH = 2.355
 
@@ -40,7 +41,7 @@ def time_processes(linear: LinearModel) -> list[TimeProcess]:
 def _swings(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
     """Sines of any phase: words and shapes (V, 2)."""
     span = max(float(np.ptp(time)), 1.0)
-    for frequency in np.arange(_LEAST_SWINGS / span, _FASTEST, _APART / span)[:_MOST_FREQUENCIES]:
+    for frequency in np.arange(_LEAST_SWINGS / span, _FASTEST, max(_APART / span, _FASTEST / _MOST_FREQUENCIES)):
         phase = 2 * np.pi * frequency * time
         shapes = np.stack([np.cos(phase), np.sin(phase)], axis=1)
         yield f"swing to and fro about every {_lasting(linear, 1 / frequency)}", shapes
@@ -51,10 +52,15 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
     first, last, width = float(time.min()), float(time.max()), _SHORTEST
     views = linear.measurement.views
     while width <= _LONGEST * (last - first):
-        for middle in np.arange(first + width, last - width / 2, width):
-            name = views.names[views.number[np.abs(time - middle).argmin()]]
-            words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
-            yield words, np.exp(-0.5 * ((time - middle) / width) ** 2)[:, None]
+        # A grid of this width within the session, where there are views: it may hold breaks of days.
+        steps = np.floor((time - first) / width)
+        middles = first + width * np.unique([steps, steps + 1])
+        for middle in middles[(middles > first) & (middles < last - width / 2)]:
+            away = np.abs(time - middle) / width
+            if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
+                name = views.names[views.number[away.argmin()]]
+                words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
+                yield words, np.exp(-0.5 * away**2)[:, None]
         width *= 2
 
 
