@@ -9,7 +9,7 @@ ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
 LOG_BAYES_FACTOR = 2.5
 # A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name ("strong", Kass & Raftery 1995).
 ODDS = float(np.log(20.0))
-# Prior shares: nothing is missing, one effect of the library, something without a name.
+# Prior shares: nothing is missing, one effect of the library, something without a name (of every kind by itself).
 PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
 # Probability with which the smallest detectable size is detected (custom in power analysis).
 POWER = 0.8
