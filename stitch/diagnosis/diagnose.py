@@ -20,7 +20,7 @@ from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, 
 from stitch.diagnosis.sentences import sentence_of
 from stitch.diagnosis.thresholds import PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed, unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import halves
 from stitch.diagnosis.variance_budget import variance_budget
@@ -66,7 +66,7 @@ def _diagnosed(state: State) -> Diagnosis:
     of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
-    said = unnamed if not beyond or any(u.of_one for u in unnamed) else ()
+    said = to_be_said(unnamed, beyond)
     rotation, translation = _scatter(linear, said)
     found = Diagnosis(
         verdict=selection.verdict,

@@ -90,7 +90,17 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         values, covariance = nothing, np.diag(nothing + np.nan)
     else:
         p, total, values, covariance = p if seen else 1.0, total if seen else 0.0, best.values, best.covariance
-    return Score(candidate, seen, form, p, total, values, covariance, best.scale, _beside(base, best))
+    return Score(
+        candidate,
+        seen,
+        form,
+        p,
+        total,
+        values=values,
+        covariance=covariance,
+        scale=best.scale,
+        beside=_beside(base, best),
+    )
 
 
 def _refitted(linear: LinearModel) -> int:

@@ -6,6 +6,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.smooth_sentences import beside_adequate, beside_poses, smooth_errors
 from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.diagnosis.unknown.unnamed_errors import to_be_said
 from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import amount, angle_text, length_text, rounded
 
@@ -54,8 +55,8 @@ def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str)
     start += beside_poses(d.smooth, length_unit)
     clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
     follows = f"it follows {', '.join(clear)}; " if clear else ""
-    if d.unnamed and (not d.implausible or any(u.of_one for u in d.unnamed)):
-        again = " and ".join(u.words for u in d.unnamed)
+    if said := to_be_said(d.unnamed, d.implausible):
+        again = " and ".join(u.words for u in said)
         return (
             f"{start}{follows}the errors of the poses repeat, they {again}{_repeating(d, length_unit)}, and scatter by "
             f"{scatter} otherwise{_notes(d)}{_lack(d)}."

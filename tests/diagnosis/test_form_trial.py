@@ -19,7 +19,7 @@ VIEWS = 16
 
 @pytest.fixture(scope="module")
 def linear():
-    """A mount that drifts by 0.1 mm and 0.1 mrad over the session, a twentieth of what would be plausible."""
+    """A mount that drifts by 0.1 mm and 0.1 mrad over the session, some tenths of what would be plausible."""
     cell = freed_blade(7, VIEWS)
     drift = np.linspace(-1, 1, VIEWS)[:, None] * np.array([6e-5, -4e-5, 5e-5, 0.05, -0.06, 0.05])
     return cell.seen(frames.exp(drift) @ cell.measured.T_base_flange)
@@ -45,8 +45,7 @@ def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(line
     assert found.log_bayes_factor == pytest.approx(with_it - without, abs=0.25)
 
 
-def test_an_effect_far_below_what_is_plausible_counts(linear):
-    """At plausible size alone its six numbers would be charged more than they gain."""
+def test_an_effect_below_what_is_plausible_is_found_at_its_scale(linear):
     candidate = candidate_of(linear, EFFECTS["mount_drift"])
     found = score(linear, candidate)
     assert found.p_value < 1e-5 and found.log_bayes_factor > 3

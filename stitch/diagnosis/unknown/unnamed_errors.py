@@ -31,6 +31,11 @@ class Unnamed:
     process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
 
 
+def to_be_said(unnamed: tuple[Unnamed, ...], implausible: bool) -> tuple[Unnamed, ...]:
+    """Those of them that are said: where poses scatter as no arm does, only beside a law that stands out."""
+    return unnamed if not implausible or any(u.of_one for u in unnamed) else ()
+
+
 def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     """Kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
 
