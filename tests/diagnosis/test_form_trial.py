@@ -6,13 +6,13 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from data_synth.fixtures.freed_blade import freed_blade
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.form_trial import SCALES, try_form
 from stitch.diagnosis.score import score
 from stitch.effects.contract import EFFECTS
 from stitch.statistics.variance_prior import log_prior
+from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 16
 

@@ -6,7 +6,6 @@ from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
 from data_synth import kinematics
-from data_synth.fixtures.freed_blade import freed_blade
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
@@ -19,6 +18,7 @@ from stitch.diagnosis.unknown.joint_laws import clear_laws, joint_laws
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.statistics.variance_prior import NOISE, log_prior
+from tests.diagnosis.freed_blade import freed_blade
 
 # Effects that move views as wholes; those of points take longer to ask for.
 ASKED = (

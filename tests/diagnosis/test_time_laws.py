@@ -8,7 +8,6 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from data_synth.fixtures.freed_blade import freed_blade
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
@@ -19,6 +18,7 @@ from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.statistics.variance_prior import log_prior
+from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18
 # Of the flange in its own frame, rad and mm: 0.4 mrad and 0.12 mm, where poses scatter by 20 µrad and 20 µm.
