@@ -4,21 +4,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from blind_cells import scene_of
+from drawn_overlaps import with_moved_points
 from ordinary_cells import SCATTER, Cell, cell_of
 
 from data_synth import kinematics, nature
 from data_synth.moment import Moment
 from data_synth.ordinary_arm import OrdinaryArm
-from data_synth.scanner import Cloud
 from data_synth.scene import Scene
 from data_synth.simulate import moments_of, on_rail
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.free_poses import visible_directions
-from stitch.observations.surfaces.point_gram import seen_twists, streamed
+from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
 from stitch.observations.surfaces.surface_model import Surfaces, surface_model
 from stitch.statistics.variance_components import fit_variances
 
@@ -68,8 +67,17 @@ def seen(asked: Asked, world: World, rng: np.random.Generator) -> LinearModel:
     twists = frames.log(to_centre @ true_poses(asked, world, rng) @ frames.inverse(to_centre @ model))
     values, vectors, scale = visible_directions(g)
     noise = np.sqrt(cell.noise_factor * g.variance / values) * rng.standard_normal(len(values))
-    twists = twists - twists.mean(axis=0) + _of_points(asked, world) + (scale * (vectors @ noise)).reshape(-1, 6)
-    return _with_twists(asked.linear, twists)
+    twists = twists - twists.mean(axis=0) + (scale * (vectors @ noise)).reshape(-1, 6)
+    freed = with_moved_points(replace(freed, twists=twists), cell.measurement, asked.scene, world.laws, asked.moments)
+    return _with_freed(asked.linear, freed)
+
+
+def with_overlaps_of(asked: Asked, world: World, linear: LinearModel) -> LinearModel:
+    """The same twists, but overlaps in which only the laws of this world have moved points."""
+    assert isinstance(linear.observation, Surfaces)
+    moved = with_moved_points(asked.cell.freed, asked.cell.measurement, asked.scene, world.laws, asked.moments)
+    freed = replace(linear.observation.freed, overlaps=moved.overlaps)
+    return replace(linear, observation=replace(linear.observation, freed=freed))
 
 
 def white(linear: LinearModel) -> LinearModel:
@@ -78,14 +86,12 @@ def white(linear: LinearModel) -> LinearModel:
     return replace(linear, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None)
 
 
-def _with_twists(linear: LinearModel, twists: Array) -> LinearModel:
+def _with_freed(linear: LinearModel, freed: FreePoses) -> LinearModel:
     assert isinstance(linear.observation, Surfaces)
     channel = linear.observation.channel
-    z = channel.reduction @ twists.ravel()
+    z = channel.reduction @ freed.twists.ravel()
     mixed = replace(linear.mixed, z=z[None])
-    observation = replace(
-        linear.observation, channel=replace(channel, z=z), freed=replace(linear.observation.freed, twists=twists)
-    )
+    observation = replace(linear.observation, channel=replace(channel, z=z), freed=freed)
     return replace(linear, observation=observation, mixed=mixed, null=fit_variances(mixed, both_starts=True))
 
 
@@ -105,24 +111,3 @@ def true_poses(asked: Asked, world: World, rng: np.random.Generator) -> Array:
         moved = scene.T_reference_part @ frames.inverse(laws.act("part", moment, scene.T_reference_part))
         out.append(moved @ (frames.inverse(T) if cell.measurement.eye_to_hand else T) @ mount)
     return np.array(out)
-
-
-def _of_points(asked: Asked, world: World) -> Array:
-    """(V, 6) twists of the views that the overlaps show where points are not where they were."""
-    cell, freed = asked.cell, asked.cell.freed
-    places = [place for place in ("points", "surface") if world.laws.touches(place)]
-    if not places:
-        return np.zeros((len(asked.moments), 6))
-
-    def moved(v: int, index: Indices) -> Array:
-        scan, seen = cell.measurement.capture.scans[v], cell.measurement.scan_views[v]
-        points = scan.points[index]
-        T = frames.inverse(asked.scene.T_reference_part) @ freed.poses[v]
-        at_part = frames.transform(T, points)
-        true = frames.transform(frames.inverse(T), world.laws.act("surface", asked.moments[v], at_part))
-        bright = np.full(len(points), 0.5) if seen.intensity is None else 0.5 + 0.18 * seen.intensity[index]
-        cloud = Cloud(true, bright, seen.cosine[index])
-        return np.asarray(world.laws.act("points", asked.moments[v], cloud).points - points)[None]
-
-    sums = streamed(freed, cell.measurement.capture.noise_factor, moved, lambda: np.zeros((1, 1, 1, 3)))
-    return -np.asarray(seen_twists(sums, freed)).reshape(-1, 6)

@@ -13,13 +13,13 @@ view; --fewer N takes the first N-th of the trials.
 import argparse
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
-from unknown_cells import Asked, asked, seen
+from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import PARTS
 
-from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.verdict import Selection
@@ -54,7 +54,7 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         linear = linear.scatter_only if as_before else linear
         found = concluded(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
-        then, group = named_after(linear, a.candidates, found) if part in AGAIN else ((), ())
+        then, group = named_after(a, world, linear, found) if part in AGAIN else ((), ())
         also = () if world.arm is None else OF_THE_ARM
         cell = f"{a.cell.scene} {a.cell.seed}"
         follows = unnamed_errors(linear) if found.verdict == "unknown_effect" else ()
@@ -63,17 +63,18 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
 
 
 def named_after(
-    linear: LinearModel, candidates: Sequence[Candidate], found: Selection
+    asked: Asked, world: World, linear: LinearModel, found: Selection
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is named next, and next again, when the effect that was named is added, as `stitch add` would; and the
     group that cannot be told apart, if it ends with one."""
-    then = list[str]()
+    then, candidates = list[str](), asked.candidates
     for _ in range(ASKED_AGAIN):
         if found.verdict != "missing_effect":
             break
-        form = found.named[0].score.form
-        linear = linear.conditioned_on(form.columns, form.sizes)
-        candidates = [c for c in candidates if c.name != found.named[0].name]
+        name, form = found.named[0].name, found.named[0].score.form
+        world = replace(world, laws=world.laws.without(name))
+        linear = with_overlaps_of(asked, world, linear).conditioned_on(form.columns, form.sizes)
+        candidates = [c for c in candidates if c.name != name]
         found = concluded(linear, candidates, USUAL)
         then += [found.named[0].name] if found.verdict == "missing_effect" else []
     return tuple(then), tuple(r.name for r in found.named) if found.verdict == "cannot_tell" else ()

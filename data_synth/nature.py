@@ -75,6 +75,10 @@ class Nature:
                 value = LAWS[name].act(parameters, moment, value)
         return value
 
+    def without(self, name: str) -> "Nature":
+        """All laws but one."""
+        return Nature(tuple(law for law in self.laws if law[0] != name))
+
     def touches(self, place: str) -> bool:
         """True if a law works there."""
         return any(LAWS[name].place == place for name, _ in self.laws)

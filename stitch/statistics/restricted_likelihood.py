@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from stitch.frames import Array
 from stitch.statistics.inverse import Inverse, inverted
@@ -18,6 +19,9 @@ from stitch.statistics.variance_prior import log_prior
 
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
 _IN_CACHE = 256
+# Of the mean's information, columns of unit diagonal: directions below the first share tell nothing. Where every
+# column has more than the second of its root beside those before it there are none, and no eigenvectors are sought.
+_KNOWN, _CLEARLY_KNOWN = 1e-12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,16 +119,26 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     M = white.T @ white + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    values, vectors = np.linalg.eigh(M * scale[:, None] * scale[None, :])
-    keep = values > 1e-12
-    half = (scale[:, None] * vectors[:, keep]) / np.sqrt(values[keep])
+    own, of_information = _root_of_inverse(M * scale[:, None] * scale[None, :])
+    half = scale[:, None] * own
     mean = half @ (half.T @ (white.T @ white_z))
     rest = white_z - white @ mean
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest @ rest) + float(mean @ (problem.precision * mean))
-    logdet = inverse.logdet + float(np.log(values[keep]).sum() - 2 * np.log(scale).sum()) + problem.offset
+    logdet = inverse.logdet + float(of_information - 2 * np.log(scale).sum()) + problem.offset
     value = logdet + square + log_prior(log_variances, mixed.scales)[0]
     return Likelihood(problem, log_variances, value, mean, half, inverse, white, rest)
+
+
+def _root_of_inverse(M: Array) -> tuple[Array, float]:
+    """R (k, r) with R Rᵀ = M⁻¹ for M (k, k) of unit diagonal, and log det M; both without directions that nothing
+    tells of."""
+    L, failed = dpotrf(M, lower=1, clean=1)
+    if not failed and len(L) and np.diag(L).min() > _CLEARLY_KNOWN:
+        return np.asarray(dtrtri(L, lower=1)[0].T), 2 * float(np.log(np.diag(L)).sum())
+    values, vectors = np.linalg.eigh(M)
+    keep = values > _KNOWN
+    return vectors[:, keep] / np.sqrt(values[keep]), float(np.log(values[keep]).sum())
 
 
 def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:

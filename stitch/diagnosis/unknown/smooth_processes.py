@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Indices
@@ -82,7 +83,8 @@ def _knots(views: int) -> Indices:
 
 def _shapes(alike: Array, knots: Indices, most: int) -> Array:
     """(V, R) courses with unit coefficients of which a process is made, from its covariance with the knots (V, K)."""
-    values, vectors = np.linalg.eigh(alike[knots])
-    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
+    last = len(knots) - 1
+    values, vectors = eigh(alike[knots], subset_by_index=(max(last + 1 - most, 0), last))
+    values, vectors = values[::-1], vectors[:, ::-1]
     keep = values > _LEAST * values[0]
     return np.asarray(alike @ (vectors[:, keep] / np.sqrt(values[keep])))
