@@ -93,11 +93,12 @@ def _laws(base: LinearModel, smooth: SmoothErrors | None, closely: bool = False)
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Laws of single joints of which one is there beside all that the prior holds; likeliest first, () if none is.
 
-    The best must be 20 to 1 likelier than none though it is the best of all joints'; with it come those that 20 to 1
+    Each is charged for all that are tried. The best must be 20 to 1 likelier than none; with it come those that 20 to 1
     does not tell from it, of every joint the likelier kind.
     """
-    laws = joint_laws(linear)
-    if not laws or laws[0].log_bayes_factor < ODDS + np.log(len(laws)):
+    tried = joint_laws(linear)
+    laws = [replace(law, log_bayes_factor=law.log_bayes_factor - float(np.log(len(tried)))) for law in tried]
+    if not laws or laws[0].log_bayes_factor < ODDS:
         return ()
     likely = {law.joint: law for law in reversed(laws) if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS}
     return tuple(law for law in laws if law is likely.get(law.joint))

@@ -31,6 +31,11 @@ class TimeLaw:
     log_bayes_factor: float  # over everything else at its likeliest size, charged for all courses that were tried
     fitted: FittedProcess
 
+    @property
+    def over_nothing(self) -> float:
+        """Its log Bayes factor where the question is whether there is anything: what not knowing its size costs too."""
+        return self.log_bayes_factor - _WIDTH
+
 
 def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     """The likeliest beside a model; None where poses have no prior of errors, or a session is too short for any."""
@@ -53,4 +58,4 @@ def log_posterior(linear: LinearModel) -> float:
 def clear_time_law(linear: LinearModel) -> TimeLaw | None:
     """The likeliest, where it is 20 to 1 likelier than none."""
     law = likeliest_time_law(linear)
-    return law if law is not None and law.log_bayes_factor - _WIDTH > ODDS else None
+    return law if law is not None and law.over_nothing > ODDS else None

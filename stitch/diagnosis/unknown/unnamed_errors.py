@@ -82,7 +82,7 @@ def _time_law(linear: LinearModel) -> Unnamed | None:
     law = clear_time_law(linear)
     if law is None:
         return None
-    return Unnamed(law.words, law.log_bayes_factor, joints=False, of_one=True, process=law.fitted)
+    return Unnamed(law.words, law.over_nothing, joints=False, of_one=True, process=law.fitted)
 
 
 def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
