@@ -39,6 +39,10 @@ COURSES = (
     "How far a joint is off as one joint turns, the others where these views had them; beside its mean, with two "
     "sigmas. Dashes: where views stood. Beyond them nothing is known."
 )
+TIME_COURSE = (
+    "As if the flange were off by so much in time, along its own axes, with two sigmas. Dashes: when "
+    "views were taken. The sigmas are those of a course of this very shape."
+)
 ALIASES = (
     "1 in a row: in these views the effect of the column can do the same, and only other views or an artefact "
     "tell the two apart."

@@ -21,6 +21,7 @@ from viz import captions
 from viz import diagnosis_figures as draw
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
 from viz.comparison_figures import comparison
+from viz.course_figures import joint_courses, time_course
 from viz.diagnosis_recording import add_diagnosis
 from viz.filled_templates import render, script_json
 from viz.page_parts import svg_address, svg_text
@@ -64,9 +65,11 @@ class _Picture(NamedTuple):
 def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     """File name → picture, in the order of the page."""
     predicted = "What the views show against what the first candidate effects predict"
-    curves = draw.joint_courses(found) if found.curves else None
+    curves = joint_courses(found) if found.curves else None
+    in_time = None if found.time_curve is None else time_course(found, found.time_curve, unit)
     return {
         "joint_courses": _Picture("Where in its range a joint errs without a name", curves, captions.COURSES),
+        "time_course": _Picture("When in the session poses err without a name", in_time, captions.TIME_COURSE),
         "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
         "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
         "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),

@@ -8,7 +8,8 @@ from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
 from stitch.diagnosis.unknown.joint_curves import JointCurve
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed
+from stitch.diagnosis.unknown.time_curve import TimeCurve
+from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array
@@ -58,6 +59,11 @@ class Diagnosis:
     within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
+
+    @property
+    def time_curve(self) -> TimeCurve | None:
+        """What the flange does in a course of time that is said."""
+        return next((u.curve for u in to_be_said(self.unnamed, self.implausible) if u.curve is not None), None)
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

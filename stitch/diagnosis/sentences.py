@@ -5,10 +5,9 @@ import numpy as np
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.smooth_sentences import beside_adequate, beside_poses, smooth_errors
-from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.unnamed_errors import to_be_said
 from stitch.diagnosis.variance_budget import NOT_REPEATING
-from stitch.units import amount, angle_text, length_text, rounded
+from stitch.units import amount, angle_text, length_text
 
 
 def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
@@ -119,17 +118,6 @@ def _lack(d: Diagnosis) -> str:
     if not untested:
         return ""
     return f"; without joint angles and the robot's geometry joint effects ({', '.join(untested)}) cannot be tested"
-
-
-def curve_text(curve: JointCurve) -> str:
-    """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
-    low, high = (
-        f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad at j{curve.along} = "
-        f"{np.degrees(curve.angle[i]):.0f}°"
-        for i in curve.extremes
-    )
-    of_it = f"{curve.share:.0%} of what it does without a name"
-    return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
 
 
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:

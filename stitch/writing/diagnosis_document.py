@@ -6,6 +6,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.diagnosis.unknown.time_curve import TimeCurve
 from stitch.writing.json_file import rows_of_fields
 from stitch.writing.plain_finding import plain_finding
 
@@ -29,6 +30,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         ],
         "depends_on": rows_of_fields(d.depends_on, "covariate score p_value bins mean sigma shape"),
         "joint_laws": [_curve(curve) for curve in d.curves],
+        "time_law": None if d.time_curve is None else _time_curve(d.time_curve),
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
         "notes": list(d.notes),
@@ -45,6 +47,16 @@ def _curve(curve: JointCurve) -> dict[str, Any]:
         "covariate": curve.name,
         "share": curve.share,
         "angle_deg": np.degrees(curve.angle).tolist(),
+        "error": curve.error.tolist(),
+        "sigma": curve.sigma.tolist(),
+    }
+
+
+def _time_curve(curve: TimeCurve) -> dict[str, Any]:
+    """When in the session a flange errs by no known law, in its own frame; rotation in rad, then translation."""
+    return {
+        "steps": curve.steps.tolist(),
+        "seconds_a_step": curve.seconds or None,
         "error": curve.error.tolist(),
         "sigma": curve.sigma.tolist(),
     }

@@ -48,6 +48,8 @@ def _where(found: Diagnosis) -> str:
     joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
     if joints:
         return f": {joints} errs by a law that has no name"
+    if found.time_curve is not None:
+        return ": the poses err in the course of time, by a law that has no name"
     if found.within:
         return ": the scanner or the part's shape is off, and not the poses alone"
     follows = [x.covariate for x in found.depends_on if x.p_value < _FOLLOWS]

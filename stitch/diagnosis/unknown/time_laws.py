@@ -6,14 +6,14 @@ size throughout does that. Beside such a prior they count as white scatter, and 
 adequate; or an effect that goes with time got its name from a part of a swing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.diagnosis.unknown.joint_laws import ANY_SIZE
 from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
-from stitch.diagnosis.unknown.time_processes import time_processes
+from stitch.diagnosis.unknown.time_processes import TimeProcess, time_processes, with_nearly_its_period
 from stitch.observations.linear_model import LinearModel
 
 # Of all courses those whose size is sought with all variances.
@@ -27,7 +27,7 @@ _WIDTH = 3.0
 class TimeLaw:
     """The flange errs in one course of time."""
 
-    words: str  # what they do: "they …"
+    course: TimeProcess
     log_bayes_factor: float  # over everything else at its likeliest size, charged for all courses that were tried
     fitted: FittedProcess
 
@@ -44,8 +44,8 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     courses = time_processes(linear)
     sized = [at_likeliest_size(linear, course.process) for course in courses]
     likeliest = sorted(range(len(sized)), key=lambda k: -sized[k].gain)[:_FITTED]
-    found = [(courses[k].words, fitted(linear, sized[k], len(sized))) for k in likeliest]
-    laws = [TimeLaw(words, own.log_bayes_factor, own) for words, own in found]
+    found = [(courses[k], fitted(linear, sized[k], len(sized))) for k in likeliest]
+    laws = [TimeLaw(course, own.log_bayes_factor, own) for course, own in found]
     return max(laws, key=lambda law: law.log_bayes_factor, default=None)
 
 
@@ -56,6 +56,18 @@ def log_posterior(linear: LinearModel) -> float:
 
 
 def clear_time_law(linear: LinearModel) -> TimeLaw | None:
-    """The likeliest, where it is 20 to 1 likelier than none."""
+    """The likeliest, where it is 20 to 1 likelier than none; a swing with the likeliest of all periods near its own."""
     law = likeliest_time_law(linear)
-    return law if law is not None and law.over_nothing > ODDS else None
+    if law is None or law.over_nothing <= ODDS:
+        return None
+    return law if law.course.frequency is None else _of_period(linear, law)
+
+
+def _of_period(linear: LinearModel, law: TimeLaw) -> TimeLaw:
+    """What is known of it was asked for one of the periods that are tried, and stays as it is."""
+    beside = replace(linear, null=law.fitted.fit)
+    near = [
+        (course, at_likeliest_size(beside, course.process)) for course in with_nearly_its_period(linear, law.course)
+    ]
+    course, sized = max(near, key=lambda own: own[1].gain)
+    return replace(law, course=course, fitted=fitted(linear, sized, tried=1))

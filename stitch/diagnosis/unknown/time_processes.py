@@ -1,7 +1,8 @@
 """How a flange may err in time by one shape: swings to and fro, and stretches of views after which it comes back."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -22,33 +23,59 @@ _SHORTEST, _LONGEST, _LEAST_VIEWS = 1.5, 0.2, 2
 _FULL_WIDTH = 2.355
 
 
+# Periods between those that are tried, where one of them is clear.
+_FINER = 17
+# Times (T,) in steps from view to view → shapes (T, R) of a process.
+_Course = Callable[[Array], Array]
+
+
 @dataclass(frozen=True)
 class TimeProcess:
     """A motion of the flange in one course of time."""
 
     words: str  # what they do: "they …"
     process: SmoothProcess
+    course: _Course
+    frequency: float | None = None  # 1/step, of a swing
 
 
 def time_processes(linear: LinearModel) -> list[TimeProcess]:
     """All that are tried, of any size and direction in the flange's frame."""
     time = in_steps(linear.measurement)
-    carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
-    courses = [*_swings(linear, time), *_stretches(linear, time)]
-    return [TimeProcess(words, SmoothProcess(None, carried, shapes)) for words, shapes in courses]
-
-
-def _swings(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
-    """Sines of any phase: words and shapes (V, 2)."""
     span = max(float(np.ptp(time)), 1.0)
-    for frequency in np.arange(_LEAST_SWINGS / span, _FASTEST, max(_APART / span, _FASTEST / _MOST_FREQUENCIES)):
-        phase = 2 * np.pi * frequency * time
-        shapes = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-        yield f"swing to and fro about every {_lasting(linear, 1 / frequency)}", shapes
+    apart = max(_APART / span, _FASTEST / _MOST_FREQUENCIES)
+    swings = _swings(linear, np.arange(_LEAST_SWINGS / span, _FASTEST, apart))
+    return [*swings, *_processes(linear, _stretches(linear, time))]
 
 
-def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
-    """Bumps that begin and end within the session: words and shapes (V, 1)."""
+def with_nearly_its_period(linear: LinearModel, swing: TimeProcess) -> list[TimeProcess]:
+    """A swing, and others between it and the next ones that are tried."""
+    assert swing.frequency is not None
+    reach = _APART / max(float(np.ptp(in_steps(linear.measurement))), 1.0)
+    return _swings(linear, swing.frequency + np.linspace(-reach, reach, _FINER))
+
+
+def _processes(linear: LinearModel, courses: Iterable[tuple[str, _Course]]) -> list[TimeProcess]:
+    time = in_steps(linear.measurement)
+    carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
+    return [TimeProcess(words, SmoothProcess(None, carried, course(time)), course) for words, course in courses]
+
+
+def _swings(linear: LinearModel, frequencies: Array) -> list[TimeProcess]:
+    """Sines of any phase."""
+    words = [f"swing to and fro about every {_lasting(linear, 1 / f)}" for f in frequencies]
+    found = _processes(linear, zip(words, (partial(_waves, f) for f in frequencies), strict=True))
+    return [replace(own, frequency=float(f)) for own, f in zip(found, frequencies, strict=True)]
+
+
+def _waves(frequency: float, time: Array) -> Array:
+    """(T, 2) of which all sines of a frequency (1/step) are made."""
+    phase = 2 * np.pi * frequency * time
+    return np.stack([np.cos(phase), np.sin(phase)], axis=1)
+
+
+def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, _Course]]:
+    """Bumps that begin and end within the session, in words."""
     first, last, width = float(time.min()), float(time.max()), _SHORTEST
     views = linear.measurement.views
     while width <= _LONGEST * (last - first):
@@ -60,8 +87,13 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, Array]]:
             if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
                 name = views.names[views.number[away.argmin()]]
                 words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
-                yield words, np.exp(-0.5 * away**2)[:, None]
+                yield words, partial(_bump, middle, width)
         width *= 2
+
+
+def _bump(middle: float, width: float, time: Array) -> Array:
+    """(T, 1) of unit height, with its standard deviation `width`."""
+    return np.asarray(np.exp(-0.5 * ((time - middle) / width) ** 2)[:, None])
 
 
 def _lasting(linear: LinearModel, steps: float) -> str:

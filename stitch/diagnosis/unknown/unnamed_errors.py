@@ -7,6 +7,7 @@ import numpy as np
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
 from stitch.diagnosis.unknown.process_size import FittedProcess
+from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
 from stitch.diagnosis.unknown.time_laws import clear_time_law
 from stitch.diagnosis.unknown.unnamed_courses import clear_course
 from stitch.observations.flange_errors import WANDERING
@@ -28,6 +29,7 @@ class Unnamed:
     joints: bool  # follows the pose rather than time
     of_one: bool = False  # one joint, or one course of time, stands out beside all that the prior holds
     laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
+    curve: TimeCurve | None = None  # of the flange in time, where that is clear
     process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
 
 
@@ -82,7 +84,8 @@ def _time_law(linear: LinearModel) -> Unnamed | None:
     law = clear_time_law(linear)
     if law is None:
         return None
-    return Unnamed(law.words, law.over_nothing, joints=False, of_one=True, process=law.fitted)
+    curve = time_curve(linear, law)
+    return Unnamed(law.course.words, law.over_nothing, joints=False, of_one=True, curve=curve, process=law.fitted)
 
 
 def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:

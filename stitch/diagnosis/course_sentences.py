@@ -1,0 +1,35 @@
+"""What errs by no known law in words: where in the range of a joint, when in the session."""
+
+import numpy as np
+
+from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
+from stitch.units import amount, duration_text, rounded
+
+
+def curve_text(curve: JointCurve) -> str:
+    """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
+    low, high = (
+        f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad at j{curve.along} = "
+        f"{np.degrees(curve.angle[i]):.0f}°"
+        for i in curve.extremes
+    )
+    of_it = f"{curve.share:.0%} of what it does without a name"
+    return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
+
+
+def time_curve_text(curve: TimeCurve, length_unit: str) -> str:
+    """How far a flange seems to be off in time: It is as if the flange were off by as much as 0.12 ± 0.01 mm …"""
+    there, moved, its_sigma = curve.most(MOVED)
+    then, turned, sigma = curve.most(TURNED)
+    far, turn = amount(moved, its_sigma, length_unit), amount(turned, sigma, "rad")
+    return (
+        f"It is as if the flange were off by as much as {far} {_when(curve, there)} and turned by {turn} "
+        f"{_when(curve, then)}. What goes that way in the cell (a temperature, a machine nearby) could name it, as a "
+        "column of views.csv."
+    )
+
+
+def _when(curve: TimeCurve, k: int) -> str:
+    steps = curve.steps[k] - curve.steps[0]
+    return f"{duration_text(steps * curve.seconds)} into the session" if curve.seconds else f"at view {steps:.0f}"

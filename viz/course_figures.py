@@ -1,0 +1,66 @@
+"""Figures of errors by no known law: where in the range of a joint, and when in the session."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
+from stitch.frames import Array
+from stitch.observations.flange_errors import in_steps
+from stitch.units import MICROMETRES
+from viz.colours import BLUE, GREEN, ORANGE
+from viz.drawing import above, covariate, plain
+
+_AXES = tuple(zip("xyz", (ORANGE, GREEN, BLUE), strict=True))
+_HOURS_FROM = 7200.0  # s that are better told in hours than in minutes
+
+
+def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
+    """How far joints are off by no known law as joints turn, with two sigmas."""
+    shown = found.curves[:at_most]
+    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
+    for ax, c in zip(axes, shown, strict=False):
+        angle, error, sigma = np.degrees(c.angle), 1e3 * c.error, 1e3 * c.sigma
+        ax.fill_between(angle, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
+        ax.plot(angle, error, color=BLUE)
+        stood = np.degrees(found.linear.measurement.views.joints[:, c.along - 1])
+        ax.plot(stood, np.zeros(len(stood)), "|", color="k", ms=8)
+        ax.axhline(0, color="k", lw=0.6)
+        ax.set_title(f"{c.share:.0%} of it", fontsize=9)
+        ax.set(xlabel=covariate(c.name), ylabel=f"joint {c.joint} off by (mrad)")
+    return plain(figure)
+
+
+def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
+    """How far the flange turns and moves in time along its own axes, with two sigmas."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
+    unit, of_step = _times(curve)
+    stood = in_steps(found.linear.measurement)
+    for ax, of, factor in ((axes[0], TURNED, 1e3), (axes[1], MOVED, MICROMETRES[length_unit])):
+        _banded(ax, (curve.steps - curve.steps[0]) * of_step, factor * curve.error[:, of], factor * curve.sigma[:, of])
+        ax.plot((stood - stood.min()) * of_step, np.zeros(len(stood)), "|", color="k", ms=8)
+        ax.axhline(0, color="k", lw=0.6)
+    axes[0].set_ylabel("turned (mrad)")
+    axes[1].set(ylabel="moved (µm)", xlabel=unit)
+    above(axes[0])
+    return plain(figure)
+
+
+def _times(curve: TimeCurve) -> tuple[str, float]:
+    """What the time axis counts, and how much of it a step is."""
+    if not curve.seconds:
+        return "view", 1.0
+    whole = curve.seconds * float(np.ptp(curve.steps))
+    return ("hours", curve.seconds / 3600) if whole > _HOURS_FROM else ("minutes", curve.seconds / 60)
+
+
+def _banded(ax: Axes, time: Array, error: Array, sigma: Array) -> None:
+    """One line with its band for each axis of the flange."""
+    for k, (name, colour) in enumerate(_AXES):
+        ax.fill_between(
+            time, error[:, k] - 2 * sigma[:, k], error[:, k] + 2 * sigma[:, k], color=colour, alpha=0.18, lw=0
+        )
+        ax.plot(time, error[:, k], color=colour, label=f"axis {name}")
