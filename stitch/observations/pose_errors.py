@@ -36,6 +36,9 @@ _MOST_VIEWS = 150
 _EVERY_ARM = ("joints", "torque")
 _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 _CONSTANT = ("joint_offset", "link_geometry")
+# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own within a few
+# degrees, or the way it came.
+ALL_ANGLES, OWN_ANGLE, THE_WAY = "all angles", "own angle", "the way it came"
 
 
 def usual_sizes() -> dict[str, float]:
@@ -52,11 +55,8 @@ class PoseErrors:
     components: Array  # (c, 6V, 6V) per unit of each
     scales: Array  # (c,) that their σ usually has
     effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
-    # What each joint alone may do without a name, in none of the components: by all angles, by its own within a few
-    # degrees, and by the way it came.
-    of_joints: SmoothErrors | None = None
-    of_teeth: SmoothErrors | None = None
-    of_ways: SmoothErrors | None = None
+    # What each joint alone may do without a name, by what it follows: in none of the components.
+    of_one_joint: dict[str, SmoothErrors] = field(default_factory=dict)
 
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
@@ -103,7 +103,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white(sum(m.views.count for m in measurements))
     found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
-    of_joints = of_teeth = of_ways = None
+    of_one_joint = dict[str, SmoothErrors]()
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
@@ -116,10 +116,12 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         alike = alike_in_joints(joints)
         found["smooth"] = (spread_over(links, alike), _SMOOTH)
         if constant[0].name == _CONSTANT[0]:
-            of_joints = SmoothErrors(links[:, : joints.shape[1]], alike)
-            of_teeth = replace(of_joints, alike=np.array([alike_closely(q, q) for q in joints.T]))
             came = joints - np.concatenate([m.views.previous for m in measurements])
-            of_ways = replace(of_joints, alike=np.array(list(map(alike_in_way, joints.T, came.T))))
+            closely = np.array([alike_closely(q, q) for q in joints.T])
+            in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
+            kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way}
+            offsets = links[:, : joints.shape[1]]
+            of_one_joint = {kind: SmoothErrors(offsets, own) for kind, own in kinds.items()}
     flange = flange_twists(measurements, centres)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
@@ -129,7 +131,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
-    return PoseErrors(tuple(found), components, scales, members, of_joints, of_teeth, of_ways)
+    return PoseErrors(tuple(found), components, scales, members, of_one_joint)
 
 
 def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:

@@ -78,7 +78,11 @@ class SmoothErrors:
 
     def of(self, p: int) -> Array:
         """(6V, 6V) covariance of the twists by process p alone."""
-        return spread_over(self.columns[:, [p]], self.alike if self.alike.ndim == 2 else self.alike[p])
+        return spread_over(self.columns[:, [p]], self.alike_of(p))
+
+    def alike_of(self, p: int) -> Array:
+        """(V, V) covariance of process p."""
+        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[p])
 
 
 def spread_over(columns: Array, alike: Array) -> Array:

@@ -104,7 +104,7 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     free = null_space(linear.mixed.A[0].T).T
     R, usual = free @ linear.observation.channel.reduction, errors.scales[errors.names.index("smooth")]
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
-    own, scales = R @ errors.of_joints.of(law.joint - 1) @ R.T, np.append(errors.scales, usual)
+    own, scales = R @ errors.of_one_joint[law.follows].of(law.joint - 1) @ R.T, np.append(errors.scales, usual)
 
     def likely(variances, components):
         covariance = np.tensordot(variances, components, axes=1)

@@ -9,6 +9,7 @@ from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array
 from stitch.model.term import term_of
+from stitch.observations.pose_errors import OWN_ANGLE
 from stitch.statistics.kernels import alike_closely, alike_joint_by_joint
 
 _PLACES = 25  # over the range of a joint
@@ -47,11 +48,12 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
     found = []
     for law in laws:
         joints, errors = law.model.measurement.views.joints, law.model.pose_errors
-        assert errors is not None and errors.of_joints is not None
+        assert errors is not None
         own = law.joint - 1
-        alike = alike_closely(joints[:, own], joints[:, own]) if law.closely else errors.of_joints.alike
+        closely = law.follows == OWN_ANGLE
+        alike = errors.of_one_joint[law.follows].alike_of(own)
         whole = float(_given_views(law, alike, alike)[0].var())
-        found += [_course(law, j, whole) for j in ([own] if law.closely else range(joints.shape[1]))]
+        found += [_course(law, j, whole) for j in ([own] if closely else range(joints.shape[1]))]
     return tuple(sorted((c for c in found if c.share > _WORTH), key=lambda c: -c.share))
 
 
@@ -76,7 +78,7 @@ def _course(law: JointLaw, j: int, whole: float) -> JointCurve:
 def _alike(law: JointLaw, j: int, places: Array) -> tuple[Array, Array]:
     """(G, V) and (G, G) covariances of the law at places (G,) of joint j, rad, with the views and with each other."""
     joints = law.model.measurement.views.joints
-    if law.closely:
+    if law.follows == OWN_ANGLE:
         return alike_closely(places, joints[:, j]), alike_closely(places, places)
     # Of the function averaged over where the other joints stood.
     others = np.prod(np.delete(alike_joint_by_joint(joints, joints), j, axis=2), axis=2)
@@ -93,9 +95,9 @@ def _given_views(law: JointLaw, with_views: Array, prior: Array) -> tuple[Array,
         prior: (G, G) of the places among each other.
     """
     linear, k = law.model, law.joint - 1
-    assert linear.pose_errors is not None and linear.pose_errors.of_joints is not None
+    assert linear.pose_errors is not None
     variance, usual = linear.null.variances[-1], float(term_of(linear.measurement, EFFECTS["joint_offset"]).typical[k])
-    columns = linear.pose_errors.of_joints.columns[:, k].reshape(-1, 6, 1)
+    columns = linear.pose_errors.of_one_joint[law.follows].columns[:, k].reshape(-1, 6, 1)
     seen = linear.residual(linear.reduce((columns * with_views.T[:, None, :]).reshape(-1, len(with_views))))
     mean = variance * seen.T @ linear.white_residual
     return usual * mean, usual**2 * (variance * prior - variance**2 * seen.T @ seen)

@@ -8,7 +8,9 @@ that is off by a function of its own angle that changes within a few degrees, as
 by any function of the way it came, as by friction, which is neither play nor settling.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import SmoothErrors
+from stitch.observations.pose_errors import ALL_ANGLES, OWN_ANGLE, THE_WAY
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -32,7 +34,7 @@ class JointLaw:
     """One joint that follows the joint angles by a law without a name."""
 
     joint: int  # counted from 1
-    closely: bool  # its own angle, within a few degrees; or all angles, smoothly
+    follows: str  # ALL_ANGLES, OWN_ANGLE or THE_WAY
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size
     model: LinearModel  # with the law as the last of its pose errors, all sizes fitted
 
@@ -42,18 +44,14 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `log_posterior` charges it for that.
     """
-    errors = base.pose_errors
-    if errors is None:
-        return ()
-    laws = _laws(base, errors.of_joints) + _laws(base, errors.of_teeth, closely=True)
+    laws = _laws(base, (ALL_ANGLES, OWN_ANGLE))
     return tuple(sorted(laws, key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
     """Of the likeliest law of a joint, by the angles or by the way it came, as those of effects in the same model
     (`Ranked`); −∞ where there is none."""
-    laws = joint_laws(base)
-    laws += _laws(base, None if base.pose_errors is None else base.pose_errors.of_ways)
+    laws = _laws(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
     return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(base)
 
 
@@ -66,28 +64,28 @@ def log_prior(base: LinearModel) -> float:
 def law_covariances(base: LinearModel) -> list[Array]:
     """(n, n) in the channel of the laws of all joints, by the angles, closely, and by the way they came; usual size."""
     errors = base.pose_errors
-    if errors is None or errors.of_joints is None:
+    if errors is None or not errors.of_one_joint:
         return []
     usual = float(errors.scales[errors.names.index("smooth")])
-    kinds = [smooth for smooth in (errors.of_joints, errors.of_teeth, errors.of_ways) if smooth is not None]
-    every = [smooth.of(k) for smooth in kinds for k in range(smooth.count)]
+    every = [smooth.of(k) for smooth in errors.of_one_joint.values() for k in range(smooth.count)]
     return [usual**2 * base.reduce(base.reduce(law).T) for law in every]
 
 
-def _laws(base: LinearModel, smooth: SmoothErrors | None, closely: bool = False) -> tuple[JointLaw, ...]:
+def _laws(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
+    """Of every joint, by each of these kinds that the views tell of."""
     errors = base.pose_errors
-    if errors is None or smooth is None:
-        return ()
+    if errors is None or not errors.of_one_joint:
+        return []
     scale = float(errors.scales[errors.names.index("smooth")])
     found = []
-    for k in range(smooth.count):
-        half = base.reduce(smooth.of(k))
+    for follows, k in product(kinds, range(errors.of_one_joint[ALL_ANGLES].count)):
+        half = base.reduce(errors.of_one_joint[follows].of(k))
         every = errors.beside(f"joint {k + 1}", base.reduce(half.T), scale)
         mixed = with_errors(base.mixed, every)
         fit = _fit(base, mixed, scale**2)
         model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
-        found.append(JointLaw(k + 1, closely, 0.5 * (base.null.deviance - fit.deviance), model))
-    return tuple(found)
+        found.append(JointLaw(k + 1, follows, 0.5 * (base.null.deviance - fit.deviance), model))
+    return found
 
 
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
