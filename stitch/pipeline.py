@@ -6,23 +6,21 @@ from functools import partial
 
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.initial_values import initial_terms
-from stitch.effects.in_session import known
+from stitch.diagnosis.initial_values import with_effects
 from stitch.integrity.admission import doubts
-from stitch.integrity.admitted_fit import admitted_fit
+from stitch.integrity.admitted_fit import Admitted, admitted_fit
 from stitch.integrity.arm_here import arm_here
 from stitch.integrity.refusals import mistakes_named
 from stitch.measurement.capture import capture, part_size
-from stitch.measurement.measurement import Measurement, about_part, measurement_of
+from stitch.measurement.measurement import about_part, measurement_of
 from stitch.measurement.session import Session
-from stitch.model.bound import bound, in_unit
-from stitch.model.model import Model
+from stitch.model.bound import in_unit
 from stitch.model.model_toml import ModelFile
 from stitch.runs.recorder import Recorder, Silent
-from stitch.runs.run import Run
+from stitch.runs.run import Run, StageResult
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
-from stitch.stages.course import End, collected, course_of, linearise
+from stitch.stages.course import End, collected, course_of
 from stitch.stages.fitted import BeginAt
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
@@ -81,7 +79,7 @@ def run_rig(
         clock.lap()
 
         def with_arm(arm: ModelFile | None) -> BeginAt | None:
-            return partial(_with_effects, sessions[0], effects, arm) if effects or arm else None
+            return partial(with_effects, sessions[0], effects, arm) if effects or arm else None
 
         if model:
             fit = partial(course.apply, file=model)
@@ -94,15 +92,27 @@ def run_rig(
             here = arm_here(lambda other: again(begin_at=with_arm(other)), arm, found.fitted)
             told = (here.sentence(sessions[0].length_unit),)
             end = replace(end, notes=told) if here.holds else replace(end, doubts=told)
-        runs = []
-        for i, (session, own) in enumerate(zip(found.sessions, found.admissions, strict=True)):
-            if len(session.views) < len(sessions[i].views):
-                recorders[i].start(session)
-            out, kept = ((), own.left_out) if keep else (own.left_out, ())
-            last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
-            last = replace(last, doubts=(*end.doubts, *own.doubts))
-            runs.append(collected(session, i, last, before[i], recorders[i]))
-        return runs
+        return _of_each(sessions, found, end, before, recorders, keep)
+
+
+def _of_each(
+    sessions: Sequence[Session],
+    found: Admitted,
+    end: End,
+    before: Sequence[StageResult],
+    recorders: Sequence[Recorder],
+    keep: bool,
+) -> list[Run]:
+    """One run per session, with what is said of it alone."""
+    runs = []
+    for i, (session, own) in enumerate(zip(found.sessions, found.admissions, strict=True)):
+        if len(session.views) < len(sessions[i].views):
+            recorders[i].start(session)
+        out, kept = ((), own.left_out) if keep else (own.left_out, ())
+        last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
+        last = replace(last, doubts=(*end.doubts, *own.doubts))
+        runs.append(collected(session, i, last, before[i], recorders[i]))
+    return runs
 
 
 def add(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -145,7 +155,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         recorder.start(session)
         require_effects([measurement], effects)
         new = [name for name in effects if name not in state.model.effects]
-        model = _with_further(session, new, measurement, state.model, state.gate)
+        model = with_effects(session, new, None, measurement, state.model, state.gate)
         model = model.with_terms([term for term in model.terms if term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
         begun = Coarse(state.T_mount_coarse, gate, "of the first run", ())
@@ -164,21 +174,3 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
             doubts=doubts(session, own, fitted.correction, 0),
         )
         return collected(session, 0, end, before, recorder)
-
-
-def _with_effects(
-    session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
-) -> Model:
-    """The model with another run's arm, if any, and with further effects."""
-    if arm:
-        known_arm = bound(arm, measurement)
-        model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
-    return _with_further(session, effects, measurement, model, gate)
-
-
-def _with_further(
-    session: Session, effects: Sequence[str], measurement: Measurement, model: Model, gate: float
-) -> Model:
-    """The model with further effects, begun where the views suggest them."""
-    linear = partial(linearise, session, measurement, model, gate)
-    return model.with_terms([*model.terms, *initial_terms(measurement, [known(name) for name in effects], linear)])

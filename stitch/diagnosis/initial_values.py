@@ -1,16 +1,39 @@
 """Values to begin a fit with: those that the views suggest at first sight."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import score
 from stitch.effects.contract import Effect
+from stitch.effects.in_session import known
 from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.bound import bound
+from stitch.model.model import Model
+from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term, term_of
 from stitch.observations.linear_model import LinearModel
+from stitch.stages.course import linearise
 
 
-def initial_terms(
+def with_effects(
+    session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
+) -> Model:
+    """The model with another run's arm in place of its effects, if any, and with further effects by name.
+
+    Args:
+        gate: largest distance between partners where the session has scans, length_unit.
+    """
+    if arm:
+        known_arm = bound(arm, measurement)
+        model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
+    linear = partial(linearise, session, measurement, model, gate)
+    return model.with_terms([*model.terms, *_initial_terms(measurement, [known(name) for name in effects], linear)])
+
+
+def _initial_terms(
     measurement: Measurement, effects: Sequence[Effect], linear_now: Callable[[], LinearModel]
 ) -> list[Term]:
     """A term for each effect; events and time constants at the value that explains most.
