@@ -26,9 +26,10 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
     """
     lines: list[str] = []
     result: Run | None = None
+    found: Diagnosis | None = None
     given = set(state.model.effects)
-    found = diagnose(state)
     for _ in range(at_most):
+        found = diagnose(state)
         lines += [*_told(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
         if found.verdict != "missing_effect":
             break
@@ -37,16 +38,16 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
             lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
             break
         result, state = tried, state_of(tried)
-        # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
         lines.append(f"Added {found.effects[0]}. With it:")
-        del found
-        found = diagnose(state)
+        # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
+        found = None
     else:
         lines.append(f"Stopped after {at_most} effects; run it again to go on.")
-    if result is None or state.session.has_clouds or state.measurement.views.count < MANY_VIEWS:
-        return result, lines, found
-    kept, dropped = _without_idle(result, given)
-    return (result, lines, found) if not dropped else (kept, [*lines, *dropped], diagnose(state_of(kept)))
+    if result is not None and not state.session.has_clouds and state.measurement.views.count >= MANY_VIEWS:
+        result, dropped = _without_idle(result, given)
+        lines += dropped
+        state, found = (state_of(result), None) if dropped else (state, found)
+    return result, lines, diagnose(state) if found is None else found
 
 
 def suggest_group(state: State) -> tuple[Run | None, list[str], Diagnosis]:
