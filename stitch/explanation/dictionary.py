@@ -1,5 +1,6 @@
 """Columns that a formula may be made of: where in the chain something is displaced, times what it may follow."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -45,7 +46,7 @@ def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ing
     """
     joints = linear.measurement.views.joints.shape[1]
     of_arm = [Ingredient("robot", i, q) for i in range(joints) for q in _for_joint(i, found)]
-    elsewhere = [q for q in found if q.kind in ("time", "covariate", "torque")]
+    elsewhere = [q for q in found if q.kind in ("time", "course", "covariate", "torque")]
     places = [Ingredient(p, axis, q) for p in ("mount", "part") for axis, q in product(range(6), elsewhere)]
     ingredients = of_arm + places
     if not ingredients:
@@ -58,6 +59,15 @@ def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ing
         _modulated(bases[i.place][:, i.index], i.quantity.values, rows) / _scale(i.quantity) for i in ingredients
     ]
     return ingredients, np.column_stack(columns)
+
+
+def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
+    """Numbers of the ingredients that come together: sine and cosine of one wave, all six axes of what moves."""
+    found = defaultdict[tuple[str | int, ...], list[int]](list)
+    for k, i in enumerate(ingredients):
+        follows = i.quantity.wave or i.quantity.text
+        found[(i.place, follows, i.index) if i.place == "robot" else (i.place, follows)].append(k)
+    return [tuple(own) for own in found.values()]
 
 
 def _for_joint(i: int, found: Sequence[Quantity]) -> list[Quantity]:

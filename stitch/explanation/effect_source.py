@@ -6,7 +6,6 @@ from stitch.explanation.dictionary import Ingredient
 from stitch.units import METRES
 
 _LIMIT = 10.0  # sizes: beyond that nobody would believe it
-_NAMES = "abcd"
 
 
 def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
@@ -20,6 +19,11 @@ def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float
     )
 
 
+def _names(count: int) -> list[str]:
+    """Of the sizes: a, b, … or a1, a2, … where there are more than four."""
+    return list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
+
+
 def effect_source(
     name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], length_unit: str, origin: str
 ) -> str:
@@ -31,7 +35,7 @@ def effect_source(
     """
     place = ingredients[0].place
     to_mm = METRES[length_unit] / METRES["mm"]
-    letters = _NAMES[: len(ingredients)]
+    letters = _names(len(ingredients))
     specs = ", ".join(
         f'{a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g})'
         for a, i, size in (

@@ -12,7 +12,7 @@ from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
-from stitch.explanation.dictionary import coefficient, dictionary
+from stitch.explanation.dictionary import addends, coefficient, dictionary
 from stitch.explanation.effect_source import effect_source, formula_text
 from stitch.explanation.quantities import quantities
 from stitch.explanation.search import Chosen, fitted, search
@@ -46,7 +46,8 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
     with library_threads_off():
         ingredients, responses = dictionary(linear, quantities(linear.measurement.views))
         slow = np.array([i.quantity.slow for i in ingredients], bool)
-        chosen = search(linear, responses, slow) if ingredients else None
+        at = [i.place for i in ingredients]
+        chosen = search(linear, responses, addends(ingredients), at, slow) if ingredients else None
         if chosen is None:
             return Explanation(False, "Nothing that the cell knows of its views explains what is left.")
         own = [ingredients[k] for k in chosen.numbers]

@@ -8,13 +8,18 @@ import numpy as np
 from stitch.frames import Array
 from stitch.measurement.views import Views
 
-# Time constants of warming up that are tried, h; cycles in the time of the session; instants of a step, as its share.
+# Time constants of warming up that are tried, h; instants of a step, as a share of the session; swings in it, half a
+# swing apart, at the most and from view to view, and their phases; stretches as wide (standard deviation) as these
+# shares of it.
 _WARMING = (0.25, 1.0)
-_CYCLES = (1, 2, 3, 4, 6, 8)
 _STEPS = (0.2, 0.35, 0.5, 0.65, 0.8)
-# Periods a turn of gears beyond two; places in a joint's range where a tooth may be damaged, and how wide that is, rad.
+_SWINGS, _FASTEST, _PHASES = 20, 0.45, (0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5)
+_STRETCHES = (0.06, 0.12, 0.2)
+# Periods a turn of gears beyond two; how wide a damaged tooth is, rad, and how far apart its places are tried.
 _PERIODS = (3, 4, 5, 6, 7, 8)
-_PLACES, _WIDTH = 12, 0.2
+_WIDTH, _APART = 0.2, 0.15
+# Play of a gear with friction, as a share of the range that the joint was driven over.
+_PLAYS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
 _STILL = 1e-9
 
 
@@ -25,14 +30,15 @@ class Quantity:
     text: str  # for people
     code: str  # of numpy, of `views`
     unit: str  # "" without one
-    kind: str  # angle, gear, direction, move, torque, speed, time or covariate
+    kind: str  # angle, gear, direction, move, torque, speed, time, course or covariate
     joint: int | None  # that it belongs to, counted from 0
     values: Array  # (V,)
+    wave: str = ""  # of which it is the sine or the cosine: of any phase it takes both
 
     @property
     def slow(self) -> bool:
         """True if it follows time, or something that may move with it."""
-        return any(kind in self.kind.split("·") for kind in ("time", "covariate"))
+        return any(kind in self.kind.split("·") for kind in ("time", "course", "covariate"))
 
     def times(self, other: "Quantity") -> "Quantity":
         """The product; it belongs to no joint."""
@@ -56,14 +62,17 @@ def _of_joints(views: Views) -> Iterator[Quantity]:
         q, at = views.joints[:, k], f"views.joints[:, {k}]"
         for periods in (1, 2):
             angle, inner = (f"q{k + 1}", at) if periods == 1 else (f"2q{k + 1}", f"2 * {at}")
-            yield Quantity(f"sin {angle}", f"np.sin({inner})", "", "angle", k, np.sin(periods * q))
-            yield Quantity(f"cos {angle}", f"np.cos({inner})", "", "angle", k, np.cos(periods * q))
+            yield from _wave(angle, inner, "angle", k, periods * q)
         yield from _of_gear(views, k)
         yield Quantity(
             f"approach{k + 1}", f"views.approach[:, {k}]", "", "direction", k, views.approach[:, k].astype(float)
         )
         moved = q - views.previous[:, k]
         yield Quantity(f"move{k + 1}", f"({at} - views.previous[:, {k}])", "", "move", k, moved)
+        for share in _PLAYS:
+            play = float(f"{share * np.ptp(views.path[:, k]):.3g}")
+            text = f"stays ({np.degrees(play):.2g}° of play) behind q{k + 1}"
+            yield Quantity(text, f"views.behind({k}, {play:g})", "", "move", k, views.behind(k, play))
         if views.velocity is not None:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
@@ -77,9 +86,8 @@ def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
     """Higher harmonics of a joint's angle, and bumps at places of its range."""
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
     for n in _PERIODS:
-        yield Quantity(f"sin {n}q{k + 1}", f"np.sin({n} * {at})", "", "gear", k, np.sin(n * q))
-        yield Quantity(f"cos {n}q{k + 1}", f"np.cos({n} * {at})", "", "gear", k, np.cos(n * q))
-    for middle in np.linspace(q.min(), q.max(), _PLACES).round(3):
+        yield from _wave(f"{n}q{k + 1}", f"{n} * {at}", "gear", k, n * q)
+    for middle in np.arange(q.min(), q.max() + _APART, _APART).round(3):
         text = f"bump of q{k + 1} at {np.degrees(middle):.0f}°"
         code = f"np.exp(-0.5 * (({at} - {middle:g}) / {_WIDTH}) ** 2)"
         yield Quantity(text, code, "", "gear", k, np.exp(-0.5 * ((q - middle) / _WIDTH) ** 2))
@@ -93,12 +101,28 @@ def _of_time(views: Views) -> Iterator[Quantity]:
         text, code = f"(1 − exp(−t/{hours:g} h))", f"(1 - np.exp(-views.hours / {hours:g}))"
         yield Quantity(text, code, "", "time", None, 1 - np.exp(-views.hours / hours))
     whole = float(views.hours[-1]) or 1.0
-    for n in _CYCLES:
-        code = f"2 * np.pi * {n} * views.hours / {whole:.6g}"
-        turn = 2 * np.pi * n * views.hours / float(f"{whole:.6g}")
-        yield Quantity(f"sin(2π t/{whole / n:.2g} h)", f"np.sin({code})", "", "time", None, np.sin(turn))
-        yield Quantity(f"cos(2π t/{whole / n:.2g} h)", f"np.cos({code})", "", "time", None, np.cos(turn))
+    most = min(_SWINGS, _FASTEST * (views.count - 1))
+    for swings in np.arange(1.0, most, 0.5):
+        period = float(f"{whole / swings:.6g}")
+        code = f"2 * np.pi * views.hours / {period:g}"
+        for phase in _PHASES:
+            text = f"cos(2π t/{period:.2g} h − {phase:g}°)"
+            late = float(f"{np.radians(phase):.6g}")
+            swing = np.cos(2 * np.pi * views.hours / period - late)
+            yield Quantity(text, f"np.cos({code} - {late:g})", "", "course", None, swing)
+    for width in _STRETCHES:
+        for middle in np.arange(width, 1.0, width):
+            at, wide = float(f"{middle * whole:.4g}"), float(f"{width * whole:.4g}")
+            code = f"np.exp(-0.5 * ((views.hours - {at:g}) / {wide:g}) ** 2)"
+            bump = np.exp(-0.5 * ((views.hours - at) / wide) ** 2)
+            yield Quantity(f"bump of t at {at:.2g} h, {wide:.2g} h wide", code, "", "course", None, bump)
     for share in _STEPS:
         since = float(f"{share * whole:.4g}")
         text, code = f"(t > {since:.2g} h)", f"(views.hours > {since:g})"
         yield Quantity(text, code, "", "time", None, (views.hours > since).astype(float))
+
+
+def _wave(of: str, code: str, kind: str, joint: int, angle: Array) -> Iterator[Quantity]:
+    """Sine and cosine of an angle (V,)."""
+    yield Quantity(f"sin {of}", f"np.sin({code})", "", kind, joint, np.sin(angle), wave=of)
+    yield Quantity(f"cos {of}", f"np.cos({code})", "", kind, joint, np.cos(angle), wave=of)

@@ -5,8 +5,9 @@ explains more than the best of all of them would by chance. The other half, whic
 same sum of ingredients is wanted there: a test beside everything else that poses may err by, and how much likelier its
 numbers are with the sizes that the first half found. Halves change roles, and all ways are counted.
 
-What follows time, or what moves with time, is asked for in the first and the second half of the session: errors that
-wander look the same in views that are neighbours in time. What follows the arm is asked for in views taken alternately.
+What follows the arm is asked for in views taken alternately. What follows time, or what moves with time, in the first
+and the second half of the session too, and always beside errors that wander as much as all views show: these look the
+same in views that are neighbours in time.
 """
 
 from collections.abc import Sequence
@@ -16,17 +17,18 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.validation.halves import explained_beside
+from stitch.explanation.pursuit import sums_of
 from stitch.frames import Array, Indices, Mask
+from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.statistics.least_squares import column_space
-from stitch.statistics.tails import chi2_limit, chi2_tail
+from stitch.statistics.tails import chi2_tail
 from stitch.statistics.variance_components import at_variances
+from stitch.statistics.variance_prior import NOISE
 
-_AT_MOST = 4  # addends
-_CHANCE = 0.05  # that an addend which is none is added, all of them counted
+_FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of a half that are tested in the other
 _REJECTED = 0.01
-_WAYS = 4  # two dictionaries, two directions
 _BLOCKS = 16  # of neighbours in time, for views that share a wandering error which no prior knows
 # A prior of this many sizes as they come out keeps what a half does not see finite.
 _WIDE = 10.0
@@ -47,20 +49,28 @@ class Chosen:
         return self.p_value < _REJECTED and self.log_bayes_factor > ODDS
 
 
-def search(linear: LinearModel, responses: Array, slow: Mask) -> Chosen | None:
-    """The sum of columns (·, M) that explains most and stands its test best; None where no half suggests any.
+def search(
+    linear: LinearModel, responses: Array, addends: Sequence[tuple[int, ...]], places: Sequence[str], slow: Mask
+) -> Chosen | None:
+    """The sum of addends at one place that explains most and stands its test best; None where no half suggests any.
 
     Args:
+        responses: (·, M) of the observation to the ingredients.
+        addends: numbers of the ingredients that come together, all of one place, all slow or none.
+        places: of the M ingredients.
         slow: (M,) what follows time or what moves with it: views near in time share it, and wandering errors too.
     """
     columns, found = linear.reduce(responses), list[Chosen]()
-    for among, halves in ((~slow, _alternate(linear)), (slow, np.array_split(np.arange(_views(linear)), 2))):
-        at = np.flatnonzero(among)
-        for way in (halves, halves[::-1]):
-            own = _one_way(linear, columns[:, at], bool(slow[at].any()), *way) if len(at) else None
-            if own is not None:
-                found.append(replace(own, numbers=tuple(int(at[k]) for k in own.numbers)))
-    return min(found, key=lambda c: (not c.holds, c.p_value)) if found else None
+    alternate, early_late = _alternate(linear), np.array_split(np.arange(_views(linear)), 2)
+    ways = 0
+    for place, among in sorted({(places[own[0]], bool(slow[own[0]])) for own in addends}):
+        some = [own for own in addends if (places[own[0]], bool(slow[own[0]])) == (place, among)]
+        for halves in (alternate, early_late) if among else (alternate,):
+            for way in (halves, halves[::-1]):
+                found += _one_way(linear, columns, some, among, way[0], way[1])
+                ways += 1
+    found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
+    return max(found, key=lambda c: (c.holds, c.log_bayes_factor)) if found else None
 
 
 def _views(linear: LinearModel) -> int:
@@ -74,29 +84,66 @@ def _alternate(linear: LinearModel) -> list[Indices]:
     return [np.flatnonzero(block % 2 == k) for k in (0, 1)]
 
 
-def _one_way(linear: LinearModel, columns: Array, slow: bool, chosen_in: Indices, tested_in: Indices) -> Chosen | None:
-    plain = linear.scatter_only
-    seen, z = _of_half(plain, columns, chosen_in, tested_in)
-    numbers = _pursued(seen, z)
-    if not numbers:
-        return None
+def _one_way(
+    linear: LinearModel,
+    columns: Array,
+    addends: Sequence[tuple[int, ...]],
+    slow: bool,
+    chosen_in: Indices,
+    tested_in: Indices,
+) -> list[Chosen]:
+    """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
+    every = np.concatenate([np.array(own, np.int64) for own in addends])
+    seen, z, free = _of_half(linear.scatter_only, columns[:, every], chosen_in, tested_in)
+    ends = np.cumsum([len(own) for own in addends])
+    at_once = [tuple(range(end - len(own), end)) for own, end in zip(addends, ends, strict=True)]
+    suggested = sorted(sums_of(seen, z, free, at_once, _FIRST))
+    own_numbers = [tuple(int(k) for k in every[list(sum_)]) for sum_ in suggested]
+    # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
+    halves = [_of_half(linear, columns[:, every], *way)[:2] for way in ((chosen_in, tested_in), (tested_in, chosen_in))]
+    worth = [_judged(sum_, *((X[:, sum_], y) for X, y in halves)).log_bayes_factor for sum_ in suggested]
+    likely = [own_numbers[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
+    tested = [_tested(linear, columns, numbers, slow, chosen_in, tested_in) for numbers in likely]
+    return [replace(c, p_value=min(1.0, len(suggested) * c.p_value)) for c in tested]
+
+
+def _tested(
+    linear: LinearModel, columns: Array, numbers: tuple[int, ...], slow: bool, chosen_in: Indices, tested_in: Indices
+) -> Chosen:
+    """The columns of a sum in the half that took no part in choosing them, under the scatter beside it."""
     own = columns[:, numbers]
-    sizes = _WIDE * np.abs(np.linalg.lstsq(seen[:, numbers], z, rcond=None)[0]) + _FAINT
-    base = linear
-    if not slow:
-        # Under the scatter that is left beside it: what it explains is no scatter. What wanders in time stays.
-        beside = linear.conditioned_on(own, sizes)
-        base = replace(linear, null=at_variances(linear.mixed, beside.null.variances))
-    (A, y), (B, w) = _of_half(base, own, chosen_in, tested_in), _of_half(base, own, tested_in, chosen_in)
+    seen, z, _ = _of_half(linear.scatter_only, own, chosen_in, tested_in)
+    sizes = _WIDE * np.abs(np.linalg.lstsq(seen, z, rcond=None)[0]) + _FAINT
+    base = _scatter_beside(linear, own, sizes, slow)
+    ways = (chosen_in, tested_in), (tested_in, chosen_in)
+    return _judged(numbers, *(_of_half(base, own, *way)[:2] for way in ways))
+
+
+def _judged(numbers: tuple[int, ...], chosen: tuple[Array, Array], tested: tuple[Array, Array]) -> Chosen:
+    """A sum by its columns and the numbers of either half, in units of the scatter."""
+    (A, y), (B, w) = chosen, tested
     told = np.linalg.pinv(B.T @ B, rcond=1e-12, hermitian=True)
     square = float((B.T @ w) @ told @ (B.T @ w))
     mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
+    sizes = _WIDE * np.abs(mean) + _FAINT
     factor = _predicted(A.T @ A + np.diag(sizes**-2.0), mean, B, w)
-    return Chosen(tuple(numbers), min(1.0, _WAYS * chi2_tail(square, len(numbers))), factor)
+    return Chosen(numbers, chi2_tail(square, len(numbers)), factor)
 
 
-def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> tuple[Array, Array]:
-    """Whitened columns (n, k) and numbers (n,) of some views, without what the model explains there."""
+def _scatter_beside(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
+    """Under the scatter that is left beside a sum: what it explains is no scatter. What wanders in time stays."""
+    if slow and linear.pose_errors is None:
+        return linear
+    variances = linear.conditioned_on(own, sizes).null.variances.copy()
+    if slow and linear.pose_errors is not None:
+        wanders = NOISE + 1 + np.flatnonzero(np.isin(linear.pose_errors.names, list(WANDERING)))
+        variances[wanders] = np.maximum(variances, linear.null.variances)[wanders]
+    return replace(linear, null=at_variances(linear.mixed, variances))
+
+
+def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> tuple[Array, Array, int]:
+    """Whitened columns (n, k) and numbers (n,) of some views, without what the model explains there, and how many of
+    the numbers are free."""
     white, z = base.whiten(columns), base.white_z
     if isinstance(base.observation, Surfaces):
         U = explained_beside(base, base.observation, out)
@@ -104,29 +151,7 @@ def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> 
         rows = base.mixed.z.shape[1]
         at = (keep[:, None] * rows + np.arange(rows)).ravel()
         U, white, z = column_space(base.white_design[at]), white[at], z[at]
-    return white - U @ (U.T @ white), z - U @ (U.T @ z)
-
-
-def _pursued(seen: Array, z: Array) -> list[int]:
-    """Columns whose sum explains z, each after the first beyond what the best of all would by chance."""
-    strength = np.linalg.norm(seen, axis=0)
-    unit = seen / np.maximum(strength, 1e-300)
-    # What lies almost wholly in what the model explains would be blown up.
-    usable = strength > _FAINT * strength.max(initial=0.0)
-    limit = chi2_limit(_CHANCE / max(int(usable.sum()), 1), 1)
-    chosen, rest = list[int](), z
-    while len(chosen) < _AT_MOST:
-        left = np.linalg.norm(unit, axis=0)
-        gains = np.where(usable & (left > 0.1), (unit.T @ rest / np.maximum(left, 1e-300)) ** 2, 0.0)
-        best = int(gains.argmax())
-        # The first one is for the other half to judge.
-        if gains[best] < (limit if chosen else _FAINT):
-            break
-        chosen.append(best)
-        along = unit[:, best] / left[best]
-        unit = unit - np.outer(along, along @ unit)
-        rest = rest - along * (along @ rest)
-    return chosen
+    return white - U @ (U.T @ white), z - U @ (U.T @ z), len(z) - U.shape[1]
 
 
 def _predicted(precision: Array, mean: Array, B: Array, w: Array) -> float:

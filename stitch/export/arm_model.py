@@ -104,6 +104,7 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
         standoff=1.0,
         first={},
         number=np.arange(count),
+        path=joints,
     )
     return _bare(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
 

@@ -26,7 +26,8 @@ class Views:
     standoff: float
     first: dict[str, float]  # the covariates at the session's first view
     number: Indices  # (V,) of the view in its session, from 0
-    names: tuple[str, ...] = ()  # of all views of the session, by their number
+    path: Array  # (W, n) joints of all views of the session, by their number
+    names: tuple[str, ...] = ()  # of those
 
     def sag(self, c: Array) -> Array:
         """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
@@ -38,6 +39,18 @@ class Views:
     def since_first(self, covariate: str) -> Array:
         """(V,) a covariate less its value at the first view."""
         return np.asarray(self.covariates[covariate] - self.first[covariate])
+
+    def behind(self, joint: int, play: float) -> Array:
+        """(V,) rad by which what a joint drives stays behind it where friction holds it within ± `play`.
+
+        It follows the last reversals and not only the last direction: the play operator (Krejčí 1996, "Hysteresis,
+        Convexity and Dissipation in Hyperbolic Equations", ch. II), at rest in the first view of the session.
+        """
+        states = np.append(np.nan, self.path[:, joint])  # before the first view, and after each
+        for v, at in enumerate(self.path[1:, joint], start=2):
+            states[v] = min(max(states[v - 1], at - play), at + play)
+        q, before = self.joints[:, joint], states[self.number]
+        return np.where(self.number > 0, np.clip(before, q - play, q + play) - q, 0.0)
 
     @property
     def hours(self) -> Array:
@@ -137,6 +150,7 @@ def views_of(session: Session) -> Views:
         standoff=standoff,
         first=first,
         number=np.arange(count),
+        path=joints,
         names=tuple(session.names),
     )
 
