@@ -44,7 +44,8 @@ def true_column(a: Asked, world: World) -> Array:
 
 
 def share_left(linear: LinearModel, column: Array) -> float:
-    """Mean square on views left out, of the present model's, with one column of free size."""
+    """Mean square on views left out, of the present model's, with one column of free size; in the fit that `add` makes,
+    under the scatter of `linear`, it is what `explain` says of its formula."""
     trial, present = linear.trial(np.column_stack([linear.design, column])), linear.present
     left, before = 0.0, 0.0
     for fold in linear.observation.folds():
@@ -83,7 +84,7 @@ def main() -> None:
                 found = explain(linear)
                 good, truth = False, float("nan")
                 if part == "unnamed":
-                    truth = share_left(linear, true_column(a, world))
+                    truth = share_left(linear.scatter_only, true_column(a, world))
                     good = found.found and found.heldout_share <= _NEAR**2 * truth
                 name = hidden[0] if part == "unnamed" else part
                 rows[name].append((found.found, good))

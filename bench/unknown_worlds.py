@@ -26,7 +26,9 @@ def memory(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
 def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """A law outside every dictionary; couplings as often as three others."""
     law = _in_turn(["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")], k)
-    error = UNNAMED[law](a.cell.plan, rng)
+    time = np.array([moment.time for moment in a.moments])
+    own = (time / np.median(np.diff(time)),) if law in IN_TIME else ()
+    error = UNNAMED[law](a.cell.plan, rng, *own)
     of_flange = error.shape[1] == 6 and law in IN_TIME
     world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
     return world, (law,) if of_flange else (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))

@@ -53,21 +53,26 @@ def ripple(plan: Plan, rng: np.random.Generator) -> Array:
     return _of_joint(plan, i, _SIZE * _RMS_OF_WAVE * np.sin(7 * plan.joints[:, i] + phase))
 
 
-def thermal_cycle(plan: Plan, rng: np.random.Generator) -> Array:
-    """A cabinet that cools in turns: the flange swings to and fro every four to nine views."""
-    views = len(plan.joints)
-    swing = np.sin(2 * np.pi * np.arange(views) / rng.uniform(4, 9) + rng.uniform(0, 2 * np.pi))
+def thermal_cycle(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
+    """A cabinet that cools in turns: the flange swings to and fro every four to nine views.
+
+    Args:
+        time: (V,) of the views, in usual steps from one to the next; their numbers where it is not given.
+    """
+    steps = np.arange(len(plan.joints)) if time is None else time
+    swing = np.sin(2 * np.pi * steps / rng.uniform(4, 9) + rng.uniform(0, 2 * np.pi))
     return _RMS_OF_WAVE * swing[:, None] * _direction(rng)
 
 
-def gust(plan: Plan, rng: np.random.Generator) -> Array:
-    """For a stretch of views the arm stands in a draught, and comes back."""
-    views = len(plan.joints)
-    middle, width = rng.uniform(0.25, 0.75) * views, rng.uniform(0.08, 0.16) * views
-    return 2 * np.exp(-0.5 * ((np.arange(views) - middle) / width) ** 2)[:, None] * _direction(rng)
+def gust(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
+    """For a stretch of views the arm stands in a draught, and comes back; `time` as above."""
+    steps = np.arange(len(plan.joints)) if time is None else time
+    whole = float(np.ptp(steps)) + 1.0
+    middle, width = rng.uniform(0.25, 0.75) * whole, rng.uniform(0.08, 0.16) * whole
+    return 2 * np.exp(-0.5 * ((steps - middle) / width) ** 2)[:, None] * _direction(rng)
 
 
-UNNAMED: dict[str, Callable[[Plan, np.random.Generator], Array]] = {
+UNNAMED: dict[str, Callable[..., Array]] = {
     law.__name__: law for law in (coupling, dress_pack, spall, hysteresis, ripple, thermal_cycle, gust)
 }
 IN_TIME = ("thermal_cycle", "gust")  # the others follow the joints

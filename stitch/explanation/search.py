@@ -42,6 +42,7 @@ class Chosen:
     numbers: tuple[int, ...]
     p_value: float  # in the half that took no part in choosing, all ways counted
     log_bayes_factor: float  # of that half's numbers with the sizes of the other over none
+    both: float  # the same, with that of the other half's numbers with the sizes of this one
 
     @property
     def holds(self) -> bool:
@@ -70,7 +71,8 @@ def search(
                 found += _one_way(linear, columns, some, among, way[0], way[1])
                 ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
-    return max(found, key=lambda c: (c.holds, c.log_bayes_factor)) if found else None
+    # Of sums that hold the one that is likeliest in both halves: each was chosen in one of them.
+    return max(found, key=lambda c: (c.holds, c.both)) if found else None
 
 
 def _views(linear: LinearModel) -> int:
@@ -124,10 +126,8 @@ def _judged(numbers: tuple[int, ...], chosen: tuple[Array, Array], tested: tuple
     (A, y), (B, w) = chosen, tested
     told = np.linalg.pinv(B.T @ B, rcond=1e-12, hermitian=True)
     square = float((B.T @ w) @ told @ (B.T @ w))
-    mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
-    sizes = _WIDE * np.abs(mean) + _FAINT
-    factor = _predicted(A.T @ A + np.diag(sizes**-2.0), mean, B, w)
-    return Chosen(numbers, chi2_tail(square, len(numbers)), factor)
+    factor = _predicted(A, y, B, w)
+    return Chosen(numbers, chi2_tail(square, len(numbers)), factor, factor + _predicted(B, w, A, y))
 
 
 def _scatter_beside(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
@@ -154,8 +154,10 @@ def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> 
     return white - U @ (U.T @ white), z - U @ (U.T @ z), len(z) - U.shape[1]
 
 
-def _predicted(precision: Array, mean: Array, B: Array, w: Array) -> float:
-    """Log likelihood ratio of w for coefficients believed to be N(mean, precision⁻¹), over none."""
+def _predicted(A: Array, y: Array, B: Array, w: Array) -> float:
+    """Log likelihood ratio of w = B·x for what y = A·x tells of x, over none."""
+    mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
+    precision = A.T @ A + np.diag((_WIDE * np.abs(mean) + _FAINT) ** -2.0)
     information, vector = B.T @ B, B.T @ w
     both = precision + information
     pull = vector + precision @ mean
