@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from stitch.effects.contract import TWIST
 from stitch.explanation.dictionary import Ingredient
 from stitch.units import METRES
 
@@ -9,14 +10,27 @@ _LIMIT = 10.0  # sizes: beyond that nobody would believe it
 
 
 def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
-    """The formula for people: what is displaced, and by what."""
-    parts = [f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in zip(ingredients, coefficients, strict=True)]
+    """The formula for people: what is displaced, and by what; joint by joint, or all axes of a body at once."""
+    own = list(zip(ingredients, coefficients, strict=True))
+    if any(i.place != "robot" for i in ingredients):
+        follows = dict.fromkeys((i.place, i.quantity.text) for i in ingredients)
+        every = [[(i, c) for i, c in own if (i.place, i.quantity.text) == key] for key in follows]
+        return "; ".join(_of_body(addend) for addend in every)
     targets = list(dict.fromkeys(i.what for i in ingredients))
     return "; ".join(
-        f"{t} = {t.replace('*', '') + ' ' if '*' in t else ''}"
-        + " ".join(p for p, i in zip(parts, ingredients, strict=True) if i.what == t)
+        f"{t} = {t.replace('*', '')} "
+        + " ".join(f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in own if i.what == t)
         for t in targets
     )
+
+
+def _of_body(addend: Sequence[tuple[Ingredient, float]]) -> str:
+    """part rx, ry, rz, tx, ty, tz = (+0.0003, +0.0001, 0) rad, (-0.1, 0, +0.02) mm · cos(2π t/0.2 h − 45°)"""
+    units = list(dict.fromkeys(i.unit for i, _ in addend))
+    sizes = [f"({', '.join(f'{c:+.2g}' for i, c in addend if i.unit == unit)}) {unit}" for unit in units]
+    axes = ", ".join(TWIST[i.index] for i, _ in addend)
+    first = addend[0][0]
+    return f"{first.place} {axes} = {', '.join(sizes)} · {first.quantity.text}"
 
 
 def _names(count: int) -> list[str]:
