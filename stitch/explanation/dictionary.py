@@ -55,10 +55,11 @@ def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ing
         place: linear.responses([_everywhere(linear, place)])[0].columns for place in {i.place for i in ingredients}
     }
     rows = _rows_per_view(linear)
-    columns = [
-        _modulated(bases[i.place][:, i.index], i.quantity.values, rows) / _scale(i.quantity) for i in ingredients
-    ]
-    return ingredients, np.column_stack(columns)
+    # Of thousands of poses half a gigabyte or more: held once.
+    columns = np.empty((len(linear.design), len(ingredients)))
+    for k, i in enumerate(ingredients):
+        columns[:, k] = _modulated(bases[i.place][:, i.index], i.quantity.values, rows) / _scale(i.quantity)
+    return ingredients, columns
 
 
 def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
@@ -74,7 +75,9 @@ def _for_joint(i: int, found: Sequence[Quantity]) -> list[Quantity]:
     own = [q for q in found if q.joint == i and q.kind in ("angle", "direction")]
     others = [q for q in found if q.joint != i and q.kind == "angle"]
     slow = [q for q in found if q.kind in ("time", "covariate")]
-    return [*found, *(a.times(b) for a in own for b in (*others, *slow))]
+    # In a course of time the whole flange errs.
+    plain = [q for q in found if q.kind != "course"]
+    return [*plain, *(a.times(b) for a in own for b in (*others, *slow))]
 
 
 def _scale(quantity: Quantity) -> float:

@@ -19,6 +19,7 @@ from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.validation.halves import explained_beside
 from stitch.explanation.pursuit import sums_of
 from stitch.frames import Array, Indices, Mask
+from stitch.measurement.scan import evenly
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
@@ -29,6 +30,7 @@ from stitch.statistics.variance_prior import NOISE
 
 _FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of a half that are tested in the other
 _REJECTED = 0.01
+_ENOUGH = 300  # views of a half
 _BLOCKS = 16  # of neighbours in time, for views that share a wandering error which no prior knows
 # A prior of this many sizes as they come out keeps what a half does not see finite.
 _WIDE = 10.0
@@ -62,7 +64,8 @@ def search(
         slow: (M,) what follows time or what moves with it: views near in time share it, and wandering errors too.
     """
     columns, found = linear.reduce(responses), list[Chosen]()
-    alternate, early_late = _alternate(linear), np.array_split(np.arange(_views(linear)), 2)
+    alternate = [_some(half) for half in _alternate(linear)]
+    early_late = [_some(half) for half in np.array_split(np.arange(_views(linear)), 2)]
     ways = 0
     for place, among in sorted({(places[own[0]], bool(slow[own[0]])) for own in addends}):
         some = [own for own in addends if (places[own[0]], bool(slow[own[0]])) == (place, among)]
@@ -84,6 +87,11 @@ def _alternate(linear: LinearModel) -> list[Indices]:
     blocks = _views(linear) if isinstance(linear.observation, Surfaces) else min(_BLOCKS, _views(linear))
     block = np.arange(_views(linear)) * blocks // _views(linear)
     return [np.flatnonzero(block % 2 == k) for k in (0, 1)]
+
+
+def _some(half: Indices) -> Indices:
+    """Views of a half, evenly over it: more of thousands would tell nothing new, and their columns fill the memory."""
+    return half if len(half) <= _ENOUGH else half[evenly(len(half), _ENOUGH)]
 
 
 def _one_way(
@@ -144,13 +152,12 @@ def _scatter_beside(linear: LinearModel, own: Array, sizes: Array, slow: bool) -
 def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> tuple[Array, Array, int]:
     """Whitened columns (n, k) and numbers (n,) of some views, without what the model explains there, and how many of
     the numbers are free."""
-    white, z = base.whiten(columns), base.white_z
     if isinstance(base.observation, Surfaces):
-        U = explained_beside(base, base.observation, out)
+        white, z, U = base.whiten(columns), base.white_z, explained_beside(base, base.observation, out)
     else:
         rows = base.mixed.z.shape[1]
         at = (keep[:, None] * rows + np.arange(rows)).ravel()
-        U, white, z = column_space(base.white_design[at]), white[at], z[at]
+        white, z, U = base.whiten(columns, keep), base.white_z[at], column_space(base.white_design[at])
     return white - U @ (U.T @ white), z - U @ (U.T @ z), len(z) - U.shape[1]
 
 

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.observations.pose_errors import PoseErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
@@ -56,9 +56,12 @@ class ErrorModel:
         """(B, m, m) inverse Cholesky factors of the null's covariance."""
         return whitener(self.mixed, self.null.variances)
 
-    def whiten(self, columns: Array) -> Array:
-        """(n, P) columns of the channel in units of the null's scatter."""
-        return np.asarray((self._half @ self.in_blocks(columns)).reshape(columns.shape))
+    def whiten(self, columns: Array, blocks: Indices | None = None) -> Array:
+        """(n, P) columns of the channel in units of the null's scatter; of some of its blocks alone, if named."""
+        own, half = self.in_blocks(columns), self._half
+        if blocks is not None:
+            own, half = own[blocks], half[blocks]
+        return np.asarray((half @ own).reshape(-1, columns.shape[1]))
 
     def without(self, effects: Collection[str]) -> Self:
         """The model in which an arm does not err by some effects of the library, of any size."""
