@@ -1,6 +1,8 @@
 """A formula as a Python file of effects that a person can read, doubt, edit and add."""
 
+from collections import defaultdict
 from collections.abc import Sequence
+from typing import Any
 
 from stitch.effects.contract import TWIST
 from stitch.explanation.dictionary import Ingredient
@@ -11,17 +13,22 @@ _LIMIT = 10.0  # sizes: beyond that nobody would believe it
 
 def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
     """The formula for people: what is displaced, and by what; joint by joint, or all axes of a body at once."""
-    own = list(zip(ingredients, coefficients, strict=True))
     if any(i.place != "robot" for i in ingredients):
-        follows = dict.fromkeys((i.place, i.quantity.text) for i in ingredients)
-        every = [[(i, c) for i, c in own if (i.place, i.quantity.text) == key] for key in follows]
-        return "; ".join(_of_body(addend) for addend in every)
-    targets = list(dict.fromkeys(i.what for i in ingredients))
+        return "; ".join(map(_of_body, _by_quantity(ingredients, coefficients)))
+    own = list(zip(ingredients, coefficients, strict=True))
     return "; ".join(
-        f"{t} = {t.replace('*', '')} "
-        + " ".join(f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in own if i.what == t)
-        for t in targets
+        f"{what} = {what.replace('*', '')} "
+        + " ".join(f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in own if i.what == what)
+        for what in dict.fromkeys(i.what for i in ingredients)
     )
+
+
+def _by_quantity(ingredients: Sequence[Ingredient], sizes: Sequence[Any]) -> list[list[tuple[Ingredient, Any]]]:
+    """Ingredients with their sizes, those together that follow the same at one place."""
+    found = defaultdict[tuple[str, str], list[tuple[Ingredient, Any]]](list)
+    for i, size in zip(ingredients, sizes, strict=True):
+        found[i.place, i.quantity.text].append((i, size))
+    return list(found.values())
 
 
 def _of_body(addend: Sequence[tuple[Ingredient, float]]) -> str:
@@ -50,26 +57,35 @@ def effect_source(
     place = ingredients[0].place
     to_mm = METRES[length_unit] / METRES["mm"]
     letters = _names(len(ingredients))
-    specs = ", ".join(
-        f'{a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g})'
+    specs = "".join(
+        f'    {a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g}),\n'
         for a, i, size in (
             (a, i, abs(c) * (to_mm if i.unit.startswith("mm") else 1.0))
             for a, i, c in zip(letters, ingredients, coefficients, strict=True)
         )
     )
-    told = "; ".join(f"{i.what} {a}·{i.quantity.text}" for a, i in zip(letters, ingredients, strict=True))
-    arguments = ", ".join(letters)
     needs = '("joints",)' if place == "robot" else "()"
     head = (
         f'"""{origin}"""\n\nimport numpy as np\n\nfrom stitch.effects import effect, number\n\n\n'
-        f'@effect("{place}", needs={needs}, {specs})\n'
+        f'@effect(\n    "{place}",\n    needs={needs},\n{specs})\n'
     )
-    if place == "robot":
-        body = [f"def {name}(joints, views, {arguments}):", f'    """{told}"""', "    true = np.array(joints, float)"]
-        body += [
-            f"    true[:, {i.index}] += {a} * {i.quantity.code}" for a, i in zip(letters, ingredients, strict=True)
-        ]
-        return head + "\n".join([*body, "    return true", ""])
-    body = [f"def {name}(views, {arguments}):", f'    """{told}"""', "    twist = np.zeros((views.count, 6))"]
-    body += [f"    twist[:, {i.index}] += {a} * {i.quantity.code}" for a, i in zip(letters, ingredients, strict=True)]
-    return head + "\n".join([*body, "    return twist", ""])
+    body = _of_joints(ingredients, letters) if place == "robot" else _of_twist(ingredients, letters)
+    first = "joints, views" if place == "robot" else "views"
+    return head + "\n".join([f"def {name}({first}, {', '.join(letters)}):", *(f"    {line}" for line in body), ""])
+
+
+def _of_joints(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:
+    own = list(zip(letters, ingredients, strict=True))
+    told = "; ".join(f"{i.what} {a}·{i.quantity.text}" for a, i in own)
+    lines = [f"true[:, {i.index}] += {a} * {i.quantity.code}" for a, i in own]
+    return [f'"""{told}"""', "true = np.array(joints, float)", *lines, "return true"]
+
+
+def _of_twist(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:
+    addends = _by_quantity(ingredients, letters)
+    told = "; ".join(f"{own[0][0].place} ({', '.join(a for _, a in own)})·{own[0][0].quantity.text}" for own in addends)
+    lines = list[str]()
+    for own in addends:
+        axes, sizes = [i.index for i, _ in own], ", ".join(a for _, a in own)
+        lines += [f"course = {own[0][0].quantity.code}", f"twist[:, {axes}] += np.outer(course, [{sizes}])"]
+    return [f'"""{told}"""', "twist = np.zeros((views.count, 6))", *lines, "return twist"]

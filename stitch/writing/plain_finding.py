@@ -63,7 +63,7 @@ def next_step(found: Diagnosis, run: str) -> str:
             return f"Next: stitch add {run} --suggested"
         case "cannot_tell":
             return f"Fitted as one, if that helps: stitch add {run} --group"
-        case "unknown_effect" if found.curves:
+        case "unknown_effect" if found.curves or found.time_curve is not None:
             return f"A formula for it, if there is one: stitch explain {run} -o mine.py"
         case "unknown_effect":
             return f"Next, to see where it fails: stitch review {run}"
