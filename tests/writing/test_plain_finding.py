@@ -20,11 +20,12 @@ def test_every_effect_of_the_library_has_words():
 
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
-@pytest.mark.parametrize("curves", [(), ("of joint 3",)])
-def test_the_next_command_can_be_typed(verdict, curves):
-    told = next_step(SimpleNamespace(verdict=verdict, curves=curves), "RUN")
+@pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
+def test_the_next_command_can_be_typed(verdict, curves, time_curve):
+    told = next_step(SimpleNamespace(verdict=verdict, curves=curves, time_curve=time_curve), "RUN")
     command = told.rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
+    assert ("explain" in command) == (verdict == "unknown_effect" and bool(curves or time_curve))
 
 
 def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
