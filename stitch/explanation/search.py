@@ -104,13 +104,14 @@ def _one_way(
 ) -> list[Chosen]:
     """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
     every = np.concatenate([np.array(own, np.int64) for own in addends])
-    seen, z, free = _of_half(linear.scatter_only, columns[:, every], chosen_in, tested_in)
+    among = columns[:, every]
+    seen, z, free = _of_half(linear.scatter_only, among, chosen_in, tested_in)
     ends = np.cumsum([len(own) for own in addends])
     at_once = [tuple(range(end - len(own), end)) for own, end in zip(addends, ends, strict=True)]
     suggested = sorted(sums_of(seen, z, free, at_once, _FIRST))
     own_numbers = [tuple(int(k) for k in every[list(sum_)]) for sum_ in suggested]
     # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
-    halves = [_of_half(linear, columns[:, every], *way)[:2] for way in ((chosen_in, tested_in), (tested_in, chosen_in))]
+    halves = [_of_half(linear, among, *way)[:2] for way in ((chosen_in, tested_in), (tested_in, chosen_in))]
     worth = [_judged(sum_, *((X[:, sum_], y) for X, y in halves)).log_bayes_factor for sum_ in suggested]
     likely = [own_numbers[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
     tested = [_tested(linear, columns, numbers, slow, chosen_in, tested_in) for numbers in likely]

@@ -1,7 +1,7 @@
 """How a flange may err in time by one shape: swings to and fro, and stretches of views after which it comes back."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -27,6 +27,7 @@ _FULL_WIDTH = 2.355
 _FINER = 17
 # Times (T,) in steps from view to view → shapes (T, R) of a process.
 _Course = Callable[[Array], Array]
+_Told = tuple[str, _Course, float | None]  # in words, and with its frequency if it is a swing
 
 
 @dataclass(frozen=True)
@@ -42,30 +43,37 @@ class TimeProcess:
 def time_processes(linear: LinearModel) -> list[TimeProcess]:
     """All that are tried, of any size and direction in the flange's frame."""
     time = in_steps(linear.measurement)
-    span = max(float(np.ptp(time)), 1.0)
+    span = _span(time)
     apart = max(_APART / span, _FASTEST / _MOST_FREQUENCIES)
     swings = _swings(linear, np.arange(_LEAST_SWINGS / span, _FASTEST, apart))
-    return [*swings, *_processes(linear, _stretches(linear, time))]
+    return _processes(linear, time, [*swings, *_stretches(linear, time)])
 
 
 def with_nearly_its_period(linear: LinearModel, swing: TimeProcess) -> list[TimeProcess]:
     """A swing, and others between it and the next ones that are tried."""
     assert swing.frequency is not None
-    reach = _APART / max(float(np.ptp(in_steps(linear.measurement))), 1.0)
-    return _swings(linear, swing.frequency + np.linspace(-reach, reach, _FINER))
-
-
-def _processes(linear: LinearModel, courses: Iterable[tuple[str, _Course]]) -> list[TimeProcess]:
     time = in_steps(linear.measurement)
+    reach = _APART / _span(time)
+    return _processes(linear, time, _swings(linear, swing.frequency + np.linspace(-reach, reach, _FINER)))
+
+
+def _span(time: Array) -> float:
+    """Of the session in steps, one at the least."""
+    return max(float(np.ptp(time)), 1.0)
+
+
+def _processes(linear: LinearModel, time: Array, courses: Iterable[_Told]) -> list[TimeProcess]:
     carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
-    return [TimeProcess(words, SmoothProcess(None, carried, course(time)), course) for words, course in courses]
+    return [
+        TimeProcess(words, SmoothProcess(None, carried, course(time)), course, frequency)
+        for words, course, frequency in courses
+    ]
 
 
-def _swings(linear: LinearModel, frequencies: Array) -> list[TimeProcess]:
-    """Sines of any phase."""
-    words = [f"swing to and fro about every {_lasting(linear, 1 / f)}" for f in frequencies]
-    found = _processes(linear, zip(words, (partial(_waves, f) for f in frequencies), strict=True))
-    return [replace(own, frequency=float(f)) for own, f in zip(found, frequencies, strict=True)]
+def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_Told]:
+    """Sines of any phase, in words."""
+    for f in map(float, frequencies):
+        yield f"swing to and fro about every {_lasting(linear, 1 / f)}", partial(_waves, f), f
 
 
 def _waves(frequency: float, time: Array) -> Array:
@@ -74,7 +82,7 @@ def _waves(frequency: float, time: Array) -> Array:
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
-def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, _Course]]:
+def _stretches(linear: LinearModel, time: Array) -> Iterator[_Told]:
     """Bumps that begin and end within the session, in words."""
     first, last, width = float(time.min()), float(time.max()), _SHORTEST
     views = linear.measurement.views
@@ -87,7 +95,7 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[tuple[str, _Course]
             if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
                 name = views.names[views.number[away.argmin()]]
                 words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
-                yield words, partial(_bump, middle, width)
+                yield words, partial(_bump, middle, width), None
         width *= 2
 
 
