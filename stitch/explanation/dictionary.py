@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.effects.contract import TWIST, Effect
 from stitch.effects.specs import per_joint, twist
-from stitch.explanation.quantities import Quantity
+from stitch.explanation.quantity import Quantity
 from stitch.frames import Array
 from stitch.measurement.views import Views
 from stitch.model.term import Term, term_of
@@ -38,8 +38,30 @@ class Ingredient:
         return f"q*{self.index + 1}" if self.place == "robot" else f"{self.place} {TWIST[self.index]}"
 
 
-def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ingredient], Array]:
-    """All M ingredients, and the response (·, M) of the observation to one of each.
+@dataclass(frozen=True)
+class Dictionary:
+    """All ingredients, and what the observation answers to one of each."""
+
+    ingredients: list[Ingredient]
+    places: dict[str, Array]  # (·, 6 or joints) response to the same displacement in every view
+    rows: int  # of a response, in a view
+
+    def base(self, ingredient: Ingredient) -> Array:
+        """(·,) response to the same displacement in every view."""
+        return np.asarray(self.places[ingredient.place][:, ingredient.index])
+
+    def columns(self, ingredients: Sequence[Ingredient]) -> Array:
+        """(·, k) responses to one of each, scaled."""
+        values = np.stack([scaled(i.quantity) for i in ingredients], axis=1)
+        bases = np.stack([self.base(i) for i in ingredients], axis=1)
+        # Blocks beyond the views (a drawing) know nothing of them.
+        factors = np.zeros((len(bases) // self.rows, len(ingredients)))
+        factors[: len(values)] = values
+        return np.asarray(bases * np.repeat(factors, self.rows, axis=0))
+
+
+def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> Dictionary:
+    """All M ingredients of these quantities.
 
     A joint may follow any quantity, and its own angle or direction times any other joint's angle; mount and part what
     does not turn with the arm.
@@ -49,17 +71,10 @@ def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> tuple[list[Ing
     elsewhere = [q for q in found if q.kind in ("time", "course", "covariate", "torque")]
     places = [Ingredient(p, axis, q) for p in ("mount", "part") for axis, q in product(range(6), elsewhere)]
     ingredients = of_arm + places
-    if not ingredients:
-        return [], np.zeros((len(linear.design), 0))
     bases = {
         place: linear.responses([_everywhere(linear, place)])[0].columns for place in {i.place for i in ingredients}
     }
-    rows = _rows_per_view(linear)
-    # Of thousands of poses half a gigabyte or more: held once.
-    columns = np.empty((len(linear.design), len(ingredients)))
-    for k, i in enumerate(ingredients):
-        columns[:, k] = _modulated(bases[i.place][:, i.index], i.quantity.values, rows) / _scale(i.quantity)
-    return ingredients, columns
+    return Dictionary(ingredients, bases, _rows_per_view(linear))
 
 
 def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
@@ -85,9 +100,14 @@ def _scale(quantity: Quantity) -> float:
     return max(float(np.abs(quantity.values).max()), 1e-300)
 
 
-def coefficient(ingredient: Ingredient, scaled: float) -> float:
+def scaled(quantity: Quantity) -> Array:
+    """(V,) values of at most one."""
+    return quantity.values / _scale(quantity)
+
+
+def coefficient(ingredient: Ingredient, of_scaled: float) -> float:
     """In the ingredient's unit, of one for its scaled column."""
-    return scaled / _scale(ingredient.quantity)
+    return of_scaled / _scale(ingredient.quantity)
 
 
 def _everywhere(linear: LinearModel, place: str) -> Term:
@@ -115,11 +135,3 @@ def _rows_per_view(linear: LinearModel) -> int:
         return 6
     assert isinstance(observation, Targets)
     return int(observation.rows.residual.shape[1])
-
-
-def _modulated(column: Array, values: Array, rows: int) -> Array:
-    """A response (·,) times a number of each view; blocks beyond the views (a drawing) know nothing of them."""
-    blocks = column.reshape(-1, rows)
-    factors = np.zeros(len(blocks))
-    factors[: len(values)] = values
-    return np.asarray((blocks * factors[:, None]).ravel())

@@ -4,18 +4,17 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
-from stitch.explanation.dictionary import addends, coefficient, dictionary
+from stitch.explanation.dictionary import coefficient, dictionary
 from stitch.explanation.effect_source import effect_source, formula_text
+from stitch.explanation.held_test import Chosen, fitted
 from stitch.explanation.quantities import quantities
-from stitch.explanation.search import Chosen, fitted, search
+from stitch.explanation.search import search
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
@@ -44,14 +43,12 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
         origin: first line of the file of effects.
     """
     with library_threads_off():
-        ingredients, responses = dictionary(linear, quantities(linear.measurement.views))
-        slow = np.array([i.quantity.slow for i in ingredients], bool)
-        at = [i.place for i in ingredients]
-        chosen = search(linear, responses, addends(ingredients), at, slow) if ingredients else None
+        terms = dictionary(linear, quantities(linear.measurement.views))
+        chosen = search(linear, terms)
         if chosen is None:
             return Explanation(False, "Nothing that the cell knows of its views explains what is left.")
-        own = [ingredients[k] for k in chosen.numbers]
-        scaled = fitted(linear, responses, chosen.numbers)
+        own = chosen.ingredients
+        scaled = fitted(linear, terms, own)
         values = [coefficient(i, float(x)) for i, x in zip(own, scaled, strict=True)]
         text, places = formula_text(own, values), {i.place for i in own}
         if not chosen.holds or len(places) > 1:

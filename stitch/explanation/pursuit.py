@@ -1,7 +1,7 @@
 """Orthogonal matching pursuit over addends of one or several columns (Pati, Rezaiifar & Krishnaprasad 1993, ACSSC;
 groups: Lozano, Świrszcz & Abe 2009, NIPS 22)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,23 +16,30 @@ _CHANCE = 0.05  # that an addend which is none is added, all of them counted
 _FAINT, _LEFT = 1e-6, 0.1
 _WHOLE = 1 - 1e-12  # of what is left, no more is believed to be explained
 
+# Columns (n, k) of a sum, by its numbers.
+Refined = Callable[[tuple[int, ...]], Array]
 
-def sums_of(seen: Array, z: Array, free: int, addends: Sequence[tuple[int, ...]], starts: int) -> set[tuple[int, ...]]:
+
+def sums_of(
+    seen: Array, z: Array, free: int, addends: Sequence[tuple[int, ...]], starts: int, refined: Refined | None = None
+) -> set[tuple[int, ...]]:
     """Sums that explain z (n,), of which so many numbers are free: numbers of their columns in `seen` (n, M).
 
     One for each of the best addends to begin with, and each with a further addend as long as the next explains more
     than the best of all would by chance. Addends of different size are compared by the Bayesian information criterion
     (Schwarz 1978), with the scatter unknown.
+
+    Args:
+        refined: columns in the place of those in `seen`, which tell what is left for the next addend.
     """
     strength = np.linalg.norm(seen, axis=0)
     usable = strength > _FAINT * strength.max(initial=0.0)
     unit = np.where(usable, seen / np.maximum(strength, 1e-300), 0.0)
-    groups, out = _by_size(addends), set[tuple[int, ...]]()
-    gains, ranks = _explained(unit, z, groups, len(addends))
-    first = np.argsort(-_worth(gains, ranks, z, free))[:starts]
-    for k in first[ranks[first] > 0]:
-        out |= set(_begun_with(int(k), unit, z, free, addends, groups))
-    return out
+    asked = _Asked(unit, z, free, addends, _by_size(addends))
+    worth, _, ranks, _ = asked.further(np.zeros((len(z), 0)))
+    first = np.argsort(-worth)[:starts]
+    every = [asked.begun_with(int(k), refined or (lambda own: seen[:, own])) for k in first[ranks[first] > 0]]
+    return {sum_ for sums in every for sum_ in sums}
 
 
 @dataclass(frozen=True)
@@ -49,24 +56,37 @@ def _by_size(addends: Sequence[tuple[int, ...]]) -> list[_Group]:
     return [_Group(which, np.array([addends[int(k)] for k in which], np.int64)) for which in every]
 
 
-def _begun_with(
-    k: int, unit: Array, rest: Array, free: int, addends: Sequence[tuple[int, ...]], groups: Sequence[_Group]
-) -> list[tuple[int, ...]]:
-    """The sum of one addend, of that and the best further one, and so on."""
-    sums = [addends[k]]
-    while len(sums[-1]) < _AT_MOST:
-        basis = _basis(unit[:, addends[k]])
-        unit, rest, free = unit - basis @ (basis.T @ unit), rest - basis @ (basis.T @ rest), free - basis.shape[1]
-        gains, ranks = _explained(unit, rest, groups, len(addends))
-        k = int(_worth(gains, ranks, rest, free).argmax())
-        left, rank = free - int(ranks[k]), int(ranks[k])
-        if not rank or left < 1:
-            break
-        F = gains[k] / rank / max((float(rest @ rest) - gains[k]) / left, 1e-300)
-        if f_tail(F, rank, left) > _CHANCE / len(addends):
-            break
-        sums.append((*sums[-1], *addends[k]))
-    return sums
+@dataclass(frozen=True)
+class _Asked:
+    """What is to be explained, and by which addends."""
+
+    unit: Array  # (n, M) columns of unit length
+    z: Array  # (n,)
+    free: int
+    addends: Sequence[tuple[int, ...]]
+    groups: Sequence[_Group]
+
+    def begun_with(self, k: int, refined: Refined) -> list[tuple[int, ...]]:
+        """The sum of one addend, of that and the best further one, and so on."""
+        sums = [self.addends[k]]
+        while len(sums[-1]) < _AT_MOST:
+            worth, gains, ranks, rest = self.further(_basis(refined(sums[-1])))
+            k = int(worth.argmax())
+            rank = int(ranks[k])
+            left = self.free - len(sums[-1]) - rank
+            if not rank or left < 1:
+                break
+            F = gains[k] / rank / max((rest - gains[k]) / left, 1e-300)
+            if f_tail(F, rank, left) > _CHANCE / len(self.addends):
+                break
+            sums.append((*sums[-1], *self.addends[k]))
+        return sums
+
+    def further(self, basis: Array) -> tuple[Array, Array, Indices, float]:
+        """(G,) worth, gain and rank of every addend beside what lies in a basis (n, r), and the square that is left."""
+        unit, rest = self.unit - basis @ (basis.T @ self.unit), self.z - basis @ (basis.T @ self.z)
+        gains, ranks = _explained(unit, rest, self.groups, len(self.addends))
+        return _worth(gains, ranks, rest, self.free - basis.shape[1]), gains, ranks, float(rest @ rest)
 
 
 def _worth(gains: Array, ranks: Indices, z: Array, free: int) -> Array:
@@ -96,6 +116,7 @@ def _explained(unit: Array, z: Array, groups: Sequence[_Group], count: int) -> t
 
 
 def _basis(columns: Array) -> Array:
-    """(n, r) orthonormal, of columns (n, k) that had unit length."""
-    U, left, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, left > _LEFT])
+    """(n, r) orthonormal."""
+    unit = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, left, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(U[:, left > _LEFT / 2])  # of a column of which so much is left beside another

@@ -1,10 +1,11 @@
 """What a cell knows of its views, as factors of a formula: each with its text, its code and its values."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from stitch.explanation.quantity import Quantity
+from stitch.explanation.shapes import behind, bump_in_time, bump_of_joint, swing, warming
 from stitch.frames import Array
 from stitch.measurement.views import Views
 
@@ -21,30 +22,6 @@ _WIDTH, _APART = 0.2, 0.15
 # Play of a gear with friction, as a share of the range that the joint was driven over.
 _PLAYS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
 _STILL = 1e-9
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A number a view."""
-
-    text: str  # for people
-    code: str  # of numpy, of `views`
-    unit: str  # "" without one
-    kind: str  # angle, gear, direction, move, torque, speed, time, course or covariate
-    joint: int | None  # that it belongs to, counted from 0
-    values: Array  # (V,)
-    wave: str = ""  # of which it is the sine or the cosine: of any phase it takes both
-
-    @property
-    def slow(self) -> bool:
-        """True if it follows time, or something that may move with it."""
-        return any(kind in self.kind.split("·") for kind in ("time", "course", "covariate"))
-
-    def times(self, other: "Quantity") -> "Quantity":
-        """The product; it belongs to no joint."""
-        unit = " ".join(sorted(u for u in (self.unit, other.unit) if u))
-        text, code = f"{self.text}·{other.text}", f"{self.code} * {other.code}"
-        return Quantity(text, code, unit, f"{self.kind}·{other.kind}", None, self.values * other.values)
 
 
 def quantities(views: Views) -> list[Quantity]:
@@ -70,9 +47,7 @@ def _of_joints(views: Views) -> Iterator[Quantity]:
         moved = q - views.previous[:, k]
         yield Quantity(f"move{k + 1}", f"({at} - views.previous[:, {k}])", "", "move", k, moved)
         for share in _PLAYS:
-            play = float(f"{share * np.ptp(views.path[:, k]):.3g}")
-            text = f"stays ({np.degrees(play):.2g}° of play) behind q{k + 1}"
-            yield Quantity(text, f"views.behind({k}, {play:g})", "", "move", k, views.behind(k, play))
+            yield behind(views, k, float(f"{share * np.ptp(views.path[:, k]):.3g}"))
         if views.velocity is not None:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
@@ -88,9 +63,7 @@ def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
     for n in _PERIODS:
         yield from _wave(f"{n}q{k + 1}", f"{n} * {at}", "gear", k, n * q)
     for middle in np.arange(q.min(), q.max() + _APART, _APART).round(3):
-        text = f"bump of q{k + 1} at {np.degrees(middle):.0f}°"
-        code = f"np.exp(-0.5 * (({at} - {middle:g}) / {_WIDTH}) ** 2)"
-        yield Quantity(text, code, "", "gear", k, np.exp(-0.5 * ((q - middle) / _WIDTH) ** 2))
+        yield bump_of_joint(views, k, float(middle), _WIDTH)
 
 
 def _of_time(views: Views) -> Iterator[Quantity]:
@@ -98,24 +71,15 @@ def _of_time(views: Views) -> Iterator[Quantity]:
         return
     yield Quantity("t", "views.hours", "h", "time", None, views.hours)
     for hours in _WARMING:
-        text, code = f"(1 − exp(−t/{hours:g} h))", f"(1 - np.exp(-views.hours / {hours:g}))"
-        yield Quantity(text, code, "", "time", None, 1 - np.exp(-views.hours / hours))
+        yield warming(views, hours)
     whole = float(views.hours[-1]) or 1.0
     most = min(_SWINGS, _FASTEST * (views.count - 1))
     for swings in np.arange(1.0, most, 0.5):
-        period = float(f"{whole / swings:.6g}")
-        code = f"2 * np.pi * views.hours / {period:g}"
         for phase in _PHASES:
-            text = f"cos(2π t/{period:.2g} h − {phase:g}°)"
-            late = float(f"{np.radians(phase):.6g}")
-            swing = np.cos(2 * np.pi * views.hours / period - late)
-            yield Quantity(text, f"np.cos({code} - {late:g})", "", "course", None, swing)
+            yield swing(views, float(f"{whole / swings:.6g}"), float(f"{np.radians(phase):.6g}"))
     for width in _STRETCHES:
         for middle in np.arange(width, 1.0, width):
-            at, wide = float(f"{middle * whole:.4g}"), float(f"{width * whole:.4g}")
-            code = f"np.exp(-0.5 * ((views.hours - {at:g}) / {wide:g}) ** 2)"
-            bump = np.exp(-0.5 * ((views.hours - at) / wide) ** 2)
-            yield Quantity(f"bump of t at {at:.2g} h, {wide:.2g} h wide", code, "", "course", None, bump)
+            yield bump_in_time(views, float(f"{middle * whole:.4g}"), float(f"{width * whole:.4g}"))
     for share in _STEPS:
         since = float(f"{share * whole:.4g}")
         text, code = f"(t > {since:.2g} h)", f"(views.hours > {since:g})"

@@ -1,9 +1,9 @@
 """Sparse regression over a dictionary: chosen in one half of the views, tested in the other.
 
 In one half ingredients are added greedily (orthogonal matching pursuit), after the first as long as the next one
-explains more than the best of all of them would by chance. The other half, which took no part in that, then says if the
-same sum of ingredients is wanted there: a test beside everything else that poses may err by, and how much likelier its
-numbers are with the sizes that the first half found. Halves change roles, and all ways are counted.
+explains more than the best of all of them would by chance, and their places, widths and periods are moved to where they
+explain most. The other half, which took no part in that, then says if the same sum of ingredients is wanted there
+(held_test). Halves change roles, and all ways are counted.
 
 What follows the arm is asked for in views taken alternately. What follows time, or what moves with time, in the first
 and the second half of the session too, and always beside errors that wander as much as all views show: these look the
@@ -11,71 +11,46 @@ same in views that are neighbours in time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.validation.halves import explained_beside
+from stitch.explanation.dictionary import Dictionary, Ingredient, addends
+from stitch.explanation.half import Half
+from stitch.explanation.held_test import Chosen, at_present, beside_itself
 from stitch.explanation.pursuit import sums_of
-from stitch.frames import Array, Indices, Mask
+from stitch.explanation.refinement import refined, rounded
+from stitch.frames import Array, Indices
 from stitch.measurement.scan import evenly
-from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
-from stitch.statistics.least_squares import column_space
-from stitch.statistics.tails import chi2_tail
-from stitch.statistics.variance_components import at_variances
-from stitch.statistics.variance_prior import NOISE
 
 _FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of a half that are tested in the other
-_REJECTED = 0.01
 _ENOUGH = 300  # views of a half
 _BLOCKS = 16  # of neighbours in time, for views that share a wandering error which no prior knows
-# A prior of this many sizes as they come out keeps what a half does not see finite.
-_WIDE = 10.0
-_FAINT = 1e-6
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """Ingredients by their number in the dictionary, and how they stood the test."""
-
-    numbers: tuple[int, ...]
-    p_value: float  # in the half that took no part in choosing, all ways counted
-    log_bayes_factor: float  # of that half's numbers with the sizes of the other over none
-    both: float  # the same, with that of the other half's numbers with the sizes of this one
-
-    @property
-    def holds(self) -> bool:
-        """True if the half that took no part wants it."""
-        return self.p_value < _REJECTED and self.log_bayes_factor > ODDS
-
-
-def search(
-    linear: LinearModel, responses: Array, addends: Sequence[tuple[int, ...]], places: Sequence[str], slow: Mask
-) -> Chosen | None:
-    """The sum of addends at one place that explains most and stands its test best; None where no half suggests any.
-
-    Args:
-        responses: (·, M) of the observation to the ingredients.
-        addends: numbers of the ingredients that come together, all of one place, all slow or none.
-        places: of the M ingredients.
-        slow: (M,) what follows time or what moves with it: views near in time share it, and wandering errors too.
-    """
-    columns, found = linear.reduce(responses), list[Chosen]()
+def search(linear: LinearModel, terms: Dictionary) -> Chosen | None:
+    """The sum of ingredients at one place that explains most and stands its test best, its places, widths and periods
+    as all views want them; None where no half suggests any."""
+    found = list[Chosen]()
     alternate = [_some(half) for half in _alternate(linear)]
     early_late = [_some(half) for half in np.array_split(np.arange(_views(linear)), 2)]
     ways = 0
-    for place, among in sorted({(places[own[0]], bool(slow[own[0]])) for own in addends}):
-        some = [own for own in addends if (places[own[0]], bool(slow[own[0]])) == (place, among)]
-        for halves in (alternate, early_late) if among else (alternate,):
+    for place, slow in sorted({(i.place, i.quantity.slow) for i in terms.ingredients}):
+        some = [i for i in terms.ingredients if (i.place, i.quantity.slow) == (place, slow)]
+        for halves in (alternate, early_late) if slow else (alternate,):
             for way in (halves, halves[::-1]):
-                found += _one_way(linear, columns, some, among, way[0], way[1])
+                found += _one_way(linear, terms, some, way)
                 ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
+    if not found:
+        return None
     # Of sums that hold the one that is likeliest in both halves: each was chosen in one of them.
-    return max(found, key=lambda c: (c.holds, c.both)) if found else None
+    best = max(found, key=lambda c: (c.holds, c.both))
+    every = _some(np.arange(_views(linear)), 2)
+    whole = Half(linear.scatter_only, terms, every, np.empty(0, np.int64))
+    return replace(best, ingredients=rounded(refined(best.ingredients, whole)))
 
 
 def _views(linear: LinearModel) -> int:
@@ -89,94 +64,37 @@ def _alternate(linear: LinearModel) -> list[Indices]:
     return [np.flatnonzero(block % 2 == k) for k in (0, 1)]
 
 
-def _some(half: Indices) -> Indices:
-    """Views of a half, evenly over it: more of thousands would tell nothing new, and their columns fill the memory."""
-    return half if len(half) <= _ENOUGH else half[evenly(len(half), _ENOUGH)]
+def _some(views: Indices, halves: int = 1) -> Indices:
+    """Evenly over them: more of thousands would tell nothing new, and their columns fill the memory."""
+    enough = halves * _ENOUGH
+    return views if len(views) <= enough else views[evenly(len(views), enough)]
 
 
 def _one_way(
-    linear: LinearModel,
-    columns: Array,
-    addends: Sequence[tuple[int, ...]],
-    slow: bool,
-    chosen_in: Indices,
-    tested_in: Indices,
+    linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], ways: Sequence[Indices]
 ) -> list[Chosen]:
     """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
-    every = np.concatenate([np.array(own, np.int64) for own in addends])
-    among = columns[:, every]
-    seen, z, free = _of_half(linear.scatter_only, among, chosen_in, tested_in)
-    ends = np.cumsum([len(own) for own in addends])
-    at_once = [tuple(range(end - len(own), end)) for own, end in zip(addends, ends, strict=True)]
-    suggested = sorted(sums_of(seen, z, free, at_once, _FIRST))
-    own_numbers = [tuple(int(k) for k in every[list(sum_)]) for sum_ in suggested]
+    chosen, other = Half(linear.scatter_only, terms, *ways), Half(linear.scatter_only, terms, *reversed(ways))
+    suggested = _suggested(chosen, ingredients)
     # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
-    halves = [_of_half(linear, among, *way)[:2] for way in ((chosen_in, tested_in), (tested_in, chosen_in))]
-    worth = [_judged(sum_, *((X[:, sum_], y) for X, y in halves)).log_bayes_factor for sum_ in suggested]
-    likely = [own_numbers[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
-    tested = [_tested(linear, columns, numbers, slow, chosen_in, tested_in) for numbers in likely]
+    worth = [at_present(sum_, chosen, other).log_bayes_factor for sum_ in suggested]
+    likely = [suggested[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
+    slow = ingredients[0].quantity.slow
+    tested = [beside_itself(linear, terms, sum_, slow, ways) for sum_ in likely]
     return [replace(c, p_value=min(1.0, len(suggested) * c.p_value)) for c in tested]
 
 
-def _tested(
-    linear: LinearModel, columns: Array, numbers: tuple[int, ...], slow: bool, chosen_in: Indices, tested_in: Indices
-) -> Chosen:
-    """The columns of a sum in the half that took no part in choosing them, under the scatter beside it."""
-    own = columns[:, numbers]
-    seen, z, _ = _of_half(linear.scatter_only, own, chosen_in, tested_in)
-    sizes = _WIDE * np.abs(np.linalg.lstsq(seen, z, rcond=None)[0]) + _FAINT
-    base = _scatter_beside(linear, own, sizes, slow)
-    ways = (chosen_in, tested_in), (tested_in, chosen_in)
-    return _judged(numbers, *(_of_half(base, own, *way)[:2] for way in ways))
+def _suggested(half: Half, ingredients: Sequence[Ingredient]) -> list[tuple[Ingredient, ...]]:
+    """Sums that explain one half, as that half wants their places, widths and periods."""
+    found = dict[tuple[int, ...], tuple[Ingredient, ...]]()
 
+    def sum_of(numbers: tuple[int, ...]) -> tuple[Ingredient, ...]:
+        if numbers not in found:
+            found[numbers] = refined([ingredients[k] for k in numbers], half)
+        return found[numbers]
 
-def _judged(numbers: tuple[int, ...], chosen: tuple[Array, Array], tested: tuple[Array, Array]) -> Chosen:
-    """A sum by its columns and the numbers of either half, in units of the scatter."""
-    (A, y), (B, w) = chosen, tested
-    told = np.linalg.pinv(B.T @ B, rcond=1e-12, hermitian=True)
-    square = float((B.T @ w) @ told @ (B.T @ w))
-    factor = _predicted(A, y, B, w)
-    return Chosen(numbers, chi2_tail(square, len(numbers)), factor, factor + _predicted(B, w, A, y))
+    def columns(numbers: tuple[int, ...]) -> Array:
+        return half.columns(sum_of(numbers))
 
-
-def _scatter_beside(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
-    """Under the scatter that is left beside a sum: what it explains is no scatter. What wanders in time stays."""
-    if slow and linear.pose_errors is None:
-        return linear
-    variances = linear.conditioned_on(own, sizes).null.variances.copy()
-    if slow and linear.pose_errors is not None:
-        wanders = NOISE + 1 + np.flatnonzero(np.isin(linear.pose_errors.names, list(WANDERING)))
-        variances[wanders] = np.maximum(variances, linear.null.variances)[wanders]
-    return replace(linear, null=at_variances(linear.mixed, variances))
-
-
-def _of_half(base: LinearModel, columns: Array, keep: Indices, out: Indices) -> tuple[Array, Array, int]:
-    """Whitened columns (n, k) and numbers (n,) of some views, without what the model explains there, and how many of
-    the numbers are free."""
-    if isinstance(base.observation, Surfaces):
-        white, z, U = base.whiten(columns), base.white_z, explained_beside(base, base.observation, out)
-    else:
-        rows = base.mixed.z.shape[1]
-        at = (keep[:, None] * rows + np.arange(rows)).ravel()
-        white, z, U = base.whiten(columns, keep), base.white_z[at], column_space(base.white_design[at])
-    return white - U @ (U.T @ white), z - U @ (U.T @ z), len(z) - U.shape[1]
-
-
-def _predicted(A: Array, y: Array, B: Array, w: Array) -> float:
-    """Log likelihood ratio of w = B·x for what y = A·x tells of x, over none."""
-    mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
-    precision = A.T @ A + np.diag((_WIDE * np.abs(mean) + _FAINT) ** -2.0)
-    information, vector = B.T @ B, B.T @ w
-    both = precision + information
-    pull = vector + precision @ mean
-    square = pull @ np.linalg.solve(both, pull) - mean @ precision @ mean
-    return float(0.5 * square - 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(precision)[1]))
-
-
-def fitted(linear: LinearModel, columns: Array, numbers: Sequence[int]) -> Array:
-    """(k,) coefficients of some columns (·, M) from all views, under the scatter that they leave."""
-    own = linear.reduce(columns[:, list(numbers)])
-    sizes = np.full(len(numbers), 1.0)
-    beside = linear.conditioned_on(own, sizes)
-    base = replace(linear, null=at_variances(linear.mixed, beside.null.variances))
-    return np.asarray(np.linalg.lstsq(base.residual(own), base.white_residual, rcond=None)[0])
+    sums = sums_of(half.columns(ingredients), half.z, half.free, addends(ingredients), _FIRST, columns)
+    return [sum_of(numbers) for numbers in sorted(sums)]

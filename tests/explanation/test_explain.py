@@ -58,14 +58,14 @@ def test_codes_of_quantities_give_their_values():
 def test_columns_are_what_the_displacement_does():
     """One ingredient put into the joints of the simulated arm moves the targets as its column says."""
     linear = evidence(4, views=20)
-    ingredients, columns = dictionary(linear, quantities(linear.measurement.views))
-    k = next(i for i, x in enumerate(ingredients) if x.what == "q*3" and x.quantity.text == "sin q3·sin 2q2")
-    scale = np.abs(ingredients[k].quantity.values).max()
+    terms = dictionary(linear, quantities(linear.measurement.views))
+    own = next(i for i in terms.ingredients if i.what == "q*3" and i.quantity.text == "sin q3·sin 2q2")
+    column, scale = terms.columns([own])[:, 0], np.abs(own.quantity.values).max()
     rows = linear.observation.rows.residual.ravel()
     moved = evidence(4, coupling, views=20).observation.rows.residual.ravel()
     # The fit of each session takes what hand-eye and targets can of it; what remains must be the column's remainder.
     free = linear.design
-    left = moved - rows - columns[:, k] * scale * -SIZE
+    left = moved - rows - column * scale * -SIZE
     rest = left - free @ np.linalg.lstsq(free, left, rcond=None)[0]
     whole = moved - rows
     whole = whole - free @ np.linalg.lstsq(free, whole, rcond=None)[0]

@@ -1,0 +1,65 @@
+"""A factor of a formula: its text, its code and its value in every view."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.frames import Array
+
+_DIGITS = 4  # of a nonlinear parameter in a formula
+
+
+@dataclass(frozen=True)
+class Nonlinear:
+    """A parameter of a quantity that is no factor before it: a place, a width, a period."""
+
+    value: float
+    spread: float  # by about how much the true one may lie off; as a share of it where it is positive
+    positive: bool = False
+    within: tuple[float, float] = (-np.inf, np.inf)
+
+    def at(self, steps: float) -> float:
+        """So many spreads off."""
+        moved = self.value * np.exp(self.spread * steps) if self.positive else self.value + self.spread * steps
+        return float(np.clip(moved, *self.within))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number a view."""
+
+    text: str  # for people
+    code: str  # of numpy, of `views`
+    unit: str  # "" without one
+    kind: str  # angle, gear, direction, move, torque, speed, time, course or covariate
+    joint: int | None  # that it belongs to, counted from 0
+    values: Array  # (V,)
+    wave: str = ""  # of which it is the sine or the cosine: of any phase it takes both
+    nonlinear: tuple[Nonlinear, ...] = ()
+    family: "Family | None" = None  # of the nonlinear parameters' values
+
+    @property
+    def slow(self) -> bool:
+        """True if it follows time, or something that may move with it."""
+        return any(kind in self.kind.split("·") for kind in ("time", "course", "covariate"))
+
+    def times(self, other: "Quantity") -> "Quantity":
+        """The product; it belongs to no joint."""
+        unit = " ".join(sorted(u for u in (self.unit, other.unit) if u))
+        text, code = f"{self.text}·{other.text}", f"{self.code} * {other.code}"
+        return Quantity(text, code, unit, f"{self.kind}·{other.kind}", None, self.values * other.values)
+
+    def moved(self, steps: Array) -> "Quantity":
+        """The same with its nonlinear parameters so many spreads off."""
+        return self._of([p.at(float(s)) for p, s in zip(self.nonlinear, steps, strict=True)])
+
+    def rounded(self) -> "Quantity":
+        """The same with nonlinear parameters that a person can read."""
+        return self._of([float(f"{p.value:.{_DIGITS}g}") for p in self.nonlinear])
+
+    def _of(self, parameters: list[float]) -> "Quantity":
+        return self if self.family is None else self.family(*parameters)
+
+
+Family = Callable[..., Quantity]

@@ -1,0 +1,57 @@
+"""Nonlinear parameters of a sum (places, widths, periods) moved to where they explain most, sizes projected out.
+
+Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413 (variable projection). A normal prior about where the search found
+them keeps finite what the views do not tell.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stitch.explanation.dictionary import Ingredient
+from stitch.explanation.half import Half
+from stitch.explanation.quantity import Quantity
+from stitch.frames import Array
+
+_MOST = 20  # steps
+
+
+def refined(ingredients: Sequence[Ingredient], half: Half) -> tuple[Ingredient, ...]:
+    """The same ingredients, their quantities as some views want them."""
+    tuned = [q for q in _quantities(ingredients) if q.nonlinear]
+    count = sum(len(q.nonlinear) for q in tuned)
+    if not count:
+        return tuple(ingredients)
+    scatter = _left(ingredients, half)
+    # Beside its sum what is left is scatter: of about one where the scatter was known.
+    scale = np.sqrt(float(scatter @ scatter) / max(half.free - len(ingredients) - count, 1))
+
+    def off(steps: Array) -> Array:
+        return np.append(_left(_moved(ingredients, tuned, steps), half) / scale, steps)
+
+    found = least_squares(off, np.zeros(count), method="lm", max_nfev=_MOST * (count + 1))
+    return _moved(ingredients, tuned, found.x)
+
+
+def rounded(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
+    """With nonlinear parameters that a person can read."""
+    return tuple(replace(i, quantity=i.quantity.rounded()) for i in ingredients)
+
+
+def _quantities(ingredients: Sequence[Ingredient]) -> list[Quantity]:
+    """All different ones: the axes of a body follow one."""
+    return list({i.quantity.text: i.quantity for i in ingredients}.values())
+
+
+def _moved(ingredients: Sequence[Ingredient], tuned: Sequence[Quantity], steps: Array) -> tuple[Ingredient, ...]:
+    ends = np.cumsum([len(q.nonlinear) for q in tuned])[:-1]
+    new = {q.text: q.moved(own) for q, own in zip(tuned, np.split(steps, ends), strict=True)}
+    return tuple(replace(i, quantity=new.get(i.quantity.text, i.quantity)) for i in ingredients)
+
+
+def _left(ingredients: Sequence[Ingredient], half: Half) -> Array:
+    """(n,) what a sum leaves, with the best sizes."""
+    columns = half.columns(ingredients)
+    return np.asarray(half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0])

@@ -1,0 +1,81 @@
+"""Quantities with nonlinear parameters, which a formula may move: bumps, what stays behind, swings, warming up."""
+
+from functools import partial
+
+import numpy as np
+
+from stitch.explanation.quantity import Family, Nonlinear, Quantity
+from stitch.frames import Array
+from stitch.measurement.views import Views
+
+# By about what share the true width, play or time constant may differ from one that is tried; how far a bump's middle
+# may lie off, in its widths; by how many swings in the session there may be more or fewer, and rad of their phase.
+_WIDTH, _PLAY, _CONSTANT = 0.4, 0.2, 0.7
+_MIDDLE, _SWINGS, _PHASE = 0.5, 0.25, 0.8
+
+
+def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity:
+    """exp(−((q − middle) / width)² / 2) of joint k, from 0; rad."""
+    q, at = views.joints[:, k], f"views.joints[:, {k}]"
+    text = f"bump of q{k + 1} at {np.degrees(middle):.0f}°, {np.degrees(width):.2g}° wide"
+    return _bump(text, q, at, middle, width, "gear", k, partial(bump_of_joint, views, k))
+
+
+def bump_in_time(views: Views, middle: float, width: float) -> Quantity:
+    """exp(−((t − middle) / width)² / 2); h."""
+    text = f"bump of t at {middle:.2g} h, {width:.2g} h wide"
+    return _bump(text, views.hours, "views.hours", middle, width, "course", None, partial(bump_in_time, views))
+
+
+def behind(views: Views, k: int, play: float) -> Quantity:
+    """What stays behind joint k, from 0, within a play of so many rad."""
+    return Quantity(
+        f"stays ({np.degrees(play):.2g}° of play) behind q{k + 1}",
+        f"views.behind({k}, {play:.6g})",
+        "",
+        "move",
+        k,
+        views.behind(k, play),
+        nonlinear=(Nonlinear(play, _PLAY, positive=True),),
+        family=partial(behind, views, k),
+    )
+
+
+def swing(views: Views, period: float, late: float) -> Quantity:
+    """cos(2π t/period − late); h, rad."""
+    whole = float(views.hours[-1]) or 1.0
+    return Quantity(
+        f"cos(2π t/{period:.2g} h − {np.degrees(late):.3g}°)",
+        f"np.cos(2 * np.pi * views.hours / {period:.6g} - {late:.6g})",
+        "",
+        "course",
+        None,
+        np.cos(2 * np.pi * views.hours / period - late),
+        nonlinear=(Nonlinear(period, _SWINGS * period / whole, positive=True), Nonlinear(late, _PHASE)),
+        family=partial(swing, views),
+    )
+
+
+def warming(views: Views, constant: float) -> Quantity:
+    """1 − exp(−t/constant); h."""
+    return Quantity(
+        f"(1 − exp(−t/{constant:.2g} h))",
+        f"(1 - np.exp(-views.hours / {constant:.6g}))",
+        "",
+        "time",
+        None,
+        1 - np.exp(-views.hours / constant),
+        nonlinear=(Nonlinear(constant, _CONSTANT, positive=True),),
+        family=partial(warming, views),
+    )
+
+
+def _bump(
+    text: str, x: Array, at: str, middle: float, width: float, kind: str, joint: int | None, family: Family
+) -> Quantity:
+    code = f"np.exp(-0.5 * (({at} - {middle:.6g}) / {width:.6g}) ** 2)"
+    # A bump of whose flank alone is seen could be of any height.
+    there = float(x.min()), float(x.max())
+    free = Nonlinear(middle, _MIDDLE * width, within=there), Nonlinear(width, _WIDTH, positive=True)
+    values = np.exp(-0.5 * ((x - middle) / width) ** 2)
+    return Quantity(text, code, "", kind, joint, values, nonlinear=free, family=family)
