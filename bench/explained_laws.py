@@ -16,14 +16,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
-from unknown_cells import Asked, World, asked, seen, true_poses
+from unknown_cells import asked, seen, true_column
 from unknown_worlds import PARTS, UNNAMED
 
-from stitch import frames
 from stitch.explanation.explain import explain
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
@@ -31,16 +29,6 @@ DEVELOPMENT, HELD_OUT = (0, 1), (802, 803)
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "explain.md"
 _MARKS = ("<!-- laws: begin -->", "<!-- laws: end -->")
 _NEAR = 1.1  # of the truth's rms on views left out
-
-
-def true_column(a: Asked, world: World) -> Array:
-    """(6V,) twists of the views that the law alone makes."""
-    assert isinstance(a.linear.observation, Surfaces)
-    still = np.random.default_rng(0)
-    bare = replace(world, joint_errors=0.0, flange_errors=0.0, scatter=np.zeros((len(a.moments), 6)))
-    with_it, without = (true_poses(a, w, still) for w in (replace(world, scatter=bare.scatter), bare))
-    to_centre = frames.make(np.eye(3), -a.linear.observation.freed.overlaps.gram.centre)
-    return np.asarray(frames.log(to_centre @ with_it @ frames.inverse(to_centre @ without)).ravel())
 
 
 def share_left(linear: LinearModel, column: Array) -> float:

@@ -111,3 +111,13 @@ def true_poses(asked: Asked, world: World, rng: np.random.Generator) -> Array:
         moved = scene.T_reference_part @ frames.inverse(laws.act("part", moment, scene.T_reference_part))
         out.append(moved @ (frames.inverse(T) if cell.measurement.eye_to_hand else T) @ mount)
     return np.array(out)
+
+
+def true_column(a: Asked, world: World) -> Array:
+    """(6V,) twists of the views that the law alone makes."""
+    assert isinstance(a.linear.observation, Surfaces)
+    still = np.random.default_rng(0)
+    bare = replace(world, joint_errors=0.0, flange_errors=0.0, scatter=np.zeros((len(a.moments), 6)))
+    with_it, without = (true_poses(a, w, still) for w in (replace(world, scatter=bare.scatter), bare))
+    to_centre = frames.make(np.eye(3), -a.linear.observation.freed.overlaps.gram.centre)
+    return np.asarray(frames.log(to_centre @ with_it @ frames.inverse(to_centre @ without)).ravel())

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
-from unknown_worlds import PARTS
+from unknown_worlds import MULTIPLES, PARTS
 
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
@@ -33,7 +33,7 @@ DEVELOPMENT, HELD_OUT = (0, 1), (898, 899, 900, 901)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
-OF_THE_LIBRARY = ("effect", *AGAIN)
+MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES))
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
 
 
@@ -48,8 +48,8 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         a = cells[k % len(cells)]
         rng = np.random.default_rng([a.cell.seed, k, list(PARTS).index(part), 17])
         world, hidden = make(a, rng, k)
-        if part in OF_THE_LIBRARY and not hidden:
-            continue  # these views do not show the effect at any size
+        if part in MUST_SHOW and not hidden:
+            continue  # these views do not show it at any size
         linear, begun = seen(a, world, rng), time.process_time()
         linear = linear.scatter_only if as_before else linear
         found = concluded(linear, a.candidates, USUAL)

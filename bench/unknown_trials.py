@@ -46,6 +46,12 @@ class Trial:
         return self.joint and any(f"{name} " in self.follows for name in self.hidden)
 
     @property
+    def right_course(self) -> bool:
+        """What it follows is said: that joint, or of what follows no joint the time."""
+        follows_joint = any(name.startswith("joint ") for name in self.hidden)
+        return self.right_joint if follows_joint else bool(self.follows) and "joint" not in self.follows
+
+    @property
     def wrong(self) -> bool:
         """Nothing of what is named is there."""
         return not any(name in (*self.hidden, *self.also) for name in self.named)
@@ -79,6 +85,7 @@ _COLUMNS: dict[str, Callable[[Trial], bool]] = {
     "adequate": lambda t: t.verdict == "adequate",
     "right joint above all": lambda t: t.right_joint,
     "wrong joint": lambda t: t.joint and not t.right_joint,
+    "right joint or time": lambda t: t.right_course,
 }
 HEAD = "\n".join([f"| world | {' | '.join(_COLUMNS)} |", "|---" * (len(_COLUMNS) + 1) + "|"])
 

@@ -2,15 +2,22 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from blind_cells import drawn, smallest
 from blind_trials import LIBRARY
-from unknown_cells import Asked, World, white
+from unknown_cells import Asked, World, true_column, white
 
 from data_synth import nature
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.unnamed_laws import IN_TIME, UNNAMED
+from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.effects import EFFECTS
+
+MULTIPLES = (1, 2, 3, 4, 6)
+# Usual sizes of a law, 0.15 mrad or 0.05 mm rms: what errs by more is broken.
+_MOST = 10.0
 
 
 def nothing(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
@@ -32,6 +39,19 @@ def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[st
     of_flange = error.shape[1] == 6 and law in IN_TIME
     world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
     return world, (law,) if of_flange else (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))
+
+
+def unnamed_at(a: Asked, rng: np.random.Generator, k: int, multiple: float = 1.0) -> tuple[World, tuple[str, ...]]:
+    """The same at a multiple of the size that one test for this very law would find; nothing where no arm errs so."""
+    world, hidden = unnamed(a, rng, k)
+    size = multiple * _least(a, world)
+    if size > _MOST:
+        return World(_laws(a, {}, rng)), ()
+    return replace(
+        world,
+        joint_errors=size * np.asarray(world.joint_errors),
+        flange_errors=size * np.asarray(world.flange_errors),
+    ), hidden
 
 
 def effect(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
@@ -64,11 +84,21 @@ PARTS: dict[str, tuple[Part, int]] = {
     "beside": (beside, 42),
     "two": (two, 42),
     "three": (three, 42),
+    **{f"unnamed_{n}x": (partial(unnamed_at, multiple=float(n)), 60) for n in MULTIPLES},
 }
 
 
 def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> nature.Nature:
     return nature.draw(hidden, 1.0, a.cell.plan, rng)[0]
+
+
+def _least(a: Asked, world: World) -> float:
+    """Factor on the errors of a world at which one test for them, of as many as there are effects, finds them."""
+    plain = white(a.linear)
+    seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
+    free = plain.mixed.size - plain.mixed.A.shape[2]
+    scatter = plain.satterthwaite.of(plain.in_blocks(seen))
+    return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), free, scatter)) / np.linalg.norm(seen))
 
 
 def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:

@@ -13,7 +13,7 @@ from data_synth.moment import Plan
 
 Array = NDArray[np.float64]
 _SIZE, _SHIFT = 1.5e-4, 0.05
-_RMS_OF_WAVE = float(np.sqrt(2.0))
+_RMS_OF_WAVE, _RMS_OF_SAW = float(np.sqrt(2.0)), float(np.sqrt(12.0))
 
 
 def coupling(plan: Plan, rng: np.random.Generator) -> Array:
@@ -53,6 +53,22 @@ def ripple(plan: Plan, rng: np.random.Generator) -> Array:
     return _of_joint(plan, i, _SIZE * _RMS_OF_WAVE * np.sin(7 * plan.joints[:, i] + phase))
 
 
+def cogging(plan: Plan, rng: np.random.Generator) -> Array:
+    """A belt that creeps and jumps a tooth on: a saw of 12 to 25° along one joint."""
+    i, phase = int(rng.choice(plan.useful)), rng.uniform()
+    teeth = plan.joints[:, i] / np.radians(rng.uniform(12, 25)) + phase
+    return _of_joint(plan, i, _SIZE * _RMS_OF_SAW * (teeth - np.floor(teeth) - 0.5))
+
+
+def stiffening(plan: Plan, rng: np.random.Generator) -> Array:
+    """What a spring that stiffens yields beside one that does not: of the cube of a joint's torque no line's part."""
+    borne = [i for i in plan.useful if np.ptp(plan.torque[:, i]) > 0]
+    i = int(rng.choice(borne))
+    torque = plan.torque[:, i] / np.abs(plan.torque[:, i]).max()
+    line = np.polynomial.Polynomial.fit(torque, torque**3, 1)
+    return _of_joint(plan, i, _scaled(torque**3 - line(torque)))
+
+
 def thermal_cycle(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
     """A cabinet that cools in turns: the flange swings to and fro every four to nine views.
 
@@ -73,7 +89,8 @@ def gust(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Arr
 
 
 UNNAMED: dict[str, Callable[..., Array]] = {
-    law.__name__: law for law in (coupling, dress_pack, spall, hysteresis, ripple, thermal_cycle, gust)
+    law.__name__: law
+    for law in (coupling, dress_pack, spall, hysteresis, ripple, cogging, stiffening, thermal_cycle, gust)
 }
 IN_TIME = ("thermal_cycle", "gust")  # the others follow the joints
 

@@ -78,11 +78,15 @@ def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> Dictionary:
 
 
 def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
-    """Numbers of the ingredients that come together: sine and cosine of one wave, all six axes of what moves."""
+    """Numbers of the ingredients that come together: sine and cosine of one wave, a spring and how it stiffens, all six
+    axes of what moves."""
     found = defaultdict[tuple[str | int, ...], list[int]](list)
     for k, i in enumerate(ingredients):
-        follows = i.quantity.wave or i.quantity.text
-        found[(i.place, follows, i.index) if i.place == "robot" else (i.place, follows)].append(k)
+        if i.place != "robot":
+            found[i.place, i.quantity.text].append(k)
+            continue
+        for follows in i.quantity.together or (i.quantity.text,):
+            found[i.place, follows, i.index].append(k)
     return [tuple(own) for own in found.values()]
 
 

@@ -10,7 +10,7 @@ from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
-from stitch.explanation.dictionary import coefficient, dictionary
+from stitch.explanation.dictionary import Dictionary, coefficient, dictionary
 from stitch.explanation.effect_source import effect_source, formula_text
 from stitch.explanation.held_test import Chosen, fitted
 from stitch.explanation.quantities import quantities
@@ -43,32 +43,37 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
         origin: first line of the file of effects.
     """
     with library_threads_off():
-        terms = dictionary(linear, quantities(linear.measurement.views))
-        chosen = search(linear, terms)
-        if chosen is None:
-            return Explanation(False, "Nothing that the cell knows of its views explains what is left.")
-        own = chosen.ingredients
-        scaled = fitted(linear, terms, own)
-        values = [coefficient(i, float(x)) for i, x in zip(own, scaled, strict=True)]
-        text, places = formula_text(own, values), {i.place for i in own}
-        if not chosen.holds or len(places) > 1:
-            return Explanation(False, _not_held(chosen, text))
-        if any(i.place == "robot" and abs(x) > _MOST for i, x in zip(own, scaled, strict=True)):
-            return Explanation(
-                False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that."
-            )
-        source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
-        scored = _as_effect(linear, source)
-        left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
-        share = left_out.heldout
-        if not left_out.helps or share >= 1:
-            return Explanation(
-                False, f"{text} explains much, but not in views that are left out with their neighbours."
-            )
-        if beyond is not None and not beyond.helps:
-            return Explanation(False, f"{beyond.objection(text)}.")
-        why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
-        return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
+        terms, first = dictionary(linear, quantities(linear.measurement.views)), None
+        for chosen in search(linear, terms):
+            tried = _tried(linear, terms, chosen, origin)
+            if tried.found:
+                return tried
+            first = first or tried
+            # What does not hold in the other half needs no further test.
+            if not chosen.holds:
+                break
+        return first or Explanation(False, "Nothing that the cell knows of its views explains what is left.")
+
+
+def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) -> Explanation:
+    """A sum that may hold, as an effect among all views."""
+    own, scaled = chosen.ingredients, fitted(linear, terms, chosen.ingredients)
+    values = [coefficient(i, float(x)) for i, x in zip(own, scaled, strict=True)]
+    text = formula_text(own, values)
+    if not chosen.holds:
+        return Explanation(False, _not_held(chosen, text))
+    if any(i.place == "robot" and abs(x) > _MOST for i, x in zip(own, scaled, strict=True)):
+        return Explanation(False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that.")
+    source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
+    scored = _as_effect(linear, source)
+    left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
+    share = left_out.heldout
+    if not left_out.helps or share >= 1:
+        return Explanation(False, f"{text} explains much, but not in views that are left out with their neighbours.")
+    if beyond is not None and not beyond.helps:
+        return Explanation(False, f"{beyond.objection(text)}.")
+    why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
+    return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
 
 
 def _not_held(chosen: Chosen, text: str) -> str:

@@ -79,7 +79,8 @@ class _Asked:
             F = gains[k] / rank / max((rest - gains[k]) / left, 1e-300)
             if f_tail(F, rank, left) > _CHANCE / len(self.addends):
                 break
-            sums.append((*sums[-1], *self.addends[k]))
+            # Addends may share a number: a spring stands alone and with how it stiffens.
+            sums.append(tuple(dict.fromkeys((*sums[-1], *self.addends[k]))))
         return sums
 
     def further(self, basis: Array) -> tuple[Array, Array, Indices, float]:

@@ -52,9 +52,11 @@ def _of_joints(views: Views) -> Iterator[Quantity]:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
         torque, at = views.torques.values[:, k], f"views.torques.values[:, {k}]"
-        yield Quantity(f"τ{name}", at, "N m", "torque", joint, torque)
+        text, spring = f"τ{name}", f"spring under τ{name}"
+        yield Quantity(text, at, "N m", "torque", joint, torque, together=(text, spring))
         code = f"({at} * np.abs({at}))"
-        yield Quantity(f"τ{name}|τ{name}|", code, "(N m)²", "torque", joint, torque * np.abs(torque))
+        yield Quantity(f"{text}|{text}|", code, "(N m)²", "torque", joint, torque * np.abs(torque))
+        yield Quantity(f"{text}³", f"{at} ** 3", "(N m)³", "torque", joint, torque**3, together=(spring,))
 
 
 def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
@@ -87,6 +89,6 @@ def _of_time(views: Views) -> Iterator[Quantity]:
 
 
 def _wave(of: str, code: str, kind: str, joint: int, angle: Array) -> Iterator[Quantity]:
-    """Sine and cosine of an angle (V,)."""
-    yield Quantity(f"sin {of}", f"np.sin({code})", "", kind, joint, np.sin(angle), wave=of)
-    yield Quantity(f"cos {of}", f"np.cos({code})", "", kind, joint, np.cos(angle), wave=of)
+    """Sine and cosine of an angle (V,): of any phase a wave takes both."""
+    yield Quantity(f"sin {of}", f"np.sin({code})", "", kind, joint, np.sin(angle), together=(of,))
+    yield Quantity(f"cos {of}", f"np.cos({code})", "", kind, joint, np.cos(angle), together=(of,))

@@ -35,7 +35,7 @@ class Quantity:
     kind: str  # angle, gear, direction, move, torque, speed, time, course or covariate
     joint: int | None  # that it belongs to, counted from 0
     values: Array  # (V,)
-    wave: str = ""  # of which it is the sine or the cosine: of any phase it takes both
+    together: tuple[str, ...] = ()  # addends that it is a part of, where it is not one alone
     nonlinear: tuple[Nonlinear, ...] = ()
     family: "Family | None" = None  # of the nonlinear parameters' values
 

@@ -26,13 +26,14 @@ from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 
 _FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of a half that are tested in the other
+_TOLD = 6  # sums, the likeliest
 _ENOUGH = 300  # views of a half
 _BLOCKS = 16  # of neighbours in time, for views that share a wandering error which no prior knows
 
 
-def search(linear: LinearModel, terms: Dictionary) -> Chosen | None:
-    """The sum of ingredients at one place that explains most and stands its test best, its places, widths and periods
-    as all views want them; None where no half suggests any."""
+def search(linear: LinearModel, terms: Dictionary) -> list[Chosen]:
+    """Sums of ingredients at one place: those that hold first, the likeliest of them before the others; with places,
+    widths and periods as all views want them."""
     found = list[Chosen]()
     alternate = [_some(half) for half in _alternate(linear)]
     early_late = [_some(half) for half in np.array_split(np.arange(_views(linear)), 2)]
@@ -44,13 +45,11 @@ def search(linear: LinearModel, terms: Dictionary) -> Chosen | None:
                 found += _one_way(linear, terms, some, way)
                 ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
-    if not found:
-        return None
-    # Of sums that hold the one that is likeliest in both halves: each was chosen in one of them.
-    best = max(found, key=lambda c: (c.holds, c.both))
+    # Each was chosen in one half: what both say of it counts.
+    found.sort(key=lambda c: (not c.holds, -c.both))
     every = _some(np.arange(_views(linear)), 2)
     whole = Half(linear.scatter_only, terms, every, np.empty(0, np.int64))
-    return replace(best, ingredients=rounded(refined(best.ingredients, whole)))
+    return [replace(c, ingredients=rounded(refined(c.ingredients, whole))) for c in found[:_TOLD]]
 
 
 def _views(linear: LinearModel) -> int:

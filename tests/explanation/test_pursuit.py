@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from stitch.explanation.pursuit import sums_of
 
@@ -31,12 +32,18 @@ def test_of_a_wave_both_columns_come_together(columns):
     assert (0, 1) in sums_of(columns, z, NUMBERS, addends, 1)
 
 
-def test_a_single_column_is_not_found_in_a_group_that_holds_it(columns):
-    """Where it stands alone too: six numbers more for the same gain."""
-    addends = [(0,), (0, 1, 2, 3, 4, 5)]
-    z = columns[:, 0] + 0.3 * np.random.default_rng(6).standard_normal(NUMBERS)
-    sums = sums_of(columns, z, NUMBERS, addends, 1)
-    assert (0,) in sums and addends[1] not in sums
+def test_a_single_column_is_not_found_in_a_group_that_holds_it():
+    """Where it stands alone too: five numbers more for the same gain, but once in forty (0.05, of two addends)."""
+    addends, widened = [(0,), (0, 1, 2, 3, 4, 5)], 0
+    for seed in range(200):
+        rng = np.random.default_rng([6, seed])
+        columns = rng.standard_normal((NUMBERS, 6))
+        z = columns[:, 0] + 0.3 * rng.standard_normal(NUMBERS)
+        sums = sums_of(columns, z, NUMBERS, addends, 1)
+        assert (0,) in sums
+        widened += addends[1] in sums
+    # The 1e-4 tail of a binomial of 200.
+    assert widened <= binom.isf(1e-4, 200, 0.05 / 2)
 
 
 def test_columns_of_nothing_are_not_chosen(columns):
