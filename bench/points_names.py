@@ -40,7 +40,9 @@ NOTHING, MEMORY = "nothing hidden", "memory"
 LIBRARY = {"one offset": "joint_offset", "offsets": "joint_offset", "gravity": "joint_compliance"}
 LIBRARY |= {"eccentric gear": "gear_eccentricity"}
 BESIDE = " beside dress_pack"
-KINDS = (NOTHING, MEMORY, *UNNAMED, *LIBRARY, *(kind + BESIDE for kind in LIBRARY))
+# These cells are given no torques, without which no spring stiffens.
+OUTSIDE = tuple(law for law in UNNAMED if law != "stiffening")
+KINDS = (NOTHING, MEMORY, *OUTSIDE, *LIBRARY, *(kind + BESIDE for kind in LIBRARY))
 # What a joint is off by, rad; gravity turns joint 2 by so much at a metre's reach.
 _SIZE = 1.5e-4
 
