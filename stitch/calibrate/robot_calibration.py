@@ -1,8 +1,7 @@
-"""Kinematic calibration of a robot: the nominal arm with what a model found, as DH rows and as URDF."""
+"""Kinematic calibration of a robot: the nominal arm with what a model found, and the poses that would tell more."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -45,6 +44,13 @@ def calibrated_arm(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
     return CalibratedRobot(with_geometry(robot, terms), tuple(name for name in of_the_arm if name not in GEOMETRY))
 
 
+def beyond_sentence(found: CalibratedRobot) -> str:
+    """What a table of links cannot hold."""
+    if not found.beyond:
+        return "No other error of the arm was found."
+    return f"Not in it, because no table of links can hold it: {', '.join(found.beyond)}; model.toml has it."
+
+
 def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:
     """The arm with offsets on its joints and errors in its rows, exactly as the effects put them into the chain."""
     values = {term.name: term.arguments for term in terms if term.name in GEOMETRY}
@@ -61,24 +67,6 @@ def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:
         return robot
     errors = {"a": robot.a + links["da"], "alpha": robot.alpha + links["dalpha"], "d": robot.d + links["dd"]}
     return replace(robot, **errors)
-
-
-def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
-    """Rows of [robot] joints in session.toml, angles in degrees; None for an arm that came as URDF."""
-    if robot.a is None or robot.alpha is None or robot.d is None:
-        return None
-    rows = []
-    for i in range(robot.n_joints):
-        row: dict[str, Any] = {
-            "a": float(robot.a[i]),
-            "alpha_deg": float(np.degrees(robot.alpha[i])),
-            "d": float(robot.d[i]),
-            "theta_deg": float(np.degrees(robot.theta[i])),
-        }
-        if robot.mass[i]:
-            row |= {"mass": float(robot.mass[i]), "com": robot.com[i].tolist()}
-        rows.append(row)
-    return rows
 
 
 def poses_to_add(run: Run) -> Array:

@@ -1,7 +1,7 @@
 """The calibrated arm as DH rows and as URDF, with the effects that such tables can hold."""
 
-from stitch.calibrate.robot_calibration import calibrated_arm
-from stitch.calibrate.robot_files import beyond_sentence, robot_toml
+from stitch.calibrate.robot_calibration import CalibratedRobot, beyond_sentence, calibrated_arm
+from stitch.calibrate.robot_table import robot_toml
 from stitch.errors import InputError
 from stitch.export.arm_model import ArmModel
 from stitch.export.text_lines import xml_comment
@@ -14,7 +14,8 @@ def arm_dh(arm: ArmModel) -> str:
     Raises:
         InputError: an arm that came as URDF has no DH rows.
     """
-    table = robot_toml(calibrated_arm(arm.robot, arm.terms))
+    found = calibrated_arm(arm.robot, arm.terms)
+    table = robot_toml(found.robot, ["The [robot] table of session.toml", *_told(arm, found)])
     if table is None:
         raise InputError(f"the arm of session {arm.session} is stated as URDF and has no DH rows; use --to arm-urdf")
     return table
@@ -24,8 +25,18 @@ def arm_urdf(arm: ArmModel) -> str:
     """URDF in m and rad: base_link, link_1 … link_n, flange."""
     found = calibrated_arm(arm.robot, arm.terms)
     declaration, chain = to_urdf(found.robot).split("\n", 1)
-    told = [f"The arm of session {arm.session} with the joint offsets and link errors that were found"]
-    return f"{declaration}\n{xml_comment([*told, beyond_sentence(found)])}{chain}\n"
+    return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_told(arm, found)])}{chain}\n"
+
+
+def _told(arm: ArmModel, found: CalibratedRobot) -> list[str]:
+    """What is in it, what is not, and which command fits a table that stands alone."""
+    told = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(found)]
+    if not found.beyond:
+        return told
+    return [
+        *told,
+        f"Alone these may leave more than the nominal arm; fitted alone: stitch calibrate robot {arm.session}.",
+    ]
 
 
 ARM_FORMATS = {"arm-dh": arm_dh, "arm-urdf": arm_urdf}

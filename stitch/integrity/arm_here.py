@@ -8,13 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtri
 
 from stitch.frames import Array
 from stitch.model.model_toml import ModelFile
 from stitch.stages.finish import per_view_rms
 from stitch.stages.fitted import Fitted
-from stitch.statistics.shares import share_of
+from stitch.statistics.shares import clearly_less
 from stitch.units import length_text
 
 # That an arm which is right is doubted.
@@ -60,21 +59,14 @@ def arm_here(fit: FitWith, arm: ModelFile, found: Fitted) -> ArmHere:
         found: the fit with it.
     """
     own, nominal = _squares(found), _squares(fit(None))
-    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), _less(nominal, own))
+    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), clearly_less(nominal, own, _CHANCE))
     if len(arm.effects) < 2:
         return here
     rest = {name: {e: p for e, p in arm.effects.items() if e != name} for name in arm.effects}
     left = {name: _squares(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
     best = min(left, key=lambda name: _rms(left[name]))
-    less = _less(left[best], own, len(left))
+    less = clearly_less(left[best], own, _CHANCE / len(left))
     return replace(here, better_without=best, without_rms=_rms(left[best])) if less else here
-
-
-def _less(squares: Array, others: Array, tests: int = 1) -> bool:
-    """True if the first are less beyond chance, views as samples and the likeliest of so many tests."""
-    seen = np.isfinite(squares) & np.isfinite(others)
-    share, sigma = share_of(squares[seen], others[seen])
-    return bool(share < 1 - ndtri(1 - _CHANCE / tests) * sigma)
 
 
 def _rms(squares: Array) -> float:

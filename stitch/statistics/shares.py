@@ -1,6 +1,7 @@
 """What one of two models leaves of the mean square error that the other leaves."""
 
 import numpy as np
+from scipy.special import ndtri
 
 from stitch.frames import Array
 
@@ -15,3 +16,16 @@ def share_of(with_it: Array, without: Array) -> tuple[float, float]:
     share = float(with_it.sum() / max(without.sum(), 1e-300))
     spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
     return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
+
+
+def clearly_less(squares: Array, others: Array, chance: float) -> bool:
+    """True if the first are less by more than chance would make them; views where either is not finite do not count.
+
+    Args:
+        squares: (V,) mean square of each view under one model.
+        others: (V,) under another.
+        chance: one-sided, of the normal distribution.
+    """
+    seen = np.isfinite(squares) & np.isfinite(others)
+    share, sigma = share_of(squares[seen], others[seen])
+    return bool(share < 1 - ndtri(1 - chance) * sigma)

@@ -12,7 +12,8 @@ from data_synth.fixtures.labelled_arm import (
     labelled_cell,
 )
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.calibrate.robot_calibration import calibrated, dh_rows
+from stitch.calibrate.robot_calibration import calibrated
+from stitch.calibrate.robot_table import dh_rows
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import capture

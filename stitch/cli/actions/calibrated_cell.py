@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.calibrate.link_table import link_table
 from stitch.calibrate.robot_calibration import calibrated
 from stitch.calibrate.robot_files import document_of as robot_document
 from stitch.calibrate.robot_files import write_robot
@@ -90,9 +91,10 @@ def calibrated_arm(session: Path, output: Path | None, *, force: bool, at_most: 
     target = output or Path("runs") / f"{loaded.name}-robot"
     with run_folder.new_folder(target, [session], force) as scratch:
         run_folder.write_with_page(result, scratch)
-        write_robot(calibrated(result), scratch)
+        table = link_table(loaded)
+        write_robot(table, result, scratch)
         write_diagnosis(diagnosis, state_of(result), scratch)
-    document = robot_document(result, lines, diagnosis.sentence)
+    document = robot_document(result, table, lines, diagnosis.sentence)
     if as_json:
         emit(to_json(document))
     else:

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from stitch.calibrate.robot_calibration import calibrated
-from stitch.calibrate.robot_files import beyond_sentence
+from stitch.calibrate.robot_calibration import beyond_sentence, calibrated
 from stitch.cli.terminal.ledger_summary import show_ledger
 from stitch.runs.run import Run
 from stitch.system.console import console
@@ -19,13 +18,15 @@ def show_robot(result: Run, document: dict[str, Any], lines: list[str], target: 
     for line in lines:
         terminal.print(line, soft_wrap=True)
     show_ledger(result)
-    table = Table(title="Corrected DH rows", title_justify="left")
+    corrected = document["table"]["effects"]
+    table = Table(title="Corrected DH rows" if corrected else "Nominal DH rows", title_justify="left")
     for heading in ("joint", "a", "alpha (°)", "d", "theta (°)"):
         table.add_column(heading, justify="right")
     for i, row in enumerate(document["robot"] or ()):
         table.add_row(str(i + 1), *(f"{row[key]:.5f}" for key in ("a", "alpha_deg", "d", "theta_deg")))
     if document["robot"]:
         terminal.print(table)
+    terminal.print(document["table"]["sentence"], soft_wrap=True)
     terminal.print(beyond_sentence(calibrated(result)), soft_wrap=True)
     for pose in document["next"]:
         told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(pose))

@@ -1,0 +1,47 @@
+"""Tables of links of measured arms: fitted for themselves, read back, judged in views that took no part.
+
+Run: python bench/link_tables.py [--write]; writes the table of docs/points.md. Needs the measured data beside the
+project.
+"""
+
+import argparse
+import re
+import tempfile
+from pathlib import Path
+
+from explained_arm import SHARED, some
+
+from stitch.calibrate.link_table import link_table
+from stitch.reading.session_folder import load_session
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
+MARKS = ("<!-- tables: begin -->", "<!-- tables: end -->")
+# Every how manieth pose: about 600 of each arm.
+SESSIONS = {"irb120-tracker": 1, "ur10-tmac": 1, "ur10-tmac-A": 20, "ur10-tmac-C": 5}
+
+
+def row_of(name: str, every: int, folder: Path) -> str:
+    """One line: what the nominal table leaves, and the fitted one."""
+    session = load_session(SHARED / name if every == 1 else some(name, 0, every, folder / name))
+    found = link_table(session)
+    held = " and ".join(found.effects) or "–"
+    return f"| {name} | {len(session.views)} | {found.nominal_rms:.3f} | {found.heldout_rms:.3f} | {held} |"
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--write", action="store_true", help="put the table into docs/points.md")
+    given = parser.parse_args()
+    lines = ["| session | views | nominal table | fitted table | in it |", "|---|---:|---:|---:|---|"]
+    with tempfile.TemporaryDirectory() as scratch:
+        lines += [row_of(name, every, Path(scratch)) for name, every in SESSIONS.items()]
+    printed = "\n".join(lines)
+    print(printed)
+    if given.write:
+        text, block = PAGE.read_text(encoding="utf-8"), f"{MARKS[0]}\n{printed}\n{MARKS[1]}"
+        PAGE.write_text(re.sub(f"{MARKS[0]}.*{MARKS[1]}", lambda _: block, text, flags=re.S), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
