@@ -15,7 +15,7 @@ import numpy as np
 
 from stitch.measurement.session import Session
 from stitch.model.arm import kept_arm
-from stitch.pipeline import run
+from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
 from stitch.runs.state import state_of
@@ -57,11 +57,14 @@ def main() -> None:
         print(f"{name}: {len(session.views)} poses, {', '.join(result.effects)}, {seconds:.0f} s", flush=True)
     lines.append("| poses judged | arm | rms, mm | on poses left out, mm | U of the hand-eye's turn, mrad |")
     lines.append("|---|---|---:|---:|---:|")
+    effects = sorted({name for result in found.values() for name in result.effects})
+    common = dict(zip(SERIES, run_rig(list(series.values()), effects=effects), strict=True))
     for name, other in zip(SERIES, reversed(SERIES), strict=True):
         session = series[name]
         ways = {
             "nominal": run(session),
             f"of {other} (`--arm`)": run(session, arm=kept_arm(model_of(found[other]))),
+            f"common to both (`run A C`: {', '.join(effects)})": common[name],
             "fitted here": found[name],
         }
         lines += [row(f"{name} | {way}", result) for way, result in ways.items()]

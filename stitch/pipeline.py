@@ -70,12 +70,12 @@ def run_rig(
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         require_measured_once(sessions)
         begun = course.start(sessions, measurements, model)
-        measurements = [about_part(m, begun.T_mount) for m in measurements]
+        measurements = [about_part(m, own.T_mount) for m, own in zip(measurements, begun, strict=True)]
         seconds = clock.lap()
         before = []
-        for session, measurement, recorder in zip(sessions, measurements, recorders, strict=True):
+        for session, measurement, own, recorder in zip(sessions, measurements, begun, recorders, strict=True):
             with mistakes_named(session):
-                before.append(course.begin(measurement, begun, seconds, recorder))
+                before.append(course.begin(measurement, own, seconds, recorder))
         clock.lap()
 
         def with_arm(arm: ModelFile | None) -> BeginAt | None:
@@ -164,7 +164,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
         fitted = course.refit([session], [measurement], model, [state.gate], recorder)
         own = fitted.sessions[0].measurement
         end = End(
-            begun=begun,
+            begun=[begun],
             fitted=fitted,
             seconds=clock.lap(),
             effects_file=state.effects_file,

@@ -1,5 +1,6 @@
 """Which way a run goes, from clouds or from labelled points, and its result collected at the end."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from stitch.measurement.measurement import Measurement
@@ -37,7 +38,7 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
 class End:
     """What all sessions of a rig have in common at the end of the fit."""
 
-    begun: Coarse
+    begun: Sequence[Coarse]  # of every session
     fitted: Fitted
     seconds: float
     effects_file: str | None
@@ -54,15 +55,16 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
     """Register and fuse one session, collect its result with its line in the history, and show it."""
     course, fitted = course_of(session), end.fitted
     finished = course.finish(session, fitted, index, before, recorder, end.seconds)
-    own, model = fitted.sessions[index], fitted.model
-    # With several sessions no joint has one place for all.
-    joints = session.joints if len(fitted.captures) == 1 else None
+    own, model, begun = fitted.sessions[index], fitted.model_of(index), end.begun[index]
+    # Where several sessions share a hand-eye no joint has one place for all.
+    shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
+    joints = session.joints if len(shared) == 1 else None
     result = Run(
         session=session,
         measurement=own.measurement,
         model=model,
-        T_mount_coarse=end.begun.T_mount,
-        unobservable=unobservable(fitted.captures, model.T_mount, session.robot, joints),
+        T_mount_coarse=begun.T_mount,
+        unobservable=unobservable(shared, model.T_mount, session.robot, joints),
         stages=finished.stages,
         poses_model=finished.poses_model,
         poses=finished.poses,
@@ -76,12 +78,12 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         overlaps=finished.overlaps,
         registered=finished.registered,
         verdict=finished.verdict,
-        ledger=(*end.ledger, _step(fitted, finished)),
+        ledger=(*end.ledger, _step(model, finished)),
         effects_file=end.effects_file,
         convergence=finished.convergence,
         notes=(
             *view_notes(end.left_out, end.kept, end.suspected),
-            *course.notes(session, fitted, index, end.begun),
+            *course.notes(session, fitted, index, begun),
             *end.notes,
         ),
         doubts=end.doubts,
@@ -94,12 +96,12 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
     return result
 
 
-def _step(fitted: Fitted, finished: Finished) -> LedgerStep:
+def _step(model: Model, finished: Finished) -> LedgerStep:
     return LedgerStep(
-        effects=tuple(fitted.model.effects),
+        effects=tuple(model.effects),
         residual_rms=finished.residual_rms,
         heldout_rms=finished.heldout_rms,
         noise_floor=finished.noise_floor,
-        T_mount=fitted.model.T_mount,
-        values={term.name: {p.name: p.value for p in term.parameters} for term in fitted.model.terms},
+        T_mount=model.T_mount,
+        values={term.name: {p.name: p.value for p in term.parameters} for term in model.terms},
     )

@@ -1,10 +1,11 @@
 """Hand-eye, places of the targets and effects from labelled points: Gauss–Newton with REML of the poses' scatter."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import covariance_of_fit, kept_root
 from stitch.model.forward import corrected
@@ -16,77 +17,101 @@ from stitch.observations.targets.rows import Rows, rows_of
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.recorder import Recorder
 from stitch.stages.fit import iterate
-from stitch.stages.target_step import Linearised, Step, rms_of_rows
+from stitch.stages.target_step import Linearised, Sighted, Step, rms_of_rows
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.folds import grouped_folds, places
 
 
 @dataclass(frozen=True)
-class _Targets:
-    """The labelled points of one session."""
+class Begun:
+    """One session before the fit: what was measured, and from where its own unknowns begin."""
 
-    measurement: Measurement
-    landmarks: Landmarks  # to begin with
+    measurement: Measurement  # with the sightings that count
+    model: Model  # effects in use with the values to begin with, the same in all sessions
+    landmarks: Landmarks
+
+
+@dataclass(frozen=True)
+class _Targets:
+    """The labelled points of all sessions of an arm."""
+
+    sessions: Sequence[Begun]
     maximum_iterations: int = 12
     converged: float = 0.02
 
     def linearise(self, model: Model, previous: Step | None) -> Linearised:
-        landmarks = self.landmarks if previous is None else previous.landmarks
-        rows = rows_of(corrected(self.measurement, model), model.T_mount, landmarks)
-        start = None if previous is None else previous.variances
-        return Linearised(model, landmarks, rows, effect_columns(rows, self.measurement, model), start)
+        if previous is None:
+            return Linearised([_about(own.measurement, own.model, own.landmarks) for own in self.sessions], None)
+        every = zip(self.sessions, previous.models, previous.landmarks, strict=True)
+        return Linearised([_about(own.measurement, at, landmarks) for own, at, landmarks in every], previous.variances)
 
 
-def fit_targets(
-    measurement: Measurement, model: Model, landmarks: Landmarks, recorder: Recorder | None = None
-) -> TargetFit:
-    """Hand-eye, landmarks and effects together, from a start that is near.
+def _about(measurement: Measurement, model: Model, landmarks: Landmarks) -> Sighted:
+    rows = rows_of(corrected(measurement, model), model.T_mount, landmarks)
+    return Sighted(model, landmarks, rows, effect_columns(rows, measurement, model))
+
+
+def fit_targets(sessions: Sequence[Begun], recorder: Recorder | None = None) -> list[TargetFit]:
+    """Hand-eyes, landmarks and common effects together, from a start that is near; one result a session.
 
     Args:
-        measurement: with the sightings that count.
-        model: effects in use with the values to begin with.
+        sessions: of one arm; their poses scatter alike.
+        recorder: shows the first of them.
     """
 
     def watch(index: int, step: Step) -> None:
         if recorder is not None:
-            poses = step.linearised.rows.capture.poses(step.model.T_mount)
+            poses = step.linearised.sessions[0].rows.capture.poses(step.model.T_mount)
             recorder.iteration("fit", index, poses, step.rms, float("nan"))
 
-    last, history = iterate(_Targets(measurement, landmarks), model, watch)
-    rows, a = last.linearised.rows, last.linearised.base.shape[2]
-    inflation = last.blocks.inflation(places(rows.capture.T_reference_mount, rows.reach), last.covariance)
+    last, history = iterate(_Targets(sessions), sessions[0].model, watch)
+    lin, terms = last.linearised, last.model.terms
+    a = lin.base.shape[2]
+    groups = [at + g for own, at in zip(lin.sessions, lin.begins, strict=True) for g in _places(own.rows)]
+    inflation = last.blocks.inflation(groups, last.covariance)
     covariance = last.covariance * inflation
     # Another run's arm is known to its own sigmas, and errs alike in every view.
-    terms = last.model.terms
-    kept = kept_root(terms, model.effects_covariance)
-    moved = last.blocks.moved_by(last.linearised.columns @ kept)
+    kept = kept_root(terms, sessions[0].model.effects_covariance)
+    moved = last.blocks.moved_by(lin.columns @ kept)
     covariance = covariance + moved @ moved.T
     sigmas = known_sigmas(terms, last.fitted, np.sqrt(np.diag(covariance)[a:]))
-    values = values_of(terms)
-    model = Model(
-        last.model.T_mount,
-        split(terms, values, sigmas),
-        covariance[:6, :6],
-        effects_covariance=covariance_of_fit(terms, last.fitted, covariance[a:, a:], kept),
-    )
-    final = rows_of(corrected(measurement, model), model.T_mount, last.landmarks)
-    return TargetFit(
-        model=model,
-        inflation=inflation,
-        landmarks=last.landmarks,
-        landmarks_covariance=covariance[6:a, 6:a],
-        variances=last.variances,
-        rows=final,
-        heldout=_heldout(rows, last.blocks),
-        history=(*history, rms_of_rows(final)),
-    )
+    found = split(terms, values_of(terms), sigmas)
+    of_effects = covariance_of_fit(terms, last.fitted, covariance[a:, a:], kept)
+    out = list[TargetFit]()
+    for k, (begun, own) in enumerate(zip(sessions, lin.sessions, strict=True)):
+        mine = covariance[lin.own[k], lin.own[k]]
+        model = Model(last.models[k].T_mount, found, mine[:6, :6], effects_covariance=of_effects)
+        final = rows_of(corrected(begun.measurement, model), model.T_mount, last.landmarks[k])
+        out.append(
+            TargetFit(
+                model=model,
+                inflation=inflation,
+                landmarks=last.landmarks[k],
+                landmarks_covariance=mine[6:, 6:],
+                variances=last.variances,
+                rows=final,
+                heldout=_heldout(own.rows, last.blocks, lin.begins[k]),
+                history=(*history, rms_of_rows([final])),
+            )
+        )
+    return out
 
 
-def _heldout(rows: Rows, blocks: Blocks) -> Array:
-    """(V, S) distances of targets whose views were left out with their neighbours in time or pose."""
+def _places(rows: Rows) -> list[Indices]:
+    return places(rows.capture.T_reference_mount, rows.reach)
+
+
+def _heldout(rows: Rows, blocks: Blocks, begins: int) -> Array:
+    """(V, S) distances of targets whose views were left out with their neighbours in time or pose.
+
+    Args:
+        begins: of the session among the blocks of all.
+    """
     square, count = np.zeros((2, *rows.distances(rows.residual).shape))
+    B, m = rows.residual.shape
+    X, z = blocks.X[begins : begins + B, :m], blocks.z[begins : begins + B, :m]
     for fold in grouped_folds(rows.capture.T_reference_mount, rows.reach):
-        residual = rows.residual + blocks.X @ blocks.solve(fold)
+        residual = X @ blocks.solve(begins + fold) - z
         square[fold] += rows.distances(residual)[fold] ** 2
         count[fold] += 1
     with np.errstate(invalid="ignore", divide="ignore"):

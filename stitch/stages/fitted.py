@@ -25,17 +25,24 @@ BeginAt = Callable[[Measurement, Model, float], Model]
 class Fitted:
     """The common model of a rig, and its sessions as they count."""
 
-    model: Model
+    model: Model  # of labelled points, that of the first session
     sessions: list[FittedSession]
     captures: list[Capture]  # without the effects in use
     correction: Correction | None = None  # of surfaces
+
+    def model_of(self, index: int) -> Model:
+        """Of one session: labelled points of an arm share its effects, and each session has its own hand-eye."""
+        own = self.sessions[index].targets
+        return own.model if self.correction is None and own is not None else self.model
 
 
 class Course(Protocol):
     """How a run goes with what was observed; a further kind of observation is one more module with these functions."""
 
-    def start(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> Coarse:
-        """The hand-eye to begin with."""
+    def start(
+        self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+    ) -> list[Coarse]:
+        """The hand-eye of every session to begin with."""
         ...
 
     def begin(self, measurement: Measurement, begun: Coarse, seconds: float, recorder: Recorder) -> StageResult:
@@ -46,7 +53,7 @@ class Course(Protocol):
         self,
         sessions: Sequence[Session],
         measurements: Sequence[Measurement],
-        begun: Coarse,
+        begun: Sequence[Coarse],
         begin_at: BeginAt | None,
         recorder: Recorder,
     ) -> Fitted:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 from stitch.frames import Array
+from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.bound import bound
@@ -32,13 +33,16 @@ from stitch.stages.reuse import reuse
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
 
 
-def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> Coarse:
-    """The hand-eye to begin with: of a model, stated in session.toml, or searched.
+def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> list[Coarse]:
+    """The hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
 
     Raises:
         NoResultError: no hand-eye makes the views overlap.
     """
-    captures = [m.capture for m in measurements]
+    return [_start(sessions, [m.capture for m in measurements], file)] * len(sessions)
+
+
+def _start(sessions: Sequence[Session], captures: Sequence[Capture], file: ModelFile | None) -> Coarse:
     if file:
         return given(captures, file.T_mount, REUSED)
     stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
@@ -57,7 +61,7 @@ def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Rec
 def fit(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
-    begun: Coarse,
+    begun: Sequence[Coarse],
     begin_at: BeginAt | None,
     recorder: Recorder,
 ) -> Fitted:
@@ -70,7 +74,7 @@ def fit(
         def erring(freed: Sequence[FreePoses], T_mount: Array) -> PoseErrors:
             return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
 
-        first = correct(captures, begun.T_mount, begun.gate, recorder, repeating, erring)
+        first = correct(captures, begun[0].T_mount, begun[0].gate, recorder, repeating, erring)
         if begin_at is None:
             return first
         gates = [overlaps.gate for overlaps in first.overlaps]
@@ -140,8 +144,8 @@ def notes(session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[
     return (*warnings(begun, fitted.correction.hand_eye), *more)
 
 
-def _targets(measurement: Measurement, correction: Correction) -> TargetFit | None:
-    return placed_targets(measurement, correction.model, correction.hand_eye.inflation)
+def _targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetFit | None]:
+    return [placed_targets(m, correction.model, correction.hand_eye.inflation) for m in measurements]
 
 
 def _fitted(correction: Correction, sessions: Sequence[FittedSession]) -> Fitted:

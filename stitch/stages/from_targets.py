@@ -1,11 +1,13 @@
 """A run from labelled points or probes alone: how it starts, fits, goes on and ends."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
+from stitch.measurement.sightings import Sightings
 from stitch.model.bound import bound
 from stitch.model.forward import corrected
 from stitch.model.model import Model
@@ -21,21 +23,25 @@ from stitch.runs.run import StageResult
 from stitch.stages.coarse import REUSED, STATED, Coarse
 from stitch.stages.evaluate_targets import evaluate_targets
 from stitch.stages.finish import Finished, finish_targets
-from stitch.stages.fit_targets import fit_targets
+from stitch.stages.fit_targets import Begun, fit_targets
 from stitch.stages.fitted import BeginAt, Fitted
 from stitch.stages.outlier_removal import without_outliers
 from stitch.stages.sentences import target_notes
 
 
-def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> Coarse:
-    """The hand-eye to begin with: of a model, stated in session.toml, or in closed form.
+def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> list[Coarse]:
+    """The hand-eye of each session to begin with: of a model, stated in session.toml, or in closed form.
 
     Raises:
         NoResultError: motions or targets that cannot show the hand-eye.
     """
-    stated = file.T_mount if file else sessions[0].scanner.T_mount
+    return [_start(session, measurement, file) for session, measurement in zip(sessions, measurements, strict=True)]
+
+
+def _start(session: Session, measurement: Measurement, file: ModelFile | None) -> Coarse:
+    stated = file.T_mount if file else session.scanner.T_mount
     if stated is None:
-        return Coarse(closed_form(measurements[0].capture), float("nan"), "found in closed form", ())
+        return Coarse(closed_form(measurement.capture), float("nan"), "found in closed form", ())
     return Coarse(stated, float("nan"), REUSED if file else STATED, ())
 
 
@@ -53,16 +59,18 @@ def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Rec
 def fit(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
-    begun: Coarse,
+    begun: Sequence[Coarse],
     begin_at: BeginAt | None,
     recorder: Recorder,
 ) -> Fitted:
-    """Hand-eye and targets; then, with effects, all of them."""
-    first = refit(sessions, measurements, Model(begun.T_mount), (), recorder)
+    """Hand-eyes and targets; then, with effects that all sessions share, all of them."""
+    first = _refit(sessions, measurements, [Model(own.T_mount) for own in begun], recorder)
     if begin_at is None:
         return first
-    own = first.sessions[0].measurement
-    return refit(sessions, [own], begin_at(own, Model(first.model.T_mount), begun.gate), (), recorder)
+    own = [session.measurement for session in first.sessions]
+    # An event or a time constant is one for all sessions: the first says where it begins.
+    model = begin_at(own[0], Model(first.model_of(0).T_mount), begun[0].gate)
+    return _refit(sessions, own, [replace(model, T_mount=first.model_of(k).T_mount) for k in range(len(own))], recorder)
 
 
 def refit(
@@ -73,28 +81,35 @@ def refit(
     recorder: Recorder,
 ) -> Fitted:
     """Hand-eye, targets and the effects of a model fitted anew from where it stands."""
-    sightings = measurements[0].capture.sightings
-    assert sightings is not None
-    drawing = drawing_of(sessions[0].nominal, sightings)
+    return _refit(sessions, measurements, [model] * len(sessions), recorder)
 
-    def once(measurement: Measurement, before: TargetFit | None) -> TargetFit:
-        begin = model if before is None else before.model
-        landmarks = initial_landmarks(corrected(measurement, begin), begin.T_mount, drawing)
-        return fit_targets(measurement, begin, landmarks, recorder)
+
+def _refit(
+    sessions: Sequence[Session], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
+) -> Fitted:
+    drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
+
+    def once(measurements: Sequence[Measurement], before: list[TargetFit] | None) -> list[TargetFit]:
+        at = models if before is None else [found.model for found in before]
+        every = zip(measurements, at, drawings, strict=True)
+        begun = [Begun(m, own, initial_landmarks(corrected(m, own), own.T_mount, drawn)) for m, own, drawn in every]
+        return fit_targets(begun, recorder)
 
     return _fitted(measurements, once)
 
 
 def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
-    """The session under a model of another run; nothing is fitted but targets that it does not know."""
-    return _fitted(measurements, lambda measurement, _: evaluate_targets(measurement, bound(file, measurement)))
+    """The sessions under a model of another run; nothing is fitted but targets that it does not know."""
+
+    def once(measurements: Sequence[Measurement], _: list[TargetFit] | None) -> list[TargetFit]:
+        return [evaluate_targets(m, bound(file, m)) for m in measurements]
+
+    return _fitted(measurements, once)
 
 
 def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
     """Labelled points as they are."""
-    sightings = measurement.capture.sightings
-    assert sightings is not None
-    return target_model(measurement, model, drawing_of(session.nominal, sightings))
+    return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
 
 
 def finish(
@@ -113,9 +128,14 @@ def notes(session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[
     return target_notes(own.targets, own.outliers, session)
 
 
-def _fitted(measurements: Sequence[Measurement], once: Callable[[Measurement, TargetFit | None], TargetFit]) -> Fitted:
-    def fit_all(measurements: Sequence[Measurement], before: TargetFit | None) -> TargetFit:
-        return once(measurements[0], before)
+def _fitted(
+    measurements: Sequence[Measurement],
+    once: Callable[[Sequence[Measurement], list[TargetFit] | None], list[TargetFit]],
+) -> Fitted:
+    found, sessions = without_outliers(measurements, once, lambda _, found: found)
+    return Fitted(found[0].model, sessions, [own.rows.capture for own in found])
 
-    found, sessions = without_outliers(measurements, fit_all, lambda _, found: found)
-    return Fitted(found.model, sessions, [found.rows.capture])
+
+def _sightings(measurement: Measurement) -> Sightings:
+    assert measurement.capture.sightings is not None
+    return measurement.capture.sightings

@@ -28,13 +28,13 @@ class FittedSession:
 def without_outliers(
     measurements: Sequence[Measurement],
     fit: Callable[[Sequence[Measurement], Found | None], Found],
-    targets_of: Callable[[Measurement, Found], TargetFit | None],
+    targets_of: Callable[[Sequence[Measurement], Found], Sequence[TargetFit | None]],
 ) -> tuple[Found, list[FittedSession]]:
     """Fit, take out the labelled points that contradict the rest, and again, until none does.
 
     Args:
         fit: from the measurements, and what the round before found, to what is found.
-        targets_of: the labelled points of one session under that.
+        targets_of: the labelled points of every session under that.
 
     Raises:
         NoResultError: more than a third of the labelled points of a session would have to go.
@@ -45,7 +45,7 @@ def without_outliers(
     found: Found | None = None
     while True:
         found = fit(measurements, found)
-        targets = [targets_of(m, found) for m in measurements]
+        targets = targets_of(measurements, found)
         worse = [find_outliers(t.rows, t.variances) if t else [] for t in targets]
         if not any(worse):
             fitted = zip(measurements, targets, taken, strict=True)

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from stitch.effects.in_session import known, parameters_in, require
 from stitch.errors import InputError
 from stitch.measurement.measurement import Measurement
@@ -32,10 +34,29 @@ def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> No
     for session in sessions:
         if not session.has_clouds and not session.has_sightings:
             raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
-        if not session.has_clouds and len(sessions) > 1:
-            raise InputError(f"{session.path}: sessions without clouds run one by one; use --hand-eye for the next")
+        if session.has_clouds != first.has_clouds:
+            clouds, points = (first, session) if first.has_clouds else (session, first)
+            raise InputError(
+                f"{clouds.path} has clouds and {points.path} labelled points alone; to fix: run them apart, one with "
+                "the model of the other (--hand-eye, --arm)"
+            )
+        if not session.has_clouds:
+            _require_same_arm(first, session)
         if len(session.views) < 2:
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
+
+
+def _require_same_arm(first: Session, other: Session) -> None:
+    """Sessions of labelled points share an arm; its loads may differ."""
+    a, b = first.robot, other.robot
+    if a is None or b is None:
+        return
+    rows = ((x.before, x.after, x.theta) for x in (a, b))
+    if a.n_joints != b.n_joints or not all(np.allclose(x, y) for x, y in zip(*rows, strict=True)):
+        raise InputError(
+            f"{other.path}: its [robot] is another arm than that of {first.path}; only sessions of one arm share its "
+            "effects; to fix: state the same rows, or run them apart"
+        )
 
 
 def require_measured_once(sessions: Sequence[Session]) -> None:

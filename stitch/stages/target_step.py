@@ -1,111 +1,184 @@
-"""One step of the fit to labelled points: Gauss–Newton over rows about a model, with REML of the poses' scatter."""
+"""One step of the fit to labelled points: Gauss–Newton over rows about a model, with REML of the poses' scatter.
 
-from dataclasses import dataclass
+Sessions of one arm share its effects and its scatter; each has a hand-eye and targets of its own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from stitch.frames import Array, Mask, exp
 from stitch.model.model import Model
-from stitch.model.term import sizes_of, split, stacked, values_of
+from stitch.model.term import Term, sizes_of, split, stacked, values_of
 from stitch.observations.targets.landmarks import Landmarks
 from stitch.observations.targets.rows import Rows, mixed_model_of_rows
 from stitch.observations.targets.target_fit import rms_of
 from stitch.stages.fit import WEAK, fitted_parameters
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.parameter_selection import Whitened
+from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.statistics.stacked_blocks import mixed_of_all, one_below_the_other, side_by_side
 from stitch.statistics.variance_components import fit_variances, whitener
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """The labelled points of one session about its model; P parameters of effects, the same in all sessions."""
+
+    model: Model
+    landmarks: Landmarks
+    rows: Rows
+    columns: Array  # (B, m, P)
+
+    @property
+    def base(self) -> Array:
+        """(B, m, a) columns of hand-eye and landmarks."""
+        return np.concatenate([self.rows.hand_eye, self.rows.landmarks], axis=2)
+
+    @property
+    def unknowns(self) -> int:
+        """Of the session alone."""
+        return 6 + int(self.rows.landmarks.shape[2])
+
+    def moved(self, x: Array, terms: tuple[Term, ...]) -> tuple[Model, Landmarks]:
+        """Model and landmarks after a step x (a,) of its own unknowns, with the effects as they are then."""
+        return Model(self.model.T_mount @ exp(x[:6]), terms), self.landmarks.moved(x[6:])
 
 
 @dataclass(frozen=True)
 class Step:
     """Where a step ended, and from where it came."""
 
-    model: Model
+    models: list[Model]  # of each session
     moved: float  # of all unknowns, sigmas
-    landmarks: Landmarks
+    landmarks: list[Landmarks]
     linearised: "Linearised"
     fitted: Mask  # (P,) parameters of the effects
     blocks: Blocks
-    covariance: Array  # of all unknowns
+    covariance: Array  # of all unknowns: those of each session, then the effects
     variances: Array  # (3,)
+
+    @property
+    def model(self) -> Model:
+        """Of the first session; the effects are those of all."""
+        return self.models[0]
 
     @property
     def rms(self) -> float:
         """3D, before the step."""
-        return rms_of_rows(self.linearised.rows)
+        return rms_of_rows([own.rows for own in self.linearised.sessions])
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Rows of targets about a model; P parameters of effects."""
+    """Rows of targets of all sessions about their models."""
 
-    model: Model
-    landmarks: Landmarks
-    rows: Rows
-    columns: Array  # (B, m, P)
+    sessions: list[Sighted]
     start: Array | None  # (3,) variances of the step before
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Effects in use."""
+        return self.sessions[0].model.terms
 
     @cached_property
     def base(self) -> Array:
-        """(B, m, a) columns of hand-eye and landmarks."""
-        return np.concatenate([self.rows.hand_eye, self.rows.landmarks], axis=2)
+        """(B, m, a) columns of every session's hand-eye and landmarks."""
+        return side_by_side([own.base for own in self.sessions])
+
+    @cached_property
+    def columns(self) -> Array:
+        """(B, m, P) of the effects."""
+        return one_below_the_other([own.columns for own in self.sessions])
 
     @cached_property
     def values(self) -> Array:
         """(P,) of the effects at which the rows were taken."""
-        return values_of(self.model.terms)
+        return values_of(self.terms)
 
     @cached_property
     def sizes(self) -> Array:
         """(P,) plausible ones."""
-        return sizes_of(self.model.terms)
+        return sizes_of(self.terms)
+
+    @property
+    def own(self) -> list[slice]:
+        """Each session's own unknowns among all."""
+        ends = [int(n) for n in np.cumsum([0, *(own.unknowns for own in self.sessions)])]
+        return [slice(begin, end) for begin, end in pairwise(ends)]
+
+    @property
+    def begins(self) -> list[int]:
+        """Of each session's blocks among all."""
+        return [int(n) for n in np.cumsum([0, *(len(own.columns) for own in self.sessions)])[:-1]]
 
     def choose(self, before: Mask | None) -> Mask:
         """(P,) the parameters that the views ask for, those of before first."""
         before = np.zeros(len(self.values), bool) if before is None else before
-        return fitted_parameters(self.model.terms, before, self._whitened)
+        return fitted_parameters(self.terms, before, self._whitened)
 
     def solve(self, choice: Mask) -> Step:
         """The step, with the variances of scatter and noise estimated anew."""
-        X = np.concatenate([self.base, self.columns[..., choice]], axis=2)
-        variances = self._variances(X)
-        blocks = self._blocks(X, self.sizes[choice], self.values[choice], variances)
+        held = np.array([p.held for p in stacked(self.terms)], bool)
+        # What the views cannot see goes to zero, and the rest must make up for it; the time of an event stays.
+        stays = held | choice
+        mixed = self._mixed(np.concatenate([self.base, self.columns[..., choice]], axis=2))
+        mixed = replace(mixed, z=mixed.z + self.columns[..., ~stays] @ self.values[~stays])
+        variances = self._variances(mixed)
+        blocks = self._blocks(mixed, self.sizes[choice], self.values[choice], variances)
         x, covariance, a = blocks.solve(), blocks.estimates_covariance(), self.base.shape[2]
-        held, values = np.array([p.held for p in stacked(self.model.terms)], bool), self.values.copy()
-        # What the views cannot see stays at zero; the time of an event stays where it was found.
-        values[np.logical_not(held | choice)] = 0.0
+        values = np.where(stays, self.values, 0.0)
         values[choice] += x[a:]
-        model = Model(self.model.T_mount @ exp(x[:6]), split(self.model.terms, values))
         moved = float(np.max(np.abs(x) / np.sqrt(np.maximum(np.diag(covariance), 1e-300))))
-        landmarks = self.landmarks.moved(x[6:a])
-        return Step(model, moved, landmarks, self, choice, blocks=blocks, covariance=covariance, variances=variances)
+        terms = split(self.terms, values)
+        every = [session.moved(x[own], terms) for session, own in zip(self.sessions, self.own, strict=True)]
+        return Step(
+            models=[model for model, _ in every],
+            moved=moved,
+            landmarks=[landmarks for _, landmarks in every],
+            linearised=self,
+            fitted=choice,
+            blocks=blocks,
+            covariance=covariance,
+            variances=variances,
+        )
 
-    def _variances(self, A: Array) -> Array:
-        """(3,) by REML with the columns A (B, m, a) as free mean."""
-        mixed = mixed_model_of_rows(self.rows, A)
+    def _mixed(self, A: Array) -> MixedModel:
+        """With the columns A (B, m, a) as free mean."""
+        every = []
+        for session, begin in zip(self.sessions, self.begins, strict=True):
+            B, m = session.rows.residual.shape
+            every.append(mixed_model_of_rows(session.rows, A[begin : begin + B, :m]))
+        return mixed_of_all(every, A)
+
+    def _variances(self, mixed: MixedModel) -> Array:
+        """(3,) by REML."""
         return fit_variances(mixed, start=self.start, both_starts=self.start is None).variances
 
     def _whitened(self, free: Mask) -> Whitened:
-        mixed = mixed_model_of_rows(self.rows, self.base)
-        half = whitener(mixed, self._variances(np.concatenate([self.base, self.columns[..., free]], axis=2)))
+        mixed = self._mixed(self.base)
+        beside = self._mixed(np.concatenate([self.base, self.columns[..., free]], axis=2))
+        half = whitener(mixed, self._variances(beside))
         z = (mixed.z + self.columns @ self.values)[..., None]
-        n = self.rows.residual.size
+        n = mixed.z.size
         base, further, seen = ((half @ c).reshape(n, c.shape[2]) for c in (self.base, self.columns, z))
         return Whitened(base, further, seen[:, 0])
 
-    def _blocks(self, X: Array, sizes: Array, values: Array, variances: Array) -> Blocks:
+    def _blocks(self, mixed: MixedModel, sizes: Array, values: Array, variances: Array) -> Blocks:
         """The step's normal equations; the prior of the effects is about zero, not about their present values."""
-        mixed = mixed_model_of_rows(self.rows, X)
-        distance = float(np.median(np.linalg.norm(np.concatenate(self.rows.capture.point_sets), axis=1)))
-        unknown = X.shape[2] - len(sizes)
-        # One radian and one working distance: keeps the unseen finite, moves nothing else.
-        far = np.concatenate([[1.0] * 3, [distance] * (unknown - 3)])
+        far = []
+        for own in self.sessions:
+            distance = float(np.median(np.linalg.norm(np.concatenate(own.rows.capture.point_sets), axis=1)))
+            # One radian and one working distance: keeps the unseen finite, moves nothing else.
+            far += [1.0] * 3 + [distance] * (own.unknowns - 3)
         precision = np.concatenate([far, WEAK * sizes]) ** -2.0
-        pull = np.concatenate([np.zeros(unknown), -values * precision[unknown:]])
-        return Blocks(mixed.z, X, mixed.covariance(variances), precision, pull)
+        pull = np.concatenate([np.zeros(len(far)), -values * precision[len(far) :]])
+        return Blocks(mixed.z, mixed.A, mixed.covariance(variances), precision, pull)
 
 
-def rms_of_rows(rows: Rows) -> float:
+def rms_of_rows(rows: Sequence[Rows]) -> float:
     """3D distance of the targets from where they are, length_unit."""
-    return rms_of(rows.distances(rows.residual))
+    return rms_of(np.concatenate([own.distances(own.residual).ravel() for own in rows]))

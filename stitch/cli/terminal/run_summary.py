@@ -36,9 +36,13 @@ def show(runs: list[Run], target: Path, tolerance: float | None = None, says_nex
         for line in (*hidden, *result.notes[len(result.left_out) :]):
             terminal.print(line, soft_wrap=True)
         terminal.print(_errors(result), soft_wrap=True)
-    # One rig has one hand-eye.
-    for line in hand_eye_lines(runs[0].T_mount, runs[0].mount_covariance, runs[0].session.mount, _unit(runs[0])):
-        terminal.print(line, soft_wrap=True)
+    # Clouds of one rig have one hand-eye, labelled points of one arm each their own.
+    own = len(runs) > 1 and not runs[0].session.has_clouds
+    for result in runs if own else runs[:1]:
+        if own:
+            terminal.print(f"{result.session.name}:", soft_wrap=True)
+        for line in hand_eye_lines(result.T_mount, result.mount_covariance, result.session.mount, _unit(result)):
+            terminal.print(line, soft_wrap=True)
     folders = [target] if len(runs) == 1 else [target / result.session.name for result in runs]
     _files(terminal, folders)
     if says_next:
