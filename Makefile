@@ -64,13 +64,14 @@ endif
 	$(PYTHON) -m bench.docs_site
 	$(VENV)/bin/zensical build --clean --strict --config-file mkdocs.yml
 
-# Pins every package with hashes. What other indexes or settings of this machine might write into it is refused.
+# Pins every package with hashes, with its extras: pip takes the newest of a package whose extra alone is asked for, and
+# finds no hash for it. What other indexes or settings of this machine might write into it is refused.
 lock:
 	@command -v uv >/dev/null || { echo "make lock needs uv" >&2; exit 2; }
 	uv pip compile pyproject.toml constraints.in --extra dev --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints.txt
+		--no-strip-extras --no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints.txt
 	uv pip compile pyproject.toml --extra docs --universal --python-version 3.11 --generate-hashes --constraint constraints.txt \
-		$$(sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' constraints.txt) \
+		$$(sed -nE 's/^([a-z0-9-]+)(\[.*\])?==.*/--no-emit-package \1/p' constraints.txt) \
 		--no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints-docs.txt
 	@! grep -nE '://| @ |^-' constraints.txt constraints-docs.txt || { echo "they name an address" >&2; exit 1; }
 
