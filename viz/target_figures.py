@@ -39,7 +39,7 @@ def errors(run: Run) -> Figure:
     distances = rows.distances(rows.residual) * um
     figure = Figure(figsize=(9, 2.8), layout="constrained")
     course, share = figure.subplots(1, 2, width_ratios=[2, 1])
-    course.plot(np.nanmax(distances, axis=1), ".", ms=2, color=BLUE)
+    course.plot(np.fmax.reduce(distances, axis=1), ".", ms=2, color=BLUE)
     course.set(xlabel="view", ylabel="farthest target (µm)", ylim=(0, None))
     for values, colour, name in ((distances, BLUE, "in the fit"), (run.targets.heldout * um, ORANGE, "left out")):
         ordered = np.sort(values[np.isfinite(values)])

@@ -48,6 +48,8 @@ def _agreement(run: Run, history: ModelHistory | None) -> str:
     unit = run.session.length_unit
     if history is not None:
         return plain_verdict(history, unit)
+    if run.targets is not None and run.targets.shows_nothing:
+        return "Every target is seen in one view alone, so that the views cannot disagree."
     now, floor = (length_text(x, unit) for x in (run.residual_rms, run.noise_floor))
     rest = f"rms over all views; the sensor's noise alone would leave {floor}."
     changes = [change_of(run.ledger, i) for i in range(1, len(run.ledger))]
@@ -61,12 +63,12 @@ def _agreement(run: Run, history: ModelHistory | None) -> str:
 def run_light(run: Run, history: ModelHistory | None, tolerance: float) -> Judged | None:
     """Whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
 
-    None where neither surfaces nor targets were fitted.
+    None where neither surfaces nor targets say anything of it.
     """
     unit = run.session.length_unit
     if history is not None:
         return judged(history, tolerance, unit)
-    if run.targets is None:
+    if run.targets is None or run.targets.shows_nothing:
         return None
     rows = run.targets.rows
     reach = float(np.nanquantile(rows.distances(rows.residual), 0.95))

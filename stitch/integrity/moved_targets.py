@@ -102,7 +102,7 @@ def _steps_of_means(off: Array) -> Array:
     n, m = np.where(known, before, 1.0), np.where(known, after, 1.0)
     squares = known * (sums / n - (clipped.sum(axis=0) - sums) / m) ** 2 / (1 / n + 1 / m)
     few = known.sum(axis=1) < _TARGETS - 1
-    return np.where(few, 0.0, np.sqrt(squares.mean(axis=1)))
+    return np.where(few, 0.0, np.sqrt(squares.sum(axis=1) / max(off.shape[1], 1)))
 
 
 def _step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.session import Session
 from stitch.units import METRES
@@ -51,11 +50,7 @@ class Sightings:
 
 
 def sightings_of(session: Session) -> Sightings | None:
-    """All labelled points of a session, its views in order; None without any.
-
-    Raises:
-        NoResultError: no target is seen in two views, so that nothing has to agree.
-    """
+    """All labelled points of a session, its views in order; None without any."""
     seen = [view.sighting for view in session.views]
     names = sorted({name for s in seen if s is not None for name in s.targets})
     if not names:
@@ -74,8 +69,6 @@ def sightings_of(session: Session) -> Sightings | None:
     usual = _USUAL_SIGMA_M / metres if session.scanner.noise is None else session.scanner.noise
     sigma = np.where(np.isnan(sigma), usual, sigma)
     found = Sightings(tuple(names), target, points, sigma, target >= 0)
-    if found.seen.max() < 2:
-        raise NoResultError(f"{session.path}: no target is seen in two views; nothing shows whether the poses agree")
     if not any(s is not None and s.rotation is not None for s in seen):
         return found
     turn = np.where(np.isnan(turn), sigma[:, 0] * metres / _PROBE_LEVER_M, turn)

@@ -15,15 +15,25 @@ def kept_arm(file: ModelFile) -> ModelFile:
     Raises:
         InputError: an effect that is not known, or none of the arm.
     """
-    effects = {
-        name: {key: replace(p, kept=True) for key, p in own.items()}
-        for name, own in file.effects.items()
-        if known(name).place in ARM
-    }
-    if not effects:
+    found = arm_in(file)
+    if found is None:
         used = ", ".join(file.effects) or "none"
         raise InputError(
             f"--arm: the model has no effect of joints or links (its effects: {used}); to fix: name the run of a "
             "session that showed them, after `stitch add`"
         )
-    return replace(file, effects=effects, targets={})
+    return found
+
+
+def arm_in(file: ModelFile) -> ModelFile | None:
+    """The same; None without an effect of the arm.
+
+    Raises:
+        InputError: an effect that is not known.
+    """
+    effects = {
+        name: {key: replace(p, kept=True) for key, p in own.items()}
+        for name, own in file.effects.items()
+        if known(name).place in ARM
+    }
+    return replace(file, effects=effects, targets={}) if effects else None

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from stitch.errors import NoResultError
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.measurement.sightings import Sightings
@@ -33,12 +34,17 @@ def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file
     """The hand-eye of each session to begin with: of a model, stated in session.toml, or in closed form.
 
     Raises:
-        NoResultError: motions or targets that cannot show the hand-eye.
+        NoResultError: motions or targets that cannot show the hand-eye; without a model, no target that is seen twice.
     """
     return [_start(session, measurement, file) for session, measurement in zip(sessions, measurements, strict=True)]
 
 
 def _start(session: Session, measurement: Measurement, file: ModelFile | None) -> Coarse:
+    if file is None and _sightings(measurement).seen.max() < 2:
+        raise NoResultError(
+            f"{session.path}: no target is seen in two views; nothing shows whether the poses agree; to fix: with the "
+            "model of another run (--hand-eye) they are put in their places"
+        )
     stated = file.T_mount if file else session.scanner.T_mount
     if stated is None:
         return Coarse(closed_form(measurement.capture), float("nan"), "found in closed form", ())

@@ -49,6 +49,8 @@ def target_sentence(found: TargetFit, registered: float, scatter: Repeatability,
     """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
     floor = found.noise_floor
     left, out, noise = (length_text(x, length_unit, 4) for x in (found.rms, found.heldout_rms, floor))
+    if found.shows_nothing:
+        return "No target is seen in two views: they lie where the model puts them, and nothing shows how well."
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (
@@ -165,10 +167,8 @@ def _left_out(found: TargetFit, outliers: Sequence[Outlier], session: Session) -
         ]
         more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""
         notes.append(f"Not used, because they contradict the rest: {', '.join(named_outliers[:_LISTED])}{more}.")
-    sightings = found.rows.sightings
-    once = [name for name, n in zip(sightings.targets, sightings.seen, strict=True) if n < 2]
-    if once:
-        notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(once)}.")
+    if found.alone and not found.shows_nothing:
+        notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(found.alone)}.")
     return notes
 
 

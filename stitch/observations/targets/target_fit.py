@@ -46,6 +46,18 @@ class TargetFit:
         return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)])
 
     @property
+    def alone(self) -> tuple[str, ...]:
+        """Targets that say nothing of the poses: fewer than two views show them, and no other run knows them."""
+        s = self.rows.sightings
+        few = [name for name, n in zip(s.targets, s.seen, strict=True) if n < 2]
+        return tuple(name for name in few if name not in self.model.targets)
+
+    @property
+    def shows_nothing(self) -> bool:
+        """True if no target says anything of the poses."""
+        return len(self.alone) == len(self.rows.sightings.targets)
+
+    @property
     def landmark_sigmas(self) -> Array:
         """(K, 3) of the targets' places."""
         K = len(self.landmarks.positions)
