@@ -20,18 +20,24 @@ _STRETCHES = (0.06, 0.12, 0.2)
 _PERIODS = (3, 4, 5, 6, 7, 8)
 _WIDTH, _APART = 0.2, 0.15
 # Play of a gear with friction, as a share of the range that the joint was driven over.
-_PLAYS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
+_PLAYS = (0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4)
 _STILL = 1e-9
+_SPRING = "spring under"  # label of what comes together: its zero, its pull, and how that stiffens
 
 
 def quantities(views: Views) -> list[Quantity]:
-    """All factors that differ from view to view."""
+    """All factors: what differs from view to view, and one that does not."""
     found = [*_of_joints(views), *_of_time(views)]
     found += [
         Quantity(name, f'views.since_first("{name}")', name, "covariate", None, views.since_first(name))
         for name in views.covariates
     ]
-    return [q for q in found if np.isfinite(q.values).all() and np.ptp(q.values) > _STILL]
+    # Where the law of a joint has its zero nobody knows.
+    springs = tuple(label for q in found for label in q.together if label.startswith(_SPRING))
+    zero = Quantity(
+        "1", "np.ones(views.count)", "", "constant", None, np.ones(views.count), ("1", *dict.fromkeys(springs))
+    )
+    return [zero, *(q for q in found if np.isfinite(q.values).all() and np.ptp(q.values) > _STILL)]
 
 
 def _of_joints(views: Views) -> Iterator[Quantity]:
@@ -52,7 +58,7 @@ def _of_joints(views: Views) -> Iterator[Quantity]:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
         torque, at = views.torques.values[:, k], f"views.torques.values[:, {k}]"
-        text, spring = f"τ{name}", f"spring under τ{name}"
+        text, spring = f"τ{name}", f"{_SPRING} τ{name}"
         yield Quantity(text, at, "N m", "torque", joint, torque, together=(text, spring))
         code = f"({at} * np.abs({at}))"
         yield Quantity(f"{text}|{text}|", code, "(N m)²", "torque", joint, torque * np.abs(torque))

@@ -32,7 +32,7 @@ class Quantity:
     text: str  # for people
     code: str  # of numpy, of `views`
     unit: str  # "" without one
-    kind: str  # angle, gear, direction, move, torque, speed, time, course or covariate
+    kind: str  # constant, angle, gear, direction, move, torque, speed, time, course or covariate
     joint: int | None  # that it belongs to, counted from 0
     values: Array  # (V,)
     together: tuple[str, ...] = ()  # addends that it is a part of, where it is not one alone
