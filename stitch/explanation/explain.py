@@ -62,7 +62,8 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
     text = formula_text(own, values)
     if not chosen.holds:
         return Explanation(False, _not_held(chosen, text))
-    if any(i.place == "robot" and abs(x) > _MOST for i, x in zip(own, scaled, strict=True)):
+    turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
+    if own[0].place == "robot" and max(turns) > _MOST:
         return Explanation(False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that.")
     source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
     scored = _as_effect(linear, source)

@@ -44,6 +44,11 @@ class Quantity:
         """True if it follows time, or something that may move with it."""
         return any(kind in self.kind.split("·") for kind in ("time", "course", "covariate"))
 
+    @property
+    def bounded(self) -> bool:
+        """True if it is one at the most, in views that nobody has measured too."""
+        return set(self.kind.split("·")) <= {"constant", "angle", "gear", "direction"}
+
     def times(self, other: "Quantity") -> "Quantity":
         """The product; it belongs to no joint."""
         unit = " ".join(sorted(u for u in (self.unit, other.unit) if u))
