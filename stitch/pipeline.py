@@ -10,7 +10,7 @@ from stitch.diagnosis.initial_values import with_effects
 from stitch.integrity.admission import doubts
 from stitch.integrity.admitted_fit import Admitted, admitted_fit
 from stitch.integrity.arm_here import arm_here
-from stitch.integrity.model_here import models_here
+from stitch.integrity.model_here import held_against_own
 from stitch.integrity.refusals import mistakes_named
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.measurement import about_part, measurement_of
@@ -23,7 +23,7 @@ from stitch.runs.run import Run, StageResult
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
 from stitch.stages.course import End, collected, course_of
-from stitch.stages.fitted import BeginAt, Fitted
+from stitch.stages.fitted import BeginAt, Course, Fitted
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
@@ -89,21 +89,20 @@ def run_rig(
             fit = partial(course.fit, begun=begun, begin_at=with_arm(arm), recorder=recorders[0])
         found = admitted_fit(sessions, measurements, fit, keep)
         end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
-        doubted: Sequence[tuple[str, ...]] = [()] * len(sessions)
         if model and not sessions[0].has_clouds:
-
-            def fit_here() -> Fitted:
-                anew = course.start(found.sessions, found.measurements, None)
-                begin_at = with_arm(arm_in(model))
-                return course.fit(found.sessions, found.measurements, anew, begin_at=begin_at, recorder=Silent())
-
-            doubted = models_here(found.sessions, found.fitted, fit_here)
+            found = held_against_own(found, partial(_fitted_here, course, found, with_arm(arm_in(model))))
         if arm:
             again = partial(course.fit, found.sessions, found.measurements, begun, recorder=Silent())
             here = arm_here(lambda other: again(begin_at=with_arm(other)), arm, found.fitted)
             told = (here.sentence(sessions[0].length_unit),)
             end = replace(end, notes=told) if here.holds else replace(end, doubts=told)
-        return _of_each(sessions, found, end, before, recorders, keep, doubted)
+        return _of_each(sessions, found, end, before, recorders, keep)
+
+
+def _fitted_here(course: Course, found: Admitted, begin_at: BeginAt | None) -> Fitted:
+    """Hand-eye and targets from the sessions themselves."""
+    begun = course.start(found.sessions, found.measurements, None)
+    return course.fit(found.sessions, found.measurements, begun, begin_at, Silent())
 
 
 def _of_each(
@@ -113,7 +112,6 @@ def _of_each(
     before: Sequence[StageResult],
     recorders: Sequence[Recorder],
     keep: bool,
-    doubted: Sequence[tuple[str, ...]],
 ) -> list[Run]:
     """One run per session, with what is said of it alone."""
     runs = []
@@ -122,7 +120,7 @@ def _of_each(
             recorders[i].start(session)
         out, kept = ((), own.left_out) if keep else (own.left_out, ())
         last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
-        last = replace(last, doubts=(*end.doubts, *own.doubts, *doubted[i]))
+        last = replace(last, doubts=(*end.doubts, *own.doubts))
         runs.append(collected(session, i, last, before[i], recorders[i]))
     return runs
 

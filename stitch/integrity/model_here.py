@@ -4,14 +4,15 @@ Another day the tracker may stand elsewhere, the tool be mounted anew, a ball of
 what is left is no error of the arm. Hand-eye and targets fitted here say so, within what both are known to.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
+from stitch.integrity.admitted_fit import Admitted
 from stitch.integrity.arm_here import squares_of_targets
 from stitch.integrity.arm_limits import beyond_any_arm
 from stitch.measurement.session import Session
@@ -51,15 +52,14 @@ class ModelHere:
             told.append(f"{names} lie elsewhere than in the other run, by up to {away}")
         return (
             f"{'; '.join(told)} (targets are {off} off with it, {own} with what this session shows itself); to fix: "
-            "keep its arm alone (--arm), or give targets that moved another name"
+            "run without --hand-eye, keep the arm alone (--arm), or give targets that moved another name"
         )
 
 
-def models_here(sessions: Sequence[Session], applied: Fitted, fit: Callable[[], Fitted]) -> list[tuple[str, ...]]:
-    """What to doubt of each session.
+def held_against_own(found: Admitted, fit: Callable[[], Fitted]) -> Admitted:
+    """Sessions under the model of another run, with what is to be doubted of it in each.
 
     Args:
-        applied: under the model of the other run.
         fit: hand-eye and targets fitted here, with the arm of that run.
 
     Raises:
@@ -68,13 +68,14 @@ def models_here(sessions: Sequence[Session], applied: Fitted, fit: Callable[[], 
     try:
         own: list[FittedSession | None] = [*fit().sessions]
     except NoResultError:
-        own = [None] * len(sessions)
-    every = zip(sessions, applied.sessions, own, strict=True)
-    return [(told,) if (told := _model_here(*one)) else () for one in every]
+        own = [None] * len(found.sessions)
+    every = zip(found.admissions, found.sessions, found.fitted.sessions, own, strict=True)
+    doubted = [replace(a, doubts=(*a.doubts, *_doubts(session, there, here))) for a, session, there, here in every]
+    return replace(found, admissions=doubted)
 
 
-def _model_here(session: Session, applied: FittedSession, own: FittedSession | None) -> str | None:
-    """What to doubt; None where the other run holds."""
+def _doubts(session: Session, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
+    """What to doubt; nothing where the other run holds."""
     there = applied.targets
     assert there is not None
     beyond = beyond_any_arm(session, *np.sqrt(there.variances[:2]))
@@ -83,14 +84,14 @@ def _model_here(session: Session, applied: FittedSession, own: FittedSession | N
         told = found.sentence(session.length_unit)
         if beyond:
             raise NoResultError(f"{session.path}: {told}")
-        return f"{told[0].upper()}{told[1:]}."
+        return (f"{told[0].upper()}{told[1:]}.",)
     if beyond and own is None:
         off = length_text(there.rms, session.length_unit)
         raise NoResultError(
             f"{session.path}: under the model of the other run the targets lie {off} off, which no arm does; to fix: "
             "name a run of the same set-up, or keep its arm alone (--arm)"
         )
-    return None
+    return ()
 
 
 def _compared(applied: FittedSession, own: FittedSession) -> ModelHere | None:

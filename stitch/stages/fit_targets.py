@@ -17,7 +17,8 @@ from stitch.observations.targets.rows import Rows, rows_of
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.recorder import Recorder
 from stitch.stages.fit import iterate
-from stitch.stages.target_step import Linearised, Sighted, Step, rms_of_rows
+from stitch.stages.sighted import Sighted, rms_of_rows
+from stitch.stages.target_step import Linearised, Step
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.folds import grouped_folds, places
 

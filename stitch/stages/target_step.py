@@ -3,49 +3,24 @@
 Sessions of one arm share its effects and its scatter; each has a hand-eye and targets of its own.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
-from stitch.frames import Array, Mask, exp
+from stitch.frames import Array, Mask
 from stitch.model.model import Model
 from stitch.model.term import Term, sizes_of, split, stacked, values_of
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows, mixed_model_of_rows
-from stitch.observations.targets.target_fit import rms_of
+from stitch.observations.targets.rows import mixed_model_of_rows
 from stitch.stages.fit import WEAK, fitted_parameters
+from stitch.stages.sighted import Sighted, rms_of_rows
 from stitch.statistics.block_least_squares import Blocks
 from stitch.statistics.parameter_selection import Whitened
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.stacked_blocks import mixed_of_all, one_below_the_other, side_by_side
 from stitch.statistics.variance_components import fit_variances, whitener
-
-
-@dataclass(frozen=True)
-class Sighted:
-    """The labelled points of one session about its model; P parameters of effects, the same in all sessions."""
-
-    model: Model
-    landmarks: Landmarks
-    rows: Rows
-    columns: Array  # (B, m, P)
-
-    @property
-    def base(self) -> Array:
-        """(B, m, a) columns of hand-eye and landmarks."""
-        return np.concatenate([self.rows.hand_eye, self.rows.landmarks], axis=2)
-
-    @property
-    def unknowns(self) -> int:
-        """Of the session alone."""
-        return 6 + int(self.rows.landmarks.shape[2])
-
-    def moved(self, x: Array, terms: tuple[Term, ...]) -> tuple[Model, Landmarks]:
-        """Model and landmarks after a step x (a,) of its own unknowns, with the effects as they are then."""
-        return Model(self.model.T_mount @ exp(x[:6]), terms), self.landmarks.moved(x[6:])
 
 
 @dataclass(frozen=True)
@@ -177,8 +152,3 @@ class Linearised:
         precision = np.concatenate([far, WEAK * sizes]) ** -2.0
         pull = np.concatenate([np.zeros(len(far)), -values * precision[len(far) :]])
         return Blocks(mixed.z, mixed.A, mixed.covariance(variances), precision, pull)
-
-
-def rms_of_rows(rows: Sequence[Rows]) -> float:
-    """3D distance of the targets from where they are, length_unit."""
-    return rms_of(np.concatenate([own.distances(own.residual).ravel() for own in rows]))
