@@ -15,7 +15,7 @@ def arm_dh(arm: ArmModel) -> str:
         InputError: an arm that came as URDF has no DH rows.
     """
     found = calibrated_arm(arm.robot, arm.terms)
-    table = robot_toml(found.robot, ["The [robot] table of session.toml", *_told(arm, found)])
+    table = robot_toml(found.robot, ["The [robot] table of session.toml", *_told(found)])
     if table is None:
         raise InputError(f"the arm of session {arm.session} is stated as URDF and has no DH rows; use --to arm-urdf")
     return table
@@ -25,17 +25,17 @@ def arm_urdf(arm: ArmModel) -> str:
     """URDF in m and rad: base_link, link_1 … link_n, flange."""
     found = calibrated_arm(arm.robot, arm.terms)
     declaration, chain = to_urdf(found.robot).split("\n", 1)
-    return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_told(arm, found)])}{chain}\n"
+    return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_told(found)])}{chain}\n"
 
 
-def _told(arm: ArmModel, found: CalibratedRobot) -> list[str]:
+def _told(found: CalibratedRobot) -> list[str]:
     """What is in it, what is not, and which command fits a table that stands alone."""
     told = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(found)]
     if not found.beyond:
         return told
     return [
         *told,
-        f"Alone these may leave more than the nominal arm; fitted alone: stitch calibrate robot {arm.session}.",
+        "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself.",
     ]
 
 
