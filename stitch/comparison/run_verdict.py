@@ -1,16 +1,14 @@
 """The verdict of any run in plain words, and its light: of surfaces that overlap, or of labelled points alone."""
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from stitch.comparison.model_history import ModelHistory, change_of
 from stitch.comparison.plain_verdict import Judged, judged, plain_verdict
+from stitch.runs.doubt_headline import doubt_headline
 from stitch.runs.run import Run
 from stitch.units import length_text
-
-_CLAUSE_END = re.compile(r"[:.] ")
 
 
 def run_verdict(run: Run, history: ModelHistory | None) -> str:
@@ -30,18 +28,8 @@ def run_headline(run: Run, history: ModelHistory | None) -> str:
 def headline(verdict: str, doubts: Sequence[str]) -> str:
     """A verdict as result.json has it, of every doubt in it no more than its first clause."""
     for doubt in doubts:
-        verdict = verdict.replace(doubt, _first_clause(doubt), 1)
+        verdict = verdict.replace(doubt, doubt_headline(doubt), 1)
     return verdict
-
-
-def _first_clause(sentence: str) -> str:
-    """Up to the first colon or full stop outside brackets."""
-    ends = (found.start() for found in _CLAUSE_END.finditer(sentence) if _closed(sentence[: found.start()]))
-    return f"{sentence[: next(ends, len(sentence.rstrip('.')))]}."
-
-
-def _closed(text: str) -> bool:
-    return text.count("(") == text.count(")")
 
 
 def _agreement(run: Run, history: ModelHistory | None) -> str:

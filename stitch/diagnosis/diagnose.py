@@ -90,6 +90,7 @@ def _diagnosed(state: State) -> Diagnosis:
         within=within,
         of_field=of_field,
         smooth=smooth or (scanner_error(linear) if unknown else None),
+        doubts=state.doubts,
         budget=variance_budget(linear, [r.score for r in selection.named[:1]], said[0].process if said else None),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))

@@ -59,6 +59,9 @@ class Diagnosis:
     within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
+    doubts: tuple[
+        str, ...
+    ] = ()  # of the session as a whole, as sentences: what is found may be no more than their mark
 
     @property
     def time_curve(self) -> TimeCurve | None:

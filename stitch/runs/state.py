@@ -24,6 +24,7 @@ class State:
     effects_file: str | None
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not count; session and measurement are without
     links: ViewLinks = field(default_factory=ViewLinks)
+    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
 
     def __repr__(self) -> str:
         return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"
@@ -43,4 +44,5 @@ def state_of(run: Run) -> State:
         effects_file=run.effects_file,
         left_out=run.left_out,
         links=run.links,
+        doubts=run.doubts,
     )

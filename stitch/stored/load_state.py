@@ -57,6 +57,7 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
         effects_file=effects,
         left_out=left_out,
         links=links,
+        doubts=tuple(document.get("doubts", ())),
     )
 
 

@@ -94,7 +94,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         effects_file=state.effects_file,
         convergence={stage: [_number(x) for x in course] for stage, course in document["convergence"].items()},
         notes=tuple(document["notes"]),
-        doubts=tuple(document.get("doubts", ())),
+        doubts=state.doubts,
         targets=targets,
         left_out=state.left_out,
         links=state.links,

@@ -34,6 +34,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
         "notes": list(d.notes),
+        "doubts": list(d.doubts),
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,

@@ -5,6 +5,7 @@ Terminal, page, recording and review all say it so; the diagnosis' own sentence 
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.observations.surfaces.field_error import FieldError
+from stitch.runs.doubt_headline import doubt_headline
 from stitch.units import length_text
 from stitch.writing.plain_effects import in_words
 
@@ -13,6 +14,15 @@ _FOLLOWS = 0.01
 
 
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
+    """What is doubted of the session as a whole, what is missing, and how far the error should fall with it."""
+    finding = _finding(found, length_unit)
+    if not found.doubts:
+        return finding
+    doubted = " ".join(doubt_headline(doubt) for doubt in found.doubts)
+    return f"{doubted} What is found beside that may be no more than its mark. {finding}"
+
+
+def _finding(found: Diagnosis, length_unit: str) -> str:
     """What is missing, and how far the error should fall with it."""
     named = " or ".join(in_words(name) for name in found.effects)
     match found.verdict:
@@ -58,6 +68,8 @@ def _where(found: Diagnosis) -> str:
 
 def next_step(found: Diagnosis, run: str) -> str:
     """The command that most would type now, with what it is for; `run` as it has to be typed."""
+    if found.doubts:
+        return f"Next: put right what is doubted; it stands in full in: stitch review {run}"
     match found.verdict:
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"

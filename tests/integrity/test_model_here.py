@@ -9,7 +9,9 @@ from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch import frames
 from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.errors import NoResultError
-from stitch.pipeline import run
+from stitch.pipeline import change, diagnose, run
+from stitch.runs.state import state_of
+from stitch.writing.plain_finding import next_step, plain_finding
 from stitch.writing.result_document import model_of
 
 
@@ -60,6 +62,20 @@ def test_a_sensor_that_was_moved_is_said_by_how_much(cell):
     here = run(seen_by(then, moved)).T_mount
     off = frames.log(frames.inverse(model.T_mount) @ here)
     assert f"{1e3 * np.linalg.norm(off[:3]):.3g} mrad" in doubt
+
+
+def test_a_diagnosis_says_first_what_is_doubted(cell):
+    """A sensor that was moved looks like an effect of the arm; what is found is said to be perhaps no more than that."""
+    model, then = cell
+    moved = run(seen_by(then, frames.exp(np.array([3e-4, 0, 0, 0, 0.6, 0]))), model=model)
+    found = diagnose(moved)
+    assert found.doubts == moved.doubts
+    assert plain_finding(found, "mm").startswith(
+        "The hand-eye of the other run does not hold here. What is found beside"
+    )
+    assert next_step(found, "RUN").startswith("Next: put right what is doubted")
+    # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
+    assert not diagnose(change(state_of(moved), ["joint_offset"])).doubts
 
 
 def test_a_tool_that_was_mounted_anew_is_said_by_its_targets(cell):

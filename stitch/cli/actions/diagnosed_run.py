@@ -85,7 +85,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
     """For everybody first, then the evidence, the candidate effects, what the poses follow, what to do next."""
     terminal = console()
     terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
-    terminal.print(found.sentence, soft_wrap=True)
+    for line in (*found.doubts, found.sentence):
+        terminal.print(line, soft_wrap=True)
     if found.verdict != "adequate":
         terminal.print(stands_for(found.verdict), soft_wrap=True)
     table = Table(title="Candidate effects", title_justify="left")
