@@ -31,7 +31,8 @@ from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.observations.linear_model import LinearModel
-from stitch.pipeline import change, diagnose, run
+from stitch.pipeline import diagnose, run
+from stitch.revision import change
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stepwise import suggest

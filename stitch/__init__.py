@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from stitch.measurement.session import Session
     from stitch.model.model import Model
     from stitch.model.model_toml import read_model
-    from stitch.pipeline import add, diagnose, drop, run, run_rig
+    from stitch.pipeline import diagnose, run, run_rig
     from stitch.reading.session_folder import load_session
+    from stitch.revision import add, drop
     from stitch.runs.run import Run
 
 # Where each name lives. It is imported when it is asked for: whoever reads a session does not wait for the statistics.

@@ -9,7 +9,8 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
 from stitch.diagnosis.thresholds import MANY_VIEWS, RISE
 from stitch.diagnosis.validation.group_validation import group_share
-from stitch.pipeline import change, diagnose
+from stitch.pipeline import diagnose
+from stitch.revision import change
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.writing.plain_finding import plain_finding

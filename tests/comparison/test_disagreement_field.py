@@ -14,8 +14,9 @@ from stitch.comparison.model_history import model_history
 from stitch.comparison.patches import patches_of
 from stitch.observations.surfaces.match import distances, sample
 from stitch.observations.surfaces.overlaps import collect
-from stitch.pipeline import add, run
+from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
+from stitch.revision import add
 from stitch.stored.load_state import load_state
 from stitch.stored.stored_run import stored_run
 from stitch.writing.result_document import result_document

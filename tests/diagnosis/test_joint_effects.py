@@ -5,7 +5,8 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
-from stitch.pipeline import add, diagnose, run
+from stitch.pipeline import diagnose, run
+from stitch.revision import add
 from stitch.runs.state import state_of
 from stitch.stepwise import suggest
 

@@ -18,7 +18,8 @@ from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
-from stitch.pipeline import add, run
+from stitch.pipeline import run
+from stitch.revision import add
 from stitch.stages.fitted import Fitted
 from stitch.stages.outlier_removal import FittedSession
 

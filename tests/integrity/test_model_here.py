@@ -9,7 +9,8 @@ from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch import frames
 from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.errors import NoResultError
-from stitch.pipeline import change, diagnose, run
+from stitch.pipeline import diagnose, run
+from stitch.revision import change
 from stitch.runs.state import state_of
 from stitch.writing.plain_finding import next_step, plain_finding
 from stitch.writing.result_document import model_of

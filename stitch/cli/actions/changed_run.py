@@ -12,7 +12,7 @@ from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.effects.in_session import known, require
 from stitch.errors import InputError
-from stitch.pipeline import change
+from stitch.revision import change
 from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stepwise import suggest, suggest_group
