@@ -22,10 +22,17 @@ def test_every_effect_of_the_library_has_words():
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 @pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
 def test_the_next_command_can_be_typed(verdict, curves, time_curve):
-    told = next_step(SimpleNamespace(verdict=verdict, curves=curves, time_curve=time_curve), "RUN")
-    command = told.rsplit(": ", 1)[1]
+    found = SimpleNamespace(verdict=verdict, curves=curves, time_curve=time_curve, doubts=())
+    command = next_step(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
     assert ("explain" in command) == (verdict == "unknown_effect" and bool(curves or time_curve))
+
+
+@pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
+def test_no_model_is_built_on_a_doubtful_session(verdict):
+    found = SimpleNamespace(verdict=verdict, curves=("of joint 3",), time_curve=None, doubts=("knocked",))
+    command = next_step(found, "RUN").rsplit(": ", 1)[1]
+    assert command == "stitch review RUN" and refused(command) is None
 
 
 def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
@@ -33,4 +40,5 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     same = FieldError(0.017, 0.0, 9.0, over_noise=False)
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
-        assert said in plain_finding(SimpleNamespace(verdict="adequate", effects=(), smooth=smooth), "mm")
+        found = SimpleNamespace(verdict="adequate", effects=(), smooth=smooth, doubts=())
+        assert said in plain_finding(found, "mm")
