@@ -17,7 +17,7 @@ from stitch.observations.surfaces.match import Match
 
 _PLACES = ("points", "surface")
 # Weights follow the distances; after these steps both stand still.
-_STEPS = 4
+_STEPS = 8
 
 
 def with_moved_points(
@@ -34,11 +34,12 @@ def with_moved_points(
     ]
     matches = [_with(m, moved[m.v][m.index_v] - moved[m.w][m.index_w]) for m in freed.overlaps.matches]
     g, twists = freed.overlaps.gram, freed.twists
+    g = gram(matches, g.views, g.centre, robust_scale(matches))
     for _ in range(_STEPS):
-        g = gram(matches, g.views, g.centre, robust_scale(matches))
         step = visible_step(g)
         twists = twists + step
         matches = [_with(m, _carried(m, step, g.centre)) for m in matches]
+        g = gram(matches, g.views, g.centre, robust_scale(matches))
     return replace(freed, twists=twists, overlaps=replace(freed.overlaps, matches=matches, gram=g))
 
 

@@ -25,7 +25,7 @@ def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
         angle, error, sigma = np.degrees(c.angle), 1e3 * c.error, 1e3 * c.sigma
         ax.fill_between(angle, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
         ax.plot(angle, error, color=BLUE)
-        stood = np.degrees(found.linear.measurement.views.joints[:, c.along - 1])
+        stood = np.degrees(c.stood)
         ax.plot(stood, np.zeros(len(stood)), "|", color="k", ms=8)
         ax.axhline(0, color="k", lw=0.6)
         ax.set_title(f"{c.share:.0%} of it", fontsize=9)

@@ -10,12 +10,16 @@ from stitch.units import amount, duration_text, rounded
 def curve_text(curve: JointCurve) -> str:
     """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
     low, high = (
-        f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad at j{curve.along} = "
-        f"{np.degrees(curve.angle[i]):.0f}°"
+        f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad {_where(curve, i)}"
         for i in curve.extremes
     )
     of_it = f"{curve.share:.0%} of what it does without a name"
     return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
+
+
+def _where(curve: JointCurve, k: int) -> str:
+    there = f"{np.degrees(curve.angle[k]):.0f}°"
+    return f"after a move of {there}" if curve.of_move else f"at j{curve.along} = {there}"
 
 
 def time_curve_text(curve: TimeCurve, length_unit: str) -> str:

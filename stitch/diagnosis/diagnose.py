@@ -12,13 +12,14 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.scanner_first import scanner_first
-from stitch.diagnosis.selection.upheld import validated
+from stitch.diagnosis.selection.pairs import both_missing
+from stitch.diagnosis.selection.upheld import hold_together, validated
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
 from stitch.diagnosis.sentences import sentence_of
-from stitch.diagnosis.thresholds import PREDICTED
+from stitch.diagnosis.thresholds import MANY_VIEWS, PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
@@ -57,7 +58,7 @@ def _diagnosed(state: State) -> Diagnosis:
     matrix = alias_matrix(linear, [r.score for r in selection.ranked])
     examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
     left_out = {e.name: e.cross_validation for e in examined}
-    selection, smooth = _held(linear, selection, left_out, limit)
+    selection, smooth = _held(linear, candidates, selection, left_out, limit)
     within = left_within(linear, state.session.scanner.noise)
     if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
@@ -114,11 +115,15 @@ def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: Scatt
     selection = select(linear, candidates, limit)
     asked = [r for r in (*selection.named, selection.second) if r is not None]
     left_out: dict[str, CrossValidation | None] = {r.name: cross_validate(linear, r.score) for r in asked}
-    return _held(linear, selection, left_out, limit)[0]
+    return _held(linear, candidates, selection, left_out, limit)[0]
 
 
 def _held(
-    linear: LinearModel, selection: Selection, left_out: dict[str, CrossValidation | None], limit: ScatterLimit
+    linear: LinearModel,
+    candidates: Sequence[Candidate],
+    selection: Selection,
+    left_out: dict[str, CrossValidation | None],
+    limit: ScatterLimit,
 ) -> tuple[Selection, FieldError | None]:
     """What is named, held against views left out, halves of the views and the scanner's own error, which is returned
     where it is part of the answer."""
@@ -128,8 +133,19 @@ def _held(
         def wrong_anyway() -> bool:
             return implausible(linear, limit) or bool(unnamed_errors(linear))
 
-        selection = validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
+        held = validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
+        selection = held if held.named else _together(linear, candidates, selection) or held
     return scanner_first(linear, selection)
+
+
+def _together(linear: LinearModel, candidates: Sequence[Candidate], selection: Selection) -> Selection | None:
+    """Two effects named where the first alone does not hold: what the second does made it another in each half."""
+    if linear.measurement.views.count >= MANY_VIEWS:
+        return None
+    two = both_missing(linear, candidates, selection.named[0])
+    if two is None or not hold_together(linear, two):
+        return None
+    return replace(selection, named=two[:1], second=two[1])
 
 
 def linear_model_of(state: State) -> LinearModel:

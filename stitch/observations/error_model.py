@@ -97,6 +97,16 @@ class ErrorModel:
         return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
 
     @cached_property
+    def arm_right(self) -> Self:
+        """As if neither joints nor links erred again, from pose to pose."""
+        if self.pose_errors is None:
+            return self
+        errors = self.pose_errors.but_of_the_arm()
+        mixed = with_errors(self.mixed, errors)
+        start = np.append(self.scatter_only.null.variances, _ABSENT * errors.scales**2)
+        return replace(self, mixed=mixed, null=fit_variances(mixed, start=start), pose_errors=errors, whole=None)
+
+    @cached_property
     def elsewhere(self) -> tuple[Self, ...]:
         """The same at other variances than those of the null, where beside a further effect its maximum may lie: where
         there is nothing but scatter, as much as without other errors or as much as beside them, and where the whole of

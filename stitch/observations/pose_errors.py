@@ -29,7 +29,9 @@ from stitch.statistics.kernels import SmoothErrors, alike_closely, alike_in_join
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
-_ARM, _SMOOTH = 0.1, 0.03
+_ARM, SMOOTH = 0.1, 0.03
+# What the scans of a stop share.
+STOPS = ("stop rotation", "stop translation")
 # Dense matrices of more views take minutes; there the scatter alone must do.
 _MOST_VIEWS = 150
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
@@ -44,7 +46,7 @@ ALL_ANGLES, OWN_ANGLE, THE_WAY = "all angles", "own angle", "the way it came"
 def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
     arm = ("joint_offset", "link_geometry", "joint_compliance", *_FAMILY.values())
-    return dict.fromkeys(arm, _ARM**2) | {"smooth": _SMOOTH**2} | dict.fromkeys(WANDERING, 1 / len(WANDERING))
+    return dict.fromkeys(arm, _ARM**2) | {"smooth": SMOOTH**2} | dict.fromkeys(WANDERING, 1 / len(WANDERING))
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,12 @@ class PoseErrors:
         names, kept = tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n)
         return replace(self, names=names, components=kept, scales=self.scales[keep], effects=left)
 
+    def but_of_the_arm(self) -> "PoseErrors":
+        """What wanders in time and what scans of a stop share; neither joints nor links err again."""
+        kept = [i for i, name in enumerate(self.names) if name in (*WANDERING, *STOPS)]
+        names = tuple(self.names[i] for i in kept)
+        return replace(self, names=names, components=self.components[kept], scales=self.scales[kept], effects={})
+
     def beside(self, name: str, component: Array, scale: float) -> "PoseErrors":
         """The same with a further component (n, n)."""
         components = np.concatenate([self.components, component[None]])
@@ -114,7 +122,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
         links = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
         alike = alike_in_joints(joints)
-        found["smooth"] = (spread_over(links, alike), _SMOOTH)
+        found["smooth"] = (spread_over(links, alike), SMOOTH)
         if constant[0].name == _CONSTANT[0]:
             came = joints - np.concatenate([m.views.previous for m in measurements])
             closely = np.array([alike_closely(q, q) for q in joints.T])
@@ -127,7 +135,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
-        halves = {"stop rotation": flange[:, :3], "stop translation": flange[:, 3:]}
+        halves = dict(zip(STOPS, (flange[:, :3], flange[:, 3:]), strict=True))
         found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])

@@ -42,8 +42,17 @@ def alike_in_way(joint: Array, came: Array) -> Array:
     """(V, V) of a function of one joint's angle (V,) rad, smooth, and of how far it came, (V,) rad, by any law:
     continuous and no more (Ornstein–Uhlenbeck, over the range of the joint), as play, friction and settling are.
     """
-    reach = max(float(np.ptp(joint)), 1e-9)
-    return np.asarray(alike_in_joints(joint[:, None]) * alike_in_time(came, reach))
+    return np.asarray(alike_in_joints(joint[:, None]) * alike_in_move(came, came, reach_of_way(joint)))
+
+
+def alike_in_move(some: Array, others: Array, reach: float) -> Array:
+    """(S, O) of a continuous function of how far a joint came, (S,) and (O,) rad."""
+    return alike_in_time(some, reach, others)
+
+
+def reach_of_way(joint: Array) -> float:
+    """How far a move may differ and still do nearly the same, rad: the range of the joint (V,) rad."""
+    return max(float(np.ptp(joint)), 1e-9)
 
 
 def alike_in_time(time: Array, memory: float, others: Array | None = None) -> Array:

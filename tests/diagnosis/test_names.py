@@ -13,8 +13,9 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
+from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import clear_laws, joint_laws
+from stitch.diagnosis.unknown.joint_laws import joint_laws
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.statistics.variance_prior import NOISE, log_prior

@@ -10,10 +10,14 @@ from scipy.optimize import check_grad
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import Measured, clean, simulated
 from stitch import pipeline
+from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.errors_by_view import CHANGING, by_view, part_of_view
 from stitch.observations.surfaces.field_error import field_error
+from stitch.observations.surfaces.gram import gram
+from stitch.observations.surfaces.match import Match
+from stitch.observations.surfaces.moved_views import as_displacements
 from stitch.observations.surfaces.shown_errors import ShownErrors
 from stitch.observations.surfaces.smooth_errors import COARSE, smooth_sums
 from stitch.runs.state import state_of
@@ -129,6 +133,27 @@ def test_estimates_are_those_of_weighted_least_squares():
     wanted = np.linalg.solve(A.T @ W @ A + np.eye(6), A.T @ W @ shown.seen)
     np.testing.assert_allclose(shown.estimate(0, shares), wanted[:4])
     np.testing.assert_allclose(shown.estimate(1, shares), wanted[4:])
+
+
+@pytest.mark.parametrize("name", [None, "range_scale", "scanner_thermal_scale", "field_curvature"])
+@pytest.mark.parametrize("short", [0.0, 0.003])
+def test_where_the_iteration_ended_makes_no_error_of_the_scanner(sound: LinearModel, name: str | None, short: float):
+    """Views that stand some micrometres off the place where they agree best show nothing, beside whatever may be there:
+    poses follow most of what a scale does, so that a small step they still owe looks like hundreds of nats."""
+    freed, rng = sound.observation.freed, np.random.default_rng(0)
+    g = freed.overlaps.gram
+    twists = short * rng.standard_normal((g.views, 6)) / as_displacements(g)
+
+    def moved(m: Match) -> Match:
+        B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)
+        return replace(m, residual=m.residual + B @ (twists[m.v] - twists[m.w]))
+
+    matches = [moved(m) for m in freed.overlaps.matches]
+    stopped = replace(freed.overlaps, matches=matches, gram=gram(matches, g.views, g.centre, g.scale))
+    forms = {c.name: c.forms[0] for c in candidates_of(sound)[0]}
+    beside = [] if name is None else [forms[name].term]
+    freed = replace(freed, overlaps=stopped)
+    assert not field_error(sound.measurement, sound.model, freed, 0.01, beside).unusual
 
 
 def test_what_is_beside_may_have_any_size(sound: LinearModel):

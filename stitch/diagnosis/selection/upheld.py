@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.selection.ranking import Ranked, conditioned
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.thresholds import BEYOND_CHANCE, STEADY
-from stitch.diagnosis.validation.cross_validation import CrossValidation
-from stitch.diagnosis.validation.halves import Halves
+from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
+from stitch.diagnosis.validation.halves import Halves, halves
+from stitch.observations.linear_model import LinearModel
 
 
 def validated(
@@ -38,6 +39,15 @@ def validated(
     verdict = "unknown_effect" if something else "adequate"
     kept = tuple(notes[: len(selection.notes) + 1])
     return Selection(verdict, (), selection.ranked, selection.empirical, notes=kept)
+
+
+def hold_together(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
+    """True if each of two effects stands that test beside the other, beside which it was scored."""
+    asked = (pair, pair[::-1])
+    return not any(
+        _refused(one, cross_validate(conditioned(linear, [other]), one.score), halves(one.score))
+        for one, other in asked
+    )
 
 
 def _refused(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:

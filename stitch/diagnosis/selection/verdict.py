@@ -9,7 +9,8 @@ from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
 from stitch.diagnosis.selection.forward_selection import forward_selection
 from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
-from stitch.diagnosis.selection.ranking import Ranked, beside, certain, conditioned, contends, ranked_all, ranked_one
+from stitch.diagnosis.selection.pairs import both_missing, second_beside
+from stitch.diagnosis.selection.ranking import Ranked, beside, certain, conditioned, contends, ranked_all
 from stitch.diagnosis.thresholds import (
     ALPHA_UNKNOWN,
     LOG_BAYES_FACTOR,
@@ -65,7 +66,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         second = others[0] if others else None
     elif _outdone(best, stray, law):
         # Two known effects at once may look like none of them: try the best with a second one.
-        second = _second(linear, candidates, best)
+        second = second_beside(linear, candidates, best)
         if second is None or _outdone(best, stray, law, second, len(ranked)):
             return unknown
         others = [second]
@@ -77,7 +78,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     near = (r for r in likely if r.name != best.name and r.name not in refused)
     group = (best, *(() if second is not None else near))
     if len(group) > 1 and linear.measurement.views.count < MANY_VIEWS:
-        two = _both(linear, candidates, best)
+        two = both_missing(linear, candidates, best)
         if two is not None:
             return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
     verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
@@ -134,27 +135,3 @@ def _order_open(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) ->
     if base.pose_errors is not None:
         nameless = [rescored(base, r) for r in nameless]
     return any(r.log_posterior > best.log_posterior - ODDS for r in nameless)
-
-
-def _both(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> tuple[Ranked, Ranked] | None:
-    """Two effects that are both missing, where one alone left several as likely: what one of them took for itself.
-
-    Each must be certain beside the other, and beside the second no other may come near the first.
-    """
-    second = _second(linear, candidates, best)
-    if second is None:
-        return None
-    others = [c for c in candidates if c.name != second.name and not c.empirical]
-    first, *rest = ranked_all(linear.conditioned_on(second.score.form.columns, second.score.form.sizes), others)[0]
-    if not certain(first) or any(contends(r) and r.log_posterior > first.log_posterior - ODDS for r in rest):
-        return None
-    beside_first = linear.conditioned_on(first.score.form.columns, first.score.form.sizes)
-    again = ranked_one(beside_first, second.score.candidate, tests=len(others))
-    return (first, again) if certain(again) else None
-
-
-def _second(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
-    """The effect that explains most beside the best one, if it is certain."""
-    others = [c for c in candidates if c.name != best.name and not c.empirical]
-    ranked, _ = ranked_all(linear.conditioned_on(best.score.form.columns, best.score.form.sizes), others)
-    return next((r for r in ranked if certain(r)), None)

@@ -15,11 +15,11 @@ from itertools import product
 import numpy as np
 
 from stitch.diagnosis.form_trial import SCALES
-from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import ALL_ANGLES, OWN_ANGLE, THE_WAY
+from stitch.observations.pose_errors import ALL_ANGLES, OWN_ANGLE, SMOOTH, THE_WAY
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -44,14 +44,14 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `log_posterior` charges it for that.
     """
-    laws = _laws(base, (ALL_ANGLES, OWN_ANGLE))
+    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE))
     return tuple(sorted(laws, key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
     """Of the likeliest law of a joint, by the angles or by the way it came, as those of effects in the same model
     (`Ranked`); −∞ where there is none."""
-    laws = _laws(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
+    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
     return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(base)
 
 
@@ -66,44 +66,28 @@ def law_covariances(base: LinearModel) -> list[Array]:
     errors = base.pose_errors
     if errors is None or not errors.of_one_joint:
         return []
-    usual = float(errors.scales[errors.names.index("smooth")])
     every = [smooth.of(k) for smooth in errors.of_one_joint.values() for k in range(smooth.count)]
-    return [usual**2 * base.reduce(base.reduce(law).T) for law in every]
+    return [SMOOTH**2 * base.reduce(base.reduce(law).T) for law in every]
 
 
-def _laws(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
+def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     """Of every joint, by each of these kinds that the views tell of."""
     errors = base.pose_errors
     if errors is None or not errors.of_one_joint:
         return []
-    scale = float(errors.scales[errors.names.index("smooth")])
     found = []
     for follows, k in product(kinds, range(errors.of_one_joint[ALL_ANGLES].count)):
         half = base.reduce(errors.of_one_joint[follows].of(k))
-        every = errors.beside(f"joint {k + 1}", base.reduce(half.T), scale)
+        every = errors.beside(f"joint {k + 1}", base.reduce(half.T), SMOOTH)
         mixed = with_errors(base.mixed, every)
-        fit = _fit(base, mixed, scale**2)
+        fit = _fit(base, mixed)
         model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
         found.append(JointLaw(k + 1, follows, 0.5 * (base.null.deviance - fit.deviance), model))
     return found
 
 
-def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
-    """Laws of single joints of which one is there beside all that the prior holds; likeliest first, () if none is.
-
-    Each is charged for all that are tried. The best must be 20 to 1 likelier than none; with it come those that 20 to 1
-    does not tell from it, of every joint the likelier kind.
-    """
-    tried = joint_laws(linear)
-    laws = [replace(law, log_bayes_factor=law.log_bayes_factor - float(np.log(len(tried)))) for law in tried]
-    if not laws or laws[0].log_bayes_factor < ODDS:
-        return ()
-    likely = {law.joint: law for law in reversed(laws) if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS}
-    return tuple(law for law in laws if law is likely.get(law.joint))
-
-
-def _fit(base: LinearModel, mixed: MixedModel, usual: float) -> VarianceFit:
+def _fit(base: LinearModel, mixed: MixedModel) -> VarianceFit:
     """At the maximum, sought from the likeliest of several starts."""
     nulls = [at.null.variances for at in (base, *base.elsewhere)]
-    starts: list[Array] = [np.append(null, times * usual) for null in nulls for times in TIMES]
+    starts: list[Array] = [np.append(null, times * SMOOTH**2) for null in nulls for times in TIMES]
     return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))

@@ -5,19 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.joint_laws import JointLaw, clear_laws
+from stitch.diagnosis.unknown.clear_joints import clear_laws
+from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
 from stitch.diagnosis.unknown.time_laws import clear_time_law
 from stitch.diagnosis.unknown.unnamed_courses import clear_course
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import STOPS
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
 _JOINTS, _TIME = "follow the joints", "wander in time"
-_STOPS = ("stop rotation", "stop translation")
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
-        _JOINTS: tuple(n for n in names if n not in (*WANDERING, *_STOPS)),
+        _JOINTS: tuple(n for n in names if n not in (*WANDERING, *STOPS)),
         _TIME: tuple(WANDERING),
-        "are shared by the scans of a stop": _STOPS,
+        "are shared by the scans of a stop": STOPS,
     }
     found = [
         Unnamed(words, _gain(linear, _deviance_without(linear, kind)), words == _JOINTS)
@@ -71,7 +72,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
 
 
 def _clear_law(linear: LinearModel) -> Unnamed | None:
-    """That of one joint beside all that the prior holds."""
+    """That of one joint, beside all that the prior holds or in place of what an arm does."""
     laws = clear_laws(linear)
     if not laws:
         return None

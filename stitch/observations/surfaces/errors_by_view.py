@@ -7,7 +7,7 @@ motion of the views makes them meet.
 import numpy as np
 
 from stitch.frames import Array, Indices, Mask
-from stitch.observations.surfaces.free_poses import FreePoses, answer_of_views
+from stitch.observations.surfaces.free_poses import FreePoses, answer_of_views, visible_step
 from stitch.observations.surfaces.point_gram import PointGram
 from stitch.observations.surfaces.shown_errors import ShownErrors
 from stitch.observations.surfaces.smooth_errors import COARSE
@@ -34,7 +34,10 @@ def by_view(sums: PointGram, freed: FreePoses, noise: float, beside: int = 0) ->
     np.add.at(square, (at[:, :, None], at[:, None, :]), sums.square)
     np.add.at(pull, at, sums.residual)
     push = [_on_views(sums, g.views, g.pairs, at, keep, width) for keep in (~g.labelled, g.labelled)]
-    square -= (push[0] + push[1]).T @ answer_of_views(g, *push)
+    both = push[0] + push[1]
+    square -= both.T @ answer_of_views(g, *push)
+    # The iteration ended a small step short of where the views agree best.
+    pull += both.T @ visible_step(g).ravel()
     causes = _causes(int(part[-1]) + 1, width - beside)
     return ShownErrors.of(square, pull, causes, g, noise, beside, told=_TOLD)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.free_poses import FreePoses, visible_step
 from stitch.observations.surfaces.point_gram import PointGram, seen_twists
 from stitch.observations.surfaces.shown_errors import ShownErrors
 from stitch.observations.surfaces.smooth_errors import smooth_sums
@@ -46,11 +46,14 @@ def alike(sums: PointGram, twists: Array, freed: FreePoses, noise: float, beside
     """
     g = freed.overlaps.gram
     own = twists.reshape(g.views, 6, -1)
-    # What the poses do not follow: Σ g² less what moving the views takes away.
-    followed = np.einsum("pik,pil->kl", sums.vector, own[g.pairs[:, 0]] - own[g.pairs[:, 1]])
+    # What the poses do not follow: Σ g² less what moving the views takes away; the small step too by which the
+    # iteration ended short of where the views agree best.
+    v, w = g.pairs.T
+    followed, step = np.einsum("pik,pil->kl", sums.vector, own[v] - own[w]), visible_step(g)
+    pull = sums.residual.sum(axis=0) + np.einsum("pik,pi->k", sums.vector, step[v] - step[w])
     units = np.eye(twists.shape[1] - beside)
     causes = (units[:, :-1], units[:, -1:])
-    return ShownErrors.of(sums.square.sum(axis=0) - followed, sums.residual.sum(axis=0), causes, g, noise, beside)
+    return ShownErrors.of(sums.square.sum(axis=0) - followed, pull, causes, g, noise, beside)
 
 
 def field_scatters(measurements: Sequence[Measurement], freed: Sequence[FreePoses]) -> list[Array]:
