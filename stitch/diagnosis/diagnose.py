@@ -58,7 +58,7 @@ def _diagnosed(state: State) -> Diagnosis:
     matrix = alias_matrix(linear, [r.score for r in selection.ranked])
     examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
     left_out = {e.name: e.cross_validation for e in examined}
-    selection, smooth = _held(linear, candidates, selection, left_out, limit)
+    selection, smooth = _held(linear, candidates, selection, left_out)
     within = left_within(linear, state.session.scanner.noise)
     if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
@@ -115,7 +115,7 @@ def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: Scatt
     selection = select(linear, candidates, limit)
     asked = [r for r in (*selection.named, selection.second) if r is not None]
     left_out: dict[str, CrossValidation | None] = {r.name: cross_validate(linear, r.score) for r in asked}
-    return _held(linear, candidates, selection, left_out, limit)[0]
+    return _held(linear, candidates, selection, left_out)[0]
 
 
 def _held(
@@ -123,17 +123,12 @@ def _held(
     candidates: Sequence[Candidate],
     selection: Selection,
     left_out: dict[str, CrossValidation | None],
-    limit: ScatterLimit,
 ) -> tuple[Selection, FieldError | None]:
     """What is named, held against views left out, halves of the views and the scanner's own error, which is returned
     where it is part of the answer."""
     if selection.verdict == "missing_effect":
         asked = [r for r in (*selection.named, selection.second) if r is not None]
-
-        def wrong_anyway() -> bool:
-            return implausible(linear, limit) or bool(unnamed_errors(linear))
-
-        held = validated(selection, left_out, {r.name: halves(r.score) for r in asked}, wrong_anyway)
+        held = validated(selection, left_out, {r.name: halves(r.score) for r in asked})
         selection = held if held.named else _together(linear, candidates, selection) or held
     return scanner_first(linear, selection)
 

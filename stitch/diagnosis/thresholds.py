@@ -26,8 +26,6 @@ IMPLAUSIBLE = (2.5e-4, 0.12)
 STEADY = 0.25
 # A p-value below which two halves of the views do not find one and the same: one right effect of a hundred is lost.
 BY_CHANCE = 0.01
-# A p-value below which an effect is no chance, even one that rests on a single view or predicts none left out.
-BEYOND_CHANCE = 1e-5
 # An effect must shorten the distances on views left out by more than a hundredth to stay in a model (mean square).
 WORTH = 0.99**2
 # New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.

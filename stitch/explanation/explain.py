@@ -21,6 +21,7 @@ from stitch.system.threads import library_threads_off
 NAME = "explained"
 # rad; no gear, spring or clearance does more to a joint. Larger addends are differences of two that look alike.
 _MOST = 0.01
+_TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,27 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
         return Explanation(False, f"{text} explains much, but not in views that are left out with their neighbours.")
     if beyond is not None and not beyond.helps:
         return Explanation(False, f"{beyond.objection(text)}.")
-    why = f"{text}: found in one half of the views, it holds in the other (p = {chosen.p_value:.1g})."
+    why = f"{text}: {_how(linear, terms, chosen)} ({_chance(chosen.p_value)})."
     return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
+
+
+def _how(linear: LinearModel, terms: Dictionary, chosen: Chosen) -> str:
+    """How a sum that is told stood the test."""
+    other = chosen.instead_of
+    if not other or [i.quantity.text for i in other] == [i.quantity.text for i in chosen.ingredients]:
+        return "found in some of the views, it holds in the others"
+    values = [coefficient(i, float(x)) for i, x in zip(other, fitted(linear, terms, other), strict=True)]
+    return f"likeliest in all views; {formula_text(other, values)}, found in some of them, holds in the others"
+
+
+def _chance(p_value: float) -> str:
+    """A p-value, as far as anybody can vouch for the tails of a distribution."""
+    return f"p = {p_value:.1g}" if p_value > _TINY else f"p < {_TINY:g}"
 
 
 def _not_held(chosen: Chosen, text: str) -> str:
     return (
-        f"No formula holds: {text}, found in one half of the views, is not what the other shows "
-        f"(p = {chosen.p_value:.2g})."
+        f"No formula holds: {text}, found in some of the views, is not what the others show (p = {chosen.p_value:.2g})."
     )
 
 

@@ -34,6 +34,7 @@ class Chosen:
     p_value: float  # in the half that took no part in choosing, all ways counted
     log_bayes_factor: float  # of that half's numbers with the sizes of the other over none
     both: float  # the same, with that of the other half's numbers with the sizes of this one
+    instead_of: tuple[Ingredient, ...] = ()  # the sum that stood the test, where all views want another in its place
 
     @property
     def holds(self) -> bool:
@@ -65,10 +66,14 @@ def beside_itself(
 
 def fitted(linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient]) -> Array:
     """(k,) sizes of scaled columns from all views, under the scatter that they leave."""
-    own = linear.reduce(terms.columns(ingredients))
-    beside = linear.conditioned_on(own, np.full(len(ingredients), 1.0))
-    base = replace(linear, null=at_variances(linear.mixed, beside.null.variances))
+    base, own = scatter_beside(linear, terms, ingredients), linear.reduce(terms.columns(ingredients))
     return np.asarray(np.linalg.lstsq(base.residual(own), base.white_residual, rcond=None)[0])
+
+
+def scatter_beside(linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient]) -> LinearModel:
+    """The model under the scatter that a sum leaves."""
+    beside = linear.conditioned_on(linear.reduce(terms.columns(ingredients)), np.full(len(ingredients), 1.0))
+    return replace(linear, null=at_variances(linear.mixed, beside.null.variances))
 
 
 def _judged(ingredients: tuple[Ingredient, ...], chosen: tuple[Array, Array], tested: tuple[Array, Array]) -> Chosen:

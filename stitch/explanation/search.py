@@ -10,6 +10,7 @@ and the second half of the session too, and always beside errors that wander as 
 same in views that are neighbours in time.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from stitch.explanation.dictionary import Dictionary, Ingredient, addends
 from stitch.explanation.half import Half
-from stitch.explanation.held_test import Chosen, at_present, beside_itself
+from stitch.explanation.held_test import Chosen, at_present, beside_itself, scatter_beside
 from stitch.explanation.pursuit import sums_of
 from stitch.explanation.refinement import refined, rounded
 from stitch.frames import Array, Indices
@@ -33,34 +34,71 @@ _BLOCKS = 16  # of neighbours in time, for views that share a wandering error wh
 
 def search(linear: LinearModel, terms: Dictionary) -> list[Chosen]:
     """Sums of ingredients at one place: those that hold first, the likeliest of them before the others; with places,
-    widths and periods as all views want them."""
-    found = list[Chosen]()
-    alternate = [_some(half) for half in _alternate(linear)]
-    early_late = [_some(half) for half in np.array_split(np.arange(_views(linear)), 2)]
-    ways = 0
-    for place, slow in sorted({(i.place, i.quantity.slow) for i in terms.ingredients}):
-        some = [i for i in terms.ingredients if (i.place, i.quantity.slow) == (place, slow)]
-        for halves in (alternate, early_late) if slow else (alternate,):
-            for way in (halves, halves[::-1]):
-                found += _one_way(linear, terms, some, way)
-                ways += 1
+    widths and periods as all views want them, and sums that all views suggest where one of theirs holds."""
+    found, ways = list[Chosen](), 0
+    for some in _groups(terms):
+        for way in _ways(linear, slow=some[0].quantity.slow):
+            found += _one_way(linear, terms, some, way)
+            ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
-    # Each was chosen in one half: what both say of it counts.
+    # Each was chosen in some views: what they and the others say of it counts.
     found.sort(key=lambda c: (not c.holds, -c.both))
     every = _some(np.arange(_views(linear)), 2)
     whole = Half(linear.scatter_only, terms, every, np.empty(0, np.int64))
-    return [replace(c, ingredients=rounded(refined(c.ingredients, whole))) for c in found[:_TOLD]]
+    told = [replace(c, ingredients=rounded(refined(c.ingredients, whole))) for c in found[:_TOLD]]
+    return [*_of_all_views(linear, terms, found[0], every), *told] if found and found[0].holds else told
+
+
+def _groups(terms: Dictionary) -> list[list[Ingredient]]:
+    """Ingredients that may stand in one sum."""
+    found = defaultdict[tuple[str, bool], list[Ingredient]](list)
+    for i in terms.ingredients:
+        found[i.place, i.quantity.slow].append(i)
+    return [found[own] for own in sorted(found)]
+
+
+def _ways(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
+    """Views in which a sum is chosen, and those in which it is tested."""
+    parts = [_alternate(linear, parts) for parts in (2, 3)]
+    parts += [np.array_split(np.arange(_views(linear)), 2)] if slow else []
+    return [
+        (_some(np.sort(np.concatenate([*own[:k], *own[k + 1 :]]))), _some(own[k]))
+        for own in parts
+        for k in range(len(own))
+    ]
+
+
+def _of_all_views(linear: LinearModel, terms: Dictionary, held: Chosen, every: Indices) -> list[Chosen]:
+    """Where a sum holds, there is something: which sum it is all views know better than some of them. Those that they
+    suggest at that place, likeliest first (Bayesian information criterion), beside the scatter that it leaves."""
+    base = scatter_beside(linear, terms, held.ingredients)
+    whole = Half(base, terms, every, np.empty(0, np.int64))
+    own = held.ingredients[0]
+    some = next(g for g in _groups(terms) if (g[0].place, g[0].quantity.slow) == (own.place, own.quantity.slow))
+    sums = [*_suggested(whole, some), refined(held.ingredients, whole)]
+    likely = sorted(sums, key=lambda sum_: _criterion(sum_, whole))[:_TESTED]
+    return [replace(held, ingredients=rounded(sum_), instead_of=held.ingredients) for sum_ in likely]
+
+
+def _criterion(ingredients: tuple[Ingredient, ...], half: Half) -> float:
+    """Schwarz 1978, with the scatter unknown; places, widths and periods are numbers too."""
+    columns = half.columns(ingredients)
+    left = half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0]
+    numbers = len(ingredients) + sum(
+        len(q.nonlinear) for q in {i.quantity.text: i.quantity for i in ingredients}.values()
+    )
+    return float(half.free * np.log(left @ left) + np.log(half.free) * numbers)
 
 
 def _views(linear: LinearModel) -> int:
     return linear.measurement.views.count
 
 
-def _alternate(linear: LinearModel) -> list[Indices]:
-    """Two halves over the same region of poses: view by view, or in blocks of time."""
+def _alternate(linear: LinearModel, parts: int) -> list[Indices]:
+    """Parts over the same region of poses: view by view, or in blocks of time."""
     blocks = _views(linear) if isinstance(linear.observation, Surfaces) else min(_BLOCKS, _views(linear))
     block = np.arange(_views(linear)) * blocks // _views(linear)
-    return [np.flatnonzero(block % 2 == k) for k in (0, 1)]
+    return [np.flatnonzero(block % parts == k) for k in range(parts)]
 
 
 def _some(views: Indices, halves: int = 1) -> Indices:

@@ -25,7 +25,7 @@ _MANY = 250
 def with_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
     """The mixed model of one block with scatter, noise, and what the poses err beside."""
     components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, scales=errors.scales)
+    return replace(mixed, components=components, scales=errors.scales, kin=errors.of_arm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ class ErrorModel:
         """As if poses erred independently from view to view."""
         if self.pose_errors is None:
             return self
-        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], scales=None)
+        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], scales=None, kin=None)
         return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
 
     @cached_property

@@ -19,7 +19,7 @@ import numpy as np
 
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
@@ -60,6 +60,11 @@ class PoseErrors:
     # What each joint alone may do without a name, by what it follows: in none of the components.
     of_one_joint: dict[str, SmoothErrors] = field(default_factory=dict)
 
+    @property
+    def of_arm(self) -> Mask:
+        """(c,) what joints and links do: on a good arm all of it is small."""
+        return np.array([name not in (*WANDERING, *STOPS) for name in self.names], bool)
+
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
         return replace(
@@ -86,7 +91,7 @@ class PoseErrors:
 
     def but_of_the_arm(self) -> "PoseErrors":
         """What wanders in time and what scans of a stop share; neither joints nor links err again."""
-        kept = [i for i, name in enumerate(self.names) if name in (*WANDERING, *STOPS)]
+        kept = np.flatnonzero(~self.of_arm)
         names = tuple(self.names[i] for i in kept)
         return replace(self, names=names, components=self.components[kept], scales=self.scales[kept], effects={})
 

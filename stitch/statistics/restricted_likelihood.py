@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.statistics.inverse import Inverse, inverted
 from stitch.statistics.variance_prior import log_prior
 
@@ -34,6 +34,7 @@ class MixedModel:
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
     scales: Array | None = None  # (c − 3,) that σ of the further components usually has; None: there are none
+    kin: Mask | None = None  # (c − 3,) those that are large or small together
 
     @property
     def size(self) -> int:

@@ -7,12 +7,13 @@ while the others stand (Gibbs sampling on a grid; Ritter & Tanner 1992, J. Am. S
 and what counts is its mean there (Gelfand & Smith 1990, J. Am. Stat. Assoc. 85:398). Same random numbers every time.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.restricted_likelihood import MixedModel, rows_of_blocks
 from stitch.statistics.variance_components import VarianceFit
@@ -26,6 +27,9 @@ _AMONG, _FEWEST, _NO_ROUNDS = 300, 4, 1_200
 # The grid in log variances: below and above a variance that is usual, and its steps as a share of how
 # well n numbers know a log variance, √(2/n), at most so long.
 _BELOW, _ABOVE, _SHARE, _LONGEST = np.log(1e-4), np.log(1e8), 1.5, 0.25
+# Factors on all usual sizes of an arm: any from a hundredth to thirty, each octave as likely.
+_FACTORS = np.exp(np.arange(np.log(0.01), np.log(30.0), 0.25))
+_USUAL = int(np.abs(np.log(_FACTORS)).argmin())
 # Directions of a component with less than this share of its largest variance are rounding.
 _ROUNDING = 1e-12
 
@@ -55,17 +59,48 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     if not len(seen.z):
         return fit.variances
     grids = _grids(mixed, fit.variances)
-    densities = [log_density(i, np.log(grid), mixed.scales) for i, grid in enumerate(grids)]
-    here, total = np.array(fit.variances), np.zeros(len(grids))
+    densities = _densities(mixed, grids)
+    kin = [i for i in np.flatnonzero(_kin(mixed)) if seen.roots[i].shape[1]]
+    here, total, at, factor = np.array(fit.variances), np.zeros(len(grids)), np.zeros(len(grids), int), _USUAL
     rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
     burnt = -(-_BURNT * rounds // _ROUNDS)
     for turn in range(burnt + rounds):
         for i, grid in enumerate(grids):
             if seen.roots[i].shape[1]:
-                weights = _weights(seen, here, i, grid, densities[i])
-                here[i] = rng.choice(grid, p=weights)
+                weights = _weights(seen, here, i, grid, densities[i][factor if i in kin else 0])
+                at[i] = rng.choice(len(grid), p=weights)
+                here[i] = grid[at[i]]
                 total[i] += (turn >= burnt) * float(weights @ grid)
+        if kin:
+            factor = _factor(rng, [densities[i][:, at[i]] for i in kin])
     return np.asarray(total / rounds)
+
+
+def _kin(mixed: MixedModel) -> Mask:
+    """(c,) components that share a factor on their usual sizes."""
+    shared = np.zeros(len(mixed.components), bool)
+    if mixed.kin is not None:
+        shared[NOISE + 1 :] = mixed.kin
+    return shared
+
+
+def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
+    """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
+    return [
+        np.array([log_density(i, np.log(grid), _times(mixed.scales, f)) for f in (_FACTORS if shared else (1.0,))])
+        for i, (grid, shared) in enumerate(zip(grids, _kin(mixed), strict=True))
+    ]
+
+
+def _times(scales: Array | None, factor: float) -> Array | None:
+    return None if scales is None else factor * scales
+
+
+def _factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:
+    """Index of a factor drawn where the components stand, from densities (F,) of each there."""
+    logs = np.sum(densities, axis=0)
+    weights = np.exp(logs - logs.max())
+    return int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
 
 
 def _without_mean(mixed: MixedModel) -> _Seen:

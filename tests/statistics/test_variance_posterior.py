@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from stitch.statistics.restricted_likelihood import MixedModel
@@ -11,37 +12,44 @@ from stitch.statistics.variance_posterior import mean_variances
 N, SCALE = 40, 0.5
 
 
-def shared_errors(size: float, seed: int = 3) -> MixedModel:
-    """Numbers of known noise with an error in common to fives of them, about one unknown mean."""
+def shared_errors(size: float, seed: int = 3, kin: bool = False) -> MixedModel:
+    """Numbers of known noise with an error in common to fives of them, about one unknown mean.
+
+    Args:
+        kin: its usual size is known to a factor only.
+    """
     rng = np.random.default_rng(seed)
     groups = np.repeat(np.eye(N // 5), 5, axis=0)
     z = 1.0 + rng.standard_normal(N) + size * groups @ rng.standard_normal(N // 5)
     # Of the first two components there is nothing; the noise is there with a factor near two.
     components = np.array([np.zeros((N, N)), np.zeros((N, N)), 0.5 * np.eye(N), groups @ groups.T])[:, None]
-    return MixedModel(z[None], np.full((1, N, 1), N**-0.5), components, scales=np.array([SCALE]))
+    return MixedModel(z[None], np.full((1, N, 1), N**-0.5), components, scales=np.array([SCALE]), kin=np.array([kin]))
 
 
 def on_a_grid(mixed: MixedModel) -> np.ndarray:
-    """The same by brute force: flat prior of the mean, densities of scipy, priors of the variances written out."""
-    noise, group = np.meshgrid(np.linspace(-1.0, 3.0, 25), np.linspace(-16, 7, 47), indexing="ij")
+    """The same by brute force, down to where nearly nothing lies below: flat prior of the mean, densities of scipy, priors of the variances written out."""
+    noise, group = np.meshgrid(np.linspace(-1.0, 3.0, 25), np.arange(-100, 7, 0.5), indexing="ij")
     logs, ones = [], np.ones(N)
     for a, b in zip(noise.ravel(), group.ravel(), strict=True):
         V = np.exp(a) * mixed.components[2, 0] + np.exp(b) * mixed.components[3, 0]
         weights = np.linalg.solve(V, ones)
         mean = float(weights @ mixed.z[0] / weights.sum())
         likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
-        prior = -0.5 * ((a - np.log(2)) / 1.5) ** 2 + 0.5 * 0.1 * b - 0.5 * 1.1 * np.log1p(np.exp(b) / SCALE**2)
+        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.kin[0] else np.zeros(1)
+        over = b - 2 * np.log(SCALE) - 2 * factors
+        prior = -0.5 * ((a - np.log(2)) / 1.5) ** 2 + logsumexp(0.5 * 0.1 * over - 0.5 * 1.1 * np.log1p(np.exp(over)))
         logs.append(likelihood + prior)
     w = np.exp(np.array(logs) - max(logs))
     return np.array([w @ np.exp(noise.ravel()), w @ np.exp(group.ravel())]) / w.sum()
 
 
-@pytest.mark.parametrize("size", [0.0, 2.0])
-def test_the_average_is_the_integral(size, monkeypatch):
-    monkeypatch.setattr("stitch.statistics.variance_posterior._ROUNDS", 400)
-    mixed = shared_errors(size)
+@pytest.mark.parametrize(("size", "kin"), [(0.0, False), (2.0, False), (0.0, True), (0.5, True), (2.0, True)])
+def test_the_average_is_the_integral(size, kin, monkeypatch):
+    # 400 rounds know the mean of what spreads by as much as itself to a twentieth; of one size and a factor on it, of
+    # which each follows the other, more are asked.
+    monkeypatch.setattr("stitch.statistics.variance_posterior._ROUNDS", 2000 if kin else 400)
+    mixed = shared_errors(size, kin=kin)
     found = mean_variances(mixed, fit_variances(mixed))
-    # 400 rounds know the mean of what spreads by as much as itself to a twentieth.
     assert found[2:] == pytest.approx(on_a_grid(mixed), rel=1 / 20, abs=0.01)
     assert (found[:2] == 0).all() or (found[:2] < 1e-100).all()
 

@@ -1,27 +1,20 @@
 """Whether a name stands before the views that took no part in choosing it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from stitch.diagnosis.selection.ranking import Ranked, conditioned
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.thresholds import BEYOND_CHANCE, STEADY
+from stitch.diagnosis.thresholds import STEADY
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.validation.halves import Halves, halves
 from stitch.observations.linear_model import LinearModel
 
 
 def validated(
-    selection: Selection,
-    found: dict[str, CrossValidation | None],
-    in_halves: dict[str, Halves | None],
-    wrong_anyway: Callable[[], bool],
+    selection: Selection, found: dict[str, CrossValidation | None], in_halves: dict[str, Halves | None]
 ) -> Selection:
     """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
-    one may be.
-
-    What is left then is below what matters, unless the scatter is one that no arm has, or the effect was beyond chance:
-    then something is there, of another form.
+    one may be. Where neither holds something is there of another form: the alarm that asked for a name stands.
     """
     if selection.verdict != "missing_effect":
         return selection
@@ -35,10 +28,8 @@ def validated(
                 return selection
             return replace(selection, named=(named,), second=None, notes=tuple(notes))
         notes.append(refusal)
-    something = selection.named[0].adjusted < BEYOND_CHANCE or wrong_anyway()
-    verdict = "unknown_effect" if something else "adequate"
     kept = tuple(notes[: len(selection.notes) + 1])
-    return Selection(verdict, (), selection.ranked, selection.empirical, notes=kept)
+    return Selection("unknown_effect", (), selection.ranked, selection.empirical, notes=kept)
 
 
 def hold_together(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:

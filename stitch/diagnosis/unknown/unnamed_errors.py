@@ -116,6 +116,6 @@ def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     every = np.append(np.ones(NOISE + 1, bool), keep)
     scales = linear.mixed.scales[keep]
-    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=scales)
+    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=scales, kin=None)
     plain = np.append(linear.scatter_only.null.variances, 1e-2 * scales**2)
     return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))
