@@ -19,7 +19,7 @@ def explain_run(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Look for a formula of what is left: chosen in one half of the views, tested in the other.
+    """Look for a formula of what is left: chosen in some of the views, tested in the others.
 
     \b
     Examples:

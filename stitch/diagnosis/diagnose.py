@@ -134,11 +134,12 @@ def _held(
 
 
 def _together(linear: LinearModel, candidates: Sequence[Candidate], selection: Selection) -> Selection | None:
-    """Two effects named where the first alone does not hold: what the second does made it another in each half."""
+    """Two effects named where the first, the likeliest of all, does not hold alone: what the second does made it
+    another in each half."""
     if linear.measurement.views.count >= MANY_VIEWS:
         return None
     two = both_missing(linear, candidates, selection.named[0])
-    if two is None or not hold_together(linear, two):
+    if two is None or two[0].name != selection.named[0].name or not hold_together(linear, two):
         return None
     return replace(selection, named=two[:1], second=two[1])
 

@@ -55,7 +55,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
-    curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, as other joints turn
+    curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, along angles and moves
     within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer

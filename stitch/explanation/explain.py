@@ -1,6 +1,7 @@
 """From unknown to a formula: what a model lacks, as a sum of products of what the cell knows of its views."""
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.diagnosis.validation.extrapolation import extrapolate
 from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
-from stitch.explanation.dictionary import Dictionary, coefficient, dictionary
+from stitch.explanation.dictionary import Dictionary, Ingredient, coefficient, dictionary
 from stitch.explanation.effect_source import effect_source, formula_text
 from stitch.explanation.held_test import Chosen, fitted
 from stitch.explanation.quantities import quantities
@@ -26,7 +27,7 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class Explanation:
-    """A formula that a half of the views which took no part in finding it wants too; or none."""
+    """A formula of which views that took no part in finding it want the like too; or none."""
 
     found: bool
     why: str  # in one sentence
@@ -50,7 +51,7 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
             if tried.found:
                 return tried
             first = first or tried
-            # What does not hold in the other half needs no further test.
+            # What does not hold in the other views needs no further test.
             if not chosen.holds:
                 break
         return first or Explanation(False, "Nothing that the cell knows of its views explains what is left.")
@@ -81,10 +82,15 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
 def _how(linear: LinearModel, terms: Dictionary, chosen: Chosen) -> str:
     """How a sum that is told stood the test."""
     other = chosen.instead_of
-    if not other or [i.quantity.text for i in other] == [i.quantity.text for i in chosen.ingredients]:
+    if not other or _addends(other) == _addends(chosen.ingredients):
         return "found in some of the views, it holds in the others"
     values = [coefficient(i, float(x)) for i, x in zip(other, fitted(linear, terms, other), strict=True)]
     return f"likeliest in all views; {formula_text(other, values)}, found in some of them, holds in the others"
+
+
+def _addends(ingredients: Sequence[Ingredient]) -> set[tuple[str, int, str]]:
+    """What a person would call the same sum."""
+    return {(i.place, i.index, i.quantity.rounded().text) for i in ingredients}
 
 
 def _chance(p_value: float) -> str:

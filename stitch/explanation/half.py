@@ -16,9 +16,10 @@ from stitch.statistics.least_squares import column_space
 class Half:
     """Numbers (n,) of some views in units of their scatter, without what the model explains there."""
 
-    def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices, out: Indices) -> None:
-        """Of a linear model the views to keep; those that are left out move freely."""
-        self._linear, self._terms, self._keep, self._out = linear, terms, keep, out
+    def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices) -> None:
+        """Of a linear model the views to keep; all others move freely."""
+        self._linear, self._terms, self._keep = linear, terms, keep
+        self._out = np.setdiff1d(np.arange(linear.measurement.views.count), keep)
         self._of_view = dict[tuple[str, int], Array]()
 
     @cached_property

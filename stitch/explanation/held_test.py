@@ -57,10 +57,10 @@ def beside_itself(
         ways: views in which the sum was chosen, and those in which it is tested.
     """
     own = terms.columns(ingredients)
-    other = Half(linear.scatter_only, terms, *ways)
+    other = Half(linear.scatter_only, terms, ways[0])
     sizes = _WIDE * np.abs(np.linalg.lstsq(other.seen(own), other.z, rcond=None)[0]) + _FAINT
-    base = _scatter_beside(linear, linear.reduce(own), sizes, slow)
-    halves = Half(base, terms, *ways), Half(base, terms, *reversed(ways))
+    base = _scatter_of_test(linear, linear.reduce(own), sizes, slow)
+    halves = [Half(base, terms, views) for views in ways]
     return _judged(ingredients, *((half.seen(own), half.z) for half in halves))
 
 
@@ -85,7 +85,7 @@ def _judged(ingredients: tuple[Ingredient, ...], chosen: tuple[Array, Array], te
     return Chosen(ingredients, chi2_tail(square, len(ingredients)), factor, factor + _predicted(B, w, A, y))
 
 
-def _scatter_beside(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
+def _scatter_of_test(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
     """Under the scatter that is left beside a sum: what it explains is no scatter. What wanders in time stays."""
     if slow and linear.pose_errors is None:
         return linear

@@ -20,16 +20,16 @@ _MOST = 20  # steps
 
 def refined(ingredients: Sequence[Ingredient], half: Half) -> tuple[Ingredient, ...]:
     """The same ingredients, their quantities as some views want them."""
-    tuned = [q for q in _quantities(ingredients) if q.nonlinear]
+    tuned = [q for q in quantities_of(ingredients) if q.nonlinear]
     count = sum(len(q.nonlinear) for q in tuned)
     if not count:
         return tuple(ingredients)
-    scatter = _left(ingredients, half)
+    scatter = left_beside(ingredients, half)
     # Beside its sum what is left is scatter: of about one where the scatter was known.
     scale = np.sqrt(float(scatter @ scatter) / max(half.free - len(ingredients) - count, 1))
 
     def off(steps: Array) -> Array:
-        return np.append(_left(_moved(ingredients, tuned, steps), half) / scale, steps)
+        return np.append(left_beside(_moved(ingredients, tuned, steps), half) / scale, steps)
 
     found = least_squares(off, np.zeros(count), method="lm", max_nfev=_MOST * (count + 1))
     return _moved(ingredients, tuned, found.x)
@@ -40,7 +40,7 @@ def rounded(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
     return tuple(replace(i, quantity=i.quantity.rounded()) for i in ingredients)
 
 
-def _quantities(ingredients: Sequence[Ingredient]) -> list[Quantity]:
+def quantities_of(ingredients: Sequence[Ingredient]) -> list[Quantity]:
     """All different ones: the axes of a body follow one."""
     return list({i.quantity.text: i.quantity for i in ingredients}.values())
 
@@ -51,7 +51,7 @@ def _moved(ingredients: Sequence[Ingredient], tuned: Sequence[Quantity], steps: 
     return tuple(replace(i, quantity=new.get(i.quantity.text, i.quantity)) for i in ingredients)
 
 
-def _left(ingredients: Sequence[Ingredient], half: Half) -> Array:
+def left_beside(ingredients: Sequence[Ingredient], half: Half) -> Array:
     """(n,) what a sum leaves, with the best sizes."""
     columns = half.columns(ingredients)
     return np.asarray(half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0])

@@ -1,9 +1,9 @@
-"""Sparse regression over a dictionary: chosen in one half of the views, tested in the other.
+"""Sparse regression over a dictionary: chosen in some of the views, tested in the others.
 
-In one half ingredients are added greedily (orthogonal matching pursuit), after the first as long as the next one
-explains more than the best of all of them would by chance, and their places, widths and periods are moved to where they
-explain most. The other half, which took no part in that, then says if the same sum of ingredients is wanted there
-(held_test). Halves change roles, and all ways are counted.
+In some of the views ingredients are added greedily (orthogonal matching pursuit), after the first as long as the next
+one explains more than the best of all of them would by chance, and places, widths and periods are moved to where they
+explain most. The others, which took no part in that, then say if the same sum of ingredients is wanted there
+(held_test). Halves and thirds change roles, and all ways are counted. Where one holds, all views say which sum it is.
 
 What follows the arm is asked for in views taken alternately. What follows time, or what moves with time, in the first
 and the second half of the session too, and always beside errors that wander as much as all views show: these look the
@@ -20,13 +20,13 @@ from stitch.explanation.dictionary import Dictionary, Ingredient, addends
 from stitch.explanation.half import Half
 from stitch.explanation.held_test import Chosen, at_present, beside_itself, scatter_beside
 from stitch.explanation.pursuit import sums_of
-from stitch.explanation.refinement import refined, rounded
+from stitch.explanation.refinement import left_beside, quantities_of, refined, rounded
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import evenly
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 
-_FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of a half that are tested in the other
+_FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of some views, or of all, that are tested further
 _TOLD = 6  # sums, the likeliest
 _ENOUGH = 300  # views of a half
 _BLOCKS = 16  # of neighbours in time, for views that share a wandering error which no prior knows
@@ -35,26 +35,32 @@ _BLOCKS = 16  # of neighbours in time, for views that share a wandering error wh
 def search(linear: LinearModel, terms: Dictionary) -> list[Chosen]:
     """Sums of ingredients at one place: those that hold first, the likeliest of them before the others; with places,
     widths and periods as all views want them, and sums that all views suggest where one of theirs holds."""
-    found, ways = list[Chosen](), 0
-    for some in _groups(terms):
-        for way in _ways(linear, slow=some[0].quantity.slow):
+    found, ways, groups = list[Chosen](), 0, _groups(terms)
+    for (_, slow), some in groups.items():
+        for way in _ways(linear, slow):
             found += _one_way(linear, terms, some, way)
             ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
     # Each was chosen in some views: what they and the others say of it counts.
     found.sort(key=lambda c: (not c.holds, -c.both))
     every = _some(np.arange(_views(linear)), 2)
-    whole = Half(linear.scatter_only, terms, every, np.empty(0, np.int64))
+    whole = Half(linear.scatter_only, terms, every)
     told = [replace(c, ingredients=rounded(refined(c.ingredients, whole))) for c in found[:_TOLD]]
-    return [*_of_all_views(linear, terms, found[0], every), *told] if found and found[0].holds else told
+    if not found or not found[0].holds:
+        return told
+    return [*_of_all_views(linear, terms, groups[_group_of(found[0].ingredients[0])], found[0], every), *told]
 
 
-def _groups(terms: Dictionary) -> list[list[Ingredient]]:
+def _group_of(ingredient: Ingredient) -> tuple[str, bool]:
+    return ingredient.place, ingredient.quantity.slow
+
+
+def _groups(terms: Dictionary) -> dict[tuple[str, bool], list[Ingredient]]:
     """Ingredients that may stand in one sum."""
     found = defaultdict[tuple[str, bool], list[Ingredient]](list)
     for i in terms.ingredients:
-        found[i.place, i.quantity.slow].append(i)
-    return [found[own] for own in sorted(found)]
+        found[_group_of(i)].append(i)
+    return {own: found[own] for own in sorted(found)}
 
 
 def _ways(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
@@ -68,25 +74,23 @@ def _ways(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
     ]
 
 
-def _of_all_views(linear: LinearModel, terms: Dictionary, held: Chosen, every: Indices) -> list[Chosen]:
+def _of_all_views(
+    linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], held: Chosen, every: Indices
+) -> list[Chosen]:
     """Where a sum holds, there is something: which sum it is all views know better than some of them. Those that they
-    suggest at that place, likeliest first (Bayesian information criterion), beside the scatter that it leaves."""
+    suggest of the same ingredients, likeliest first (Bayesian information criterion), beside the scatter that it
+    leaves."""
     base = scatter_beside(linear, terms, held.ingredients)
-    whole = Half(base, terms, every, np.empty(0, np.int64))
-    own = held.ingredients[0]
-    some = next(g for g in _groups(terms) if (g[0].place, g[0].quantity.slow) == (own.place, own.quantity.slow))
-    sums = [*_suggested(whole, some), refined(held.ingredients, whole)]
+    whole = Half(base, terms, every)
+    sums = [*_suggested(whole, ingredients), refined(held.ingredients, whole)]
     likely = sorted(sums, key=lambda sum_: _criterion(sum_, whole))[:_TESTED]
     return [replace(held, ingredients=rounded(sum_), instead_of=held.ingredients) for sum_ in likely]
 
 
 def _criterion(ingredients: tuple[Ingredient, ...], half: Half) -> float:
     """Schwarz 1978, with the scatter unknown; places, widths and periods are numbers too."""
-    columns = half.columns(ingredients)
-    left = half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0]
-    numbers = len(ingredients) + sum(
-        len(q.nonlinear) for q in {i.quantity.text: i.quantity for i in ingredients}.values()
-    )
+    left = left_beside(ingredients, half)
+    numbers = len(ingredients) + sum(len(q.nonlinear) for q in quantities_of(ingredients))
     return float(half.free * np.log(left @ left) + np.log(half.free) * numbers)
 
 
@@ -111,7 +115,7 @@ def _one_way(
     linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], ways: Sequence[Indices]
 ) -> list[Chosen]:
     """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
-    chosen, other = Half(linear.scatter_only, terms, *ways), Half(linear.scatter_only, terms, *reversed(ways))
+    chosen, other = (Half(linear.scatter_only, terms, views) for views in ways)
     suggested = _suggested(chosen, ingredients)
     # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
     worth = [at_present(sum_, chosen, other).log_bayes_factor for sum_ in suggested]
@@ -122,7 +126,7 @@ def _one_way(
 
 
 def _suggested(half: Half, ingredients: Sequence[Ingredient]) -> list[tuple[Ingredient, ...]]:
-    """Sums that explain one half, as that half wants their places, widths and periods."""
+    """Sums that explain some views, as these want their places, widths and periods."""
     found = dict[tuple[int, ...], tuple[Ingredient, ...]]()
 
     def sum_of(numbers: tuple[int, ...]) -> tuple[Ingredient, ...]:

@@ -103,8 +103,10 @@ class ErrorModel:
             return self
         errors = self.pose_errors.but_of_the_arm()
         mixed = with_errors(self.mixed, errors)
-        start = np.append(self.scatter_only.null.variances, _ABSENT * errors.scales**2)
-        return replace(self, mixed=mixed, null=fit_variances(mixed, start=start), pose_errors=errors, whole=None)
+        few = np.append(self.scatter_only.null.variances, _ABSENT * errors.scales**2)
+        same = self.null.variances[np.append(np.ones(NOISE + 1, bool), ~self.pose_errors.of_arm)]
+        null = min((fit_variances(mixed, start=start) for start in (few, same)), key=lambda fit: fit.deviance)
+        return replace(self, mixed=mixed, null=null, pose_errors=errors, whole=None)
 
     @cached_property
     def elsewhere(self) -> tuple[Self, ...]:

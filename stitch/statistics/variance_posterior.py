@@ -5,6 +5,10 @@ variances, so what counts is their posterior mean (REML likelihood times prior).
 that look alike any one may be there and the others absent. So each variance is drawn in turn from all that it may be
 while the others stand (Gibbs sampling on a grid; Ritter & Tanner 1992, J. Am. Stat. Assoc. 87:861), absent included,
 and what counts is its mean there (Gelfand & Smith 1990, J. Am. Stat. Assoc. 85:398). Same random numbers every time.
+
+How good an arm is, is one more thing that nobody knows before: one factor on the usual sizes of all its errors, drawn
+with them (global and local scales; Carvalho, Polson & Scott 2010, Biometrika 97:465). An arm that shows no error of one
+kind is then believed to have less of the others.
 """
 
 from collections.abc import Sequence

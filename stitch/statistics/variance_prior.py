@@ -1,6 +1,7 @@
 """What is believed of variance components before anything was seen: scatter, noise, and what may well be absent."""
 
 import numpy as np
+from scipy.special import betainc, betaln, expit
 
 from stitch.frames import Array
 
@@ -37,8 +38,9 @@ def log_density(component: int, log_variances: Array, scales: Array | None) -> A
         return 0.5 * log_variances
     over = log_variances - 2 * float(np.log(scales[component - NOISE - 1]))
     out = 0.5 * _SPIKE * over - 0.5 * (1 + _SPIKE) * np.log1p(np.exp(over))
-    # ∫ exp(½·_SPIKE·x) dx from −∞ to the first, in steps.
-    out[0] += float(np.log(2 / _SPIKE / (log_variances[1] - log_variances[0]) + 0.5))
+    # Half a step of its own, and all that is below it: a beta distribution of x/(1 + x).
+    below = betaln(0.5 * _SPIKE, 0.5) + np.log(betainc(0.5 * _SPIKE, 0.5, expit(over[0])))
+    out[0] = np.logaddexp(out[0] - np.log(2), below - np.log(log_variances[1] - log_variances[0]))
     return np.asarray(out)
 
 

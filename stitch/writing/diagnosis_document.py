@@ -42,7 +42,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
 
 
 def _curve(curve: JointCurve) -> dict[str, Any]:
-    """Where in the range of one joint another errs by no known law; angles in degrees, errors in rad."""
+    """Where in the range or by which move a joint errs by no known law; angles in degrees, errors in rad."""
     return {
         "joint": curve.joint,
         "covariate": curve.name,

@@ -52,7 +52,7 @@ def test_no_joint_is_told_where_poses_wander(cell):
 
 
 def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
-    """A joint that is off by how far it came, smaller the farther, as no play and no settling is."""
+    """A joint that is off by how far it came, but no more beyond some 15°, as no play and no settling is."""
     q = cell.measured.plan.joints
     move = np.diff(q, axis=0, prepend=q[:1])
     off = np.zeros_like(q)

@@ -12,6 +12,7 @@ from stitch.diagnosis.diagnose import linear_model_of
 from stitch.explanation.dictionary import dictionary
 from stitch.explanation.explain import explain
 from stitch.explanation.quantities import quantities
+from stitch.explanation.search import search
 from stitch.measurement.views import views_of
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -35,6 +36,18 @@ def test_a_coupling_of_two_joints_is_found_with_its_size():
     size = float(found.formula.split("q3 ")[1].split(" rad")[0])
     assert size == pytest.approx(SIZE, rel=0.1)
     assert found.p_value < 1e-6 and found.heldout_share < 0.6
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_all_views_say_which_formula_it_is(seed):
+    """Fourteen views: some of them may suggest a relative of the law, which then stood the test, and that is said."""
+    linear = evidence(seed, coupling, views=14)
+    told = search(linear, dictionary(linear, quantities(linear.measurement.views)))[0]
+    assert told.holds and told.instead_of
+    found = explain(linear)
+    assert "sin q3·sin 2q2" in found.formula
+    suggested = {(i.what, i.quantity.text) for i in told.instead_of}
+    assert ("likeliest in all views" in found.why) == (suggested != {("q*3", "sin q3·sin 2q2")})
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -47,7 +47,7 @@ def test_columns_view_by_view_are_the_columns_of_the_whole(of, labelled):
         linear = labelled
     terms = dictionary(linear, quantities(linear.measurement.views))
     some = terms.ingredients[:: len(terms.ingredients) // 40]
-    half = Half(linear.scatter_only, terms, *halves(linear))
+    half = Half(linear.scatter_only, terms, halves(linear)[0])
     expected = half.seen(terms.columns(some))
     np.testing.assert_allclose(half.columns(some), expected, atol=1e-9 * np.abs(expected).max())
 
@@ -57,7 +57,7 @@ def test_a_bump_is_moved_to_its_place_and_width(labelled):
     views = labelled.measurement.views
     terms = dictionary(labelled, quantities(views))
     begun = Ingredient("robot", 2, bump_of_joint(views, 2, MIDDLE + 0.07, 0.2))
-    (found,) = refined([begun], Half(labelled.scatter_only, terms, *halves(labelled)))
+    (found,) = refined([begun], Half(labelled.scatter_only, terms, halves(labelled)[0]))
     middle, width = (p.value for p in found.quantity.nonlinear)
     assert middle == pytest.approx(MIDDLE, abs=0.02) and width == pytest.approx(WIDTH, rel=0.15)
     (told,) = rounded([found])

@@ -14,7 +14,7 @@ def validated(
     selection: Selection, found: dict[str, CrossValidation | None], in_halves: dict[str, Halves | None]
 ) -> Selection:
     """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
-    one may be. Where neither holds something is there of another form: the alarm that asked for a name stands.
+    one may be. Where neither holds, something is there of another form: the alarm that asked for a name stands.
     """
     if selection.verdict != "missing_effect":
         return selection

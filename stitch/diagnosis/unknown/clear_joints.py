@@ -1,8 +1,9 @@
 """Which joint errs by a law without a name: one told beside all else that an arm may do, or in place of it.
 
 All joints and links following the pose at once can do what one joint does, and beside them its law gains nothing. But
-where one joint alone explains the views as well as all of them together, and no other joint does, the errors live
-there. An arm of which every joint and link is off is explained by none of its joints alone.
+where one joint alone explains the views at least as well as all of them together, the errors live there. Compared are
+maxima of likelihood and prior: the sizes of all together are charged some three nats for being there at all. An arm of
+which every joint and link is off is explained by none of its joints alone.
 """
 
 from collections.abc import Sequence
@@ -34,6 +35,8 @@ def _beside(linear: LinearModel) -> tuple[JointLaw, ...]:
 def _alone(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Of which one, where neither joints nor links err but by it, is 20 to 1 likelier than none and explains no less
     than all of them together."""
+    if linear.pose_errors is None or not linear.pose_errors.of_one_joint:
+        return ()
     right = linear.arm_right
     tried = laws_by(right, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
     whole = 0.5 * (right.null.deviance - linear.null.deviance)

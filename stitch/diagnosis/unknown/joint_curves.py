@@ -20,7 +20,7 @@ _WORTH = 0.1
 
 @dataclass(frozen=True)
 class JointCurve:
-    """How far a joint is off as one turns, or as its own last move was longer, the rest where these views had it;
+    """How far a joint is off as one turns, or along how far it last moved itself, the rest where these views had it;
     beside its mean over the views."""
 
     joint: int  # that errs, counted from 1

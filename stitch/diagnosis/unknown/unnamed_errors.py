@@ -28,7 +28,7 @@ class Unnamed:
     words: str  # "they …"
     log_bayes_factor: float  # over the same errors without it
     joints: bool  # follows the pose rather than time
-    of_one: bool = False  # one joint, or one course of time, stands out beside all that the prior holds
+    of_one: bool = False  # one joint, or one course of time, stands out
     laws: tuple[JointLaw, ...] = ()  # of single joints, where they are clear
     curve: TimeCurve | None = None  # of the flange in time, where that is clear
     process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
@@ -66,6 +66,9 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     ]
     wanted = sorted((u for u in found if u.log_bayes_factor > ODDS), key=lambda u: -u.log_bayes_factor)
     if law is not None:
+        # What one joint does is part of what follows the joints, and as clear.
+        alike = [u.log_bayes_factor for u in found if u.joints == law.joints]
+        law = replace(law, log_bayes_factor=max(law.log_bayes_factor, *alike))
         return (law, *(u for u in wanted if u.joints != law.joints))
     # Where each can stand in for the other, the likelier alone is said to be there.
     return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
