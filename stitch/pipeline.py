@@ -8,7 +8,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.initial_values import with_effects
 from stitch.integrity.admitted_fit import Admitted, admitted_fit
-from stitch.integrity.arm_here import arm_here
+from stitch.integrity.arm_here import ArmHere, arm_here
 from stitch.integrity.model_here import held_against_own
 from stitch.integrity.refusals import mistakes_named
 from stitch.measurement.capture import capture
@@ -92,9 +92,14 @@ def run_rig(
         if arm:
             again = partial(course.fit, found.sessions, found.measurements, begun, recorder=Silent())
             here = arm_here(lambda other: again(begin_at=with_arm(other)), arm, found.fitted)
-            told = (here.sentence(sessions[0].length_unit),)
-            end = replace(end, notes=told) if here.holds else replace(end, doubts=told)
+            end = _with_arm_told(end, here, sessions[0].length_unit)
         return _of_each(sessions, found, end, before, recorders, keep)
+
+
+def _with_arm_told(end: End, here: ArmHere, length_unit: str) -> End:
+    """A note that the arm of another run holds here, or the doubt that it does not."""
+    told = (here.sentence(length_unit),)
+    return replace(end, notes=told) if here.holds else replace(end, doubts=told)
 
 
 def _fitted_here(course: Course, found: Admitted, begin_at: BeginAt | None) -> Fitted:

@@ -63,7 +63,10 @@ def _where(found: Diagnosis) -> str:
     if found.within:
         return ": the scanner or the part's shape is off, and not the poses alone"
     follows = [x.covariate for x in found.depends_on if x.p_value < _FOLLOWS]
-    return f": what is left follows {' and '.join(follows[:2])}" if follows else ""
+    if follows:
+        return f": what is left follows {' and '.join(follows[:2])}"
+    # The likeliest name, and why it does not hold.
+    return f": {found.notes[0]}" if found.notes else ""
 
 
 def next_step(found: Diagnosis, run: str) -> str:
