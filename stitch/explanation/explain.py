@@ -82,15 +82,19 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
 def _how(linear: LinearModel, terms: Dictionary, chosen: Chosen) -> str:
     """How a sum that is told stood the test."""
     other = chosen.instead_of
-    if not other or _addends(other) == _addends(chosen.ingredients):
+    if not other or _alike(other, chosen.ingredients):
         return "found in some of the views, it holds in the others"
     values = [coefficient(i, float(x)) for i, x in zip(other, fitted(linear, terms, other), strict=True)]
     return f"likeliest in all views; {formula_text(other, values)}, found in some of them, holds in the others"
 
 
-def _addends(ingredients: Sequence[Ingredient]) -> set[tuple[str, int, str]]:
-    """What a person would call the same sum."""
-    return {(i.place, i.index, i.quantity.rounded().text) for i in ingredients}
+def _alike(some: Sequence[Ingredient], others: Sequence[Ingredient]) -> bool:
+    """True of what a person would call the same sum."""
+
+    def same(i: Ingredient, k: Ingredient) -> bool:
+        return (i.place, i.index) == (k.place, k.index) and i.quantity.nearly(k.quantity)
+
+    return len(some) == len(others) and all(any(same(i, k) for k in others) for i in some)
 
 
 def _chance(p_value: float) -> str:

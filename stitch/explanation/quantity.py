@@ -24,6 +24,11 @@ class Nonlinear:
         moved = self.value * np.exp(self.spread * steps) if self.positive else self.value + self.spread * steps
         return float(np.clip(moved, *self.within))
 
+    def near(self, value: float) -> bool:
+        """True of a value that is no more than a spread off."""
+        steps = np.log(value / self.value) if self.positive else value - self.value
+        return bool(abs(steps) <= self.spread)
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -58,6 +63,13 @@ class Quantity:
     def moved(self, steps: Array) -> "Quantity":
         """The same with its nonlinear parameters so many spreads off."""
         return self._of([p.at(float(s)) for p, s in zip(self.nonlinear, steps, strict=True)])
+
+    def nearly(self, other: "Quantity") -> bool:
+        """True of the same, with nonlinear parameters no farther off than they may lie from the true ones."""
+        own = (self.kind, self.joint, len(self.nonlinear))
+        if not self.nonlinear or own != (other.kind, other.joint, len(other.nonlinear)):
+            return self.text == other.text
+        return all(a.near(b.value) for a, b in zip(self.nonlinear, other.nonlinear, strict=True))
 
     def rounded(self) -> "Quantity":
         """The same with nonlinear parameters that a person can read."""

@@ -13,6 +13,7 @@ from stitch.explanation.dictionary import dictionary
 from stitch.explanation.explain import explain
 from stitch.explanation.quantities import quantities
 from stitch.explanation.search import search
+from stitch.explanation.shapes import behind
 from stitch.measurement.views import views_of
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -48,6 +49,16 @@ def test_all_views_say_which_formula_it_is(seed):
     assert "sin q3·sin 2q2" in found.formula
     suggested = {(i.what, i.quantity.text) for i in told.instead_of}
     assert ("likeliest in all views" in found.why) == (suggested != {("q*3", "sin q3·sin 2q2")})
+
+
+def test_a_play_that_moved_a_little_is_the_same_and_another_wave_or_joint_is_not():
+    session, *_ = labelled_cell(3, views=12)
+    views = views_of(session)
+    play = behind(views, 4, 0.30)
+    assert play.nearly(behind(views, 4, 0.31)) and not play.nearly(behind(views, 4, 0.9))
+    assert not play.nearly(behind(views, 3, 0.30))
+    waves = {q.text: q for q in quantities(views)}
+    assert waves["sin 7q2"].nearly(waves["sin 7q2"]) and not waves["sin 7q2"].nearly(waves["sin 8q2"])
 
 
 @pytest.mark.parametrize("seed", range(5))
