@@ -27,9 +27,14 @@ def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
 
 
 def _beside(linear: LinearModel) -> tuple[JointLaw, ...]:
-    """Of which one is 20 to 1 likelier than none, beside all that the prior holds."""
+    """Of which one is 20 to 1 likelier than none beside all that the prior holds; each of its likeliest kind."""
     laws = _charged(joint_laws(linear))
-    return _likely(laws) if laws and laws[0].log_bayes_factor > ODDS else ()
+    if not laws or laws[0].log_bayes_factor <= ODDS:
+        return ()
+    charge = float(np.log(len(laws)))
+    by_way = {law.joint: law for law in laws_by(linear, (THE_WAY,))}
+    ways = {joint: replace(law, log_bayes_factor=law.log_bayes_factor - charge) for joint, law in by_way.items()}
+    return tuple(max(law, ways[law.joint], key=lambda one: one.log_bayes_factor) for law in _likely(laws))
 
 
 def _alone(linear: LinearModel) -> tuple[JointLaw, ...]:
