@@ -65,6 +65,12 @@ def beside(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
     return replace(world, arm=draw_arm(a.cell.plan.arm.joints, 0.5, rng)), hidden
 
 
+def arm(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """An ordinary arm of 0.3, 0.5 or 1 times the usual size: no joint errs above all others."""
+    size = (0.3, 0.5, 1.0)[k // 12 % 3]
+    return World(_laws(a, {}, rng), arm=draw_arm(a.cell.plan.arm.joints, size, rng)), ()
+
+
 def two(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """Two effects at four times that size."""
     return _several(a, 2, rng, k)
@@ -85,6 +91,7 @@ PARTS: dict[str, tuple[Part, int]] = {
     "two": (two, 42),
     "three": (three, 42),
     **{f"unnamed_{n}x": (partial(unnamed_at, multiple=float(n)), 60) for n in MULTIPLES},
+    "arm": (arm, 36),
 }
 
 

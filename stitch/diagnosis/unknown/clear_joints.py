@@ -1,9 +1,9 @@
-"""Which joint errs by a law without a name: one told beside all else that an arm may do, or in place of it.
+"""Which joint errs by a law without a name: told beside all else that an arm may do, or in place of it.
 
 All joints and links following the pose at once can do what one joint does, and beside them its law gains nothing. But
 where one joint alone explains the views at least as well as all of them together, the errors live there. Compared are
 maxima of likelihood and prior: the sizes of all together are charged some three nats for being there at all. An arm of
-which every joint and link is off is explained by none of its joints alone.
+which every joint and link is off is hardly ever explained by one of its joints alone.
 """
 
 from collections.abc import Sequence

@@ -68,7 +68,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     if law is not None:
         # What one joint does is part of what follows the joints, and as clear.
         alike = [u.log_bayes_factor for u in found if u.joints == law.joints]
-        law = replace(law, log_bayes_factor=max(law.log_bayes_factor, *alike))
+        law = replace(law, log_bayes_factor=max([law.log_bayes_factor, *alike]))
         return (law, *(u for u in wanted if u.joints != law.joints))
     # Where each can stand in for the other, the likelier alone is said to be there.
     return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
