@@ -28,12 +28,11 @@ def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
 
 def _beside(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Of which one is 20 to 1 likelier than none beside all that the prior holds; each of its likeliest kind."""
-    laws = _charged(joint_laws(linear))
+    tried = joint_laws(linear)
+    laws = _charged(tried, among=len(tried))
     if not laws or laws[0].log_bayes_factor <= ODDS:
         return ()
-    charge = float(np.log(len(laws)))
-    by_way = {law.joint: law for law in laws_by(linear, (THE_WAY,))}
-    ways = {joint: replace(law, log_bayes_factor=law.log_bayes_factor - charge) for joint, law in by_way.items()}
+    ways = {law.joint: law for law in _charged(laws_by(linear, (THE_WAY,)), among=len(tried))}
     return tuple(max(law, ways[law.joint], key=lambda one: one.log_bayes_factor) for law in _likely(laws))
 
 
@@ -46,15 +45,15 @@ def _alone(linear: LinearModel) -> tuple[JointLaw, ...]:
     tried = laws_by(right, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
     whole = 0.5 * (right.null.deviance - linear.null.deviance)
     best = max((law.log_bayes_factor for law in tried), default=-np.inf)
-    laws = _charged(tried)
+    laws = _charged(tried, among=len(tried))
     if best < whole or not laws or laws[0].log_bayes_factor < ODDS:
         return ()
     return tuple(replace(law, log_bayes_factor=law.log_bayes_factor - whole) for law in _likely(laws))
 
 
-def _charged(tried: Sequence[JointLaw]) -> list[JointLaw]:
-    """Likeliest first, each charged for all that were tried."""
-    laws = [replace(law, log_bayes_factor=law.log_bayes_factor - float(np.log(len(tried)))) for law in tried]
+def _charged(laws: Sequence[JointLaw], among: int) -> list[JointLaw]:
+    """Likeliest first, each charged for all among which it was chosen."""
+    laws = [replace(law, log_bayes_factor=law.log_bayes_factor - float(np.log(among))) for law in laws]
     return sorted(laws, key=lambda law: -law.log_bayes_factor)
 
 

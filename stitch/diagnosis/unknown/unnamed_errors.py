@@ -55,7 +55,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
-        _JOINTS: tuple(n for n in names if n not in (*WANDERING, *STOPS)),
+        _JOINTS: tuple(n for n, of_arm in zip(names, linear.pose_errors.of_arm, strict=True) if of_arm),
         _TIME: tuple(WANDERING),
         "are shared by the scans of a stop": STOPS,
     }
