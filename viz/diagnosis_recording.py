@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.diagnosis.course_sentences import course_texts
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import amounts_of
 from stitch.system.whole_file import whole
@@ -58,7 +59,8 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
     plain = plain_finding(found, length_unit)
     rec.log("diagnosis/plain", words(plain), static=True)
-    lines = [f"**{plain}**", "", found.sentence, "", f"{next_step(found, 'RUN')}", ""]
+    courses = [line for told in course_texts(found, length_unit) for line in (told, "")]
+    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{next_step(found, 'RUN')}", ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
         "|---:|---|---:|---:|---:|---|",

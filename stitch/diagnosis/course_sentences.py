@@ -2,9 +2,20 @@
 
 import numpy as np
 
+from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
 from stitch.units import amount, duration_text, rounded
+
+# Curves of joints that are told in words; the page draws one more.
+_TOLD = 2
+
+
+def course_texts(found: Diagnosis, length_unit: str) -> list[str]:
+    """A sentence for every course that is clear enough to be said, of joints and in time."""
+    told = [curve_text(curve) for curve in found.curves[:_TOLD]]
+    in_time = found.time_curve
+    return told if in_time is None else [*told, time_curve_text(in_time, length_unit)]
 
 
 def curve_text(curve: JointCurve) -> str:

@@ -1,6 +1,6 @@
 """The whole diagnosis: linear model, candidates, selection, what to measure next, one plain sentence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible, scatter_limit
 from stitch.diagnosis.scanner_first import scanner_first
+from stitch.diagnosis.score import Score
 from stitch.diagnosis.selection.pairs import both_missing
 from stitch.diagnosis.selection.upheld import hold_together, validated
 from stitch.diagnosis.selection.verdict import Selection, select
@@ -32,8 +33,7 @@ from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.state import State
 from stitch.stages.course import linearise
 from stitch.system.heap import return_large_arrays
-from stitch.system.steps import steps
-from stitch.system.threads import library_threads_off
+from stitch.system.threads import library_threads_off, parallel
 
 # From so many on, columns of candidates take a megabyte each.
 _MANY_POSES = 1000
@@ -55,10 +55,10 @@ def _diagnosed(state: State) -> Diagnosis:
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     candidates, missing = candidates_of(linear)
     selection = select(linear, candidates, limit)
-    matrix = alias_matrix(linear, [r.score for r in selection.ranked])
-    examined = _examined(linear, selection, matrix, tests=sum(not c.empirical for c in candidates))
-    left_out = {e.name: e.cross_validation for e in examined}
+    left_out = _left_out(linear, selection)
     selection, smooth = _held(linear, candidates, selection, left_out)
+    matrix = alias_matrix(linear, [r.score for r in selection.ranked])
+    examined = _examined(linear, selection, matrix, sum(not c.empirical for c in candidates), left_out)
     within = left_within(linear, state.session.scanner.noise)
     if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
@@ -113,16 +113,20 @@ def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float
 def concluded(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
     """The verdict alone: selected, and held against views left out."""
     selection = select(linear, candidates, limit)
+    return _held(linear, candidates, selection, _left_out(linear, selection))[0]
+
+
+def _left_out(linear: LinearModel, selection: Selection) -> dict[str, CrossValidation]:
+    """What each effect that may be named does on views left out, beside all that it was named beside."""
     asked = [r for r in (*selection.named, selection.second) if r is not None]
-    left_out: dict[str, CrossValidation | None] = {r.name: cross_validate(linear, r.score) for r in asked}
-    return _held(linear, candidates, selection, left_out)[0]
+    return {r.name: cross_validate(linear, r.score) for r in asked}
 
 
 def _held(
     linear: LinearModel,
     candidates: Sequence[Candidate],
     selection: Selection,
-    left_out: dict[str, CrossValidation | None],
+    left_out: Mapping[str, CrossValidation],
 ) -> tuple[Selection, FieldError | None]:
     """What is named, held against views left out, halves of the views and the scanner's own error, which is returned
     where it is part of the answer."""
@@ -149,21 +153,29 @@ def linear_model_of(state: State) -> LinearModel:
     return linearise(state.session, state.measurement, state.model, state.gate)
 
 
-def _examined(linear: LinearModel, selection: Selection, matrix: Array, tests: int) -> list[CandidateEffect]:
-    """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes."""
-    scores, push, out = [r.score for r in selection.ranked], hand_eye_response(linear), []
-    for k, ranked in enumerate(steps("candidate effects on views left out", selection.ranked)):
-        scored = ranked.score
-        detectable = smallest_detectable(linear, scored.candidate, tests)
-        out.append(
-            CandidateEffect(
-                ranked=ranked,
-                aliases=tuple(aliases_of(k, matrix, scores)),
-                cross_validation=(
-                    cross_validate(linear, scored) if scored.observable and k < PREDICTED and scored.fitted else None
-                ),
-                detectable=detectable,
-                hand_eye=omitted_effect_bias(linear, push, scored.candidate, detectable),
-            )
+def _examined(
+    linear: LinearModel, selection: Selection, matrix: Array, tests: int, left_out: Mapping[str, CrossValidation]
+) -> list[CandidateEffect]:
+    """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes.
+
+    Args:
+        left_out: of those that may be named, beside all that they were named beside; the others are asked alone.
+    """
+    scores, push = [r.score for r in selection.ranked], hand_eye_response(linear)
+
+    def asked(k: int) -> CandidateEffect:
+        ranked, candidate = selection.ranked[k], scores[k].candidate
+        detectable = smallest_detectable(linear, candidate, tests)
+        return CandidateEffect(
+            ranked=ranked,
+            aliases=tuple(aliases_of(k, matrix, scores)),
+            cross_validation=left_out.get(ranked.name) or (_alone(linear, scores[k]) if k < PREDICTED else None),
+            detectable=detectable,
+            hand_eye=omitted_effect_bias(linear, push, candidate, detectable),
         )
-    return out
+
+    return list(parallel(asked, range(len(scores)), "candidate effects on views left out"))
+
+
+def _alone(linear: LinearModel, scored: Score) -> CrossValidation | None:
+    return cross_validate(linear, scored) if scored.observable and scored.fitted else None

@@ -28,11 +28,13 @@ class ChainErrors:
     part: Array  # (V, 6) twist of the part in the reference frame
 
 
-def chain_errors(measurement: Measurement, terms: Sequence[Term]) -> ChainErrors:
-    """Collect what some effects do to the chain of frames."""
+def chain_errors(measurement: Measurement, terms: Sequence[Term], beside: ChainErrors | None = None) -> ChainErrors:
+    """Collect what some effects do to the chain of frames, beside what others have done already."""
     views = measurement.views
-    joints, links = views.joints, right_links(*views.joints.shape)
-    mount, part = np.zeros((2, views.count, 6))
+    if beside is None:
+        right = right_links(*views.joints.shape)
+        beside = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
+    joints, links, mount, part = beside.joints, beside.links, beside.mount, beside.part
     for term in terms:
         function, arguments = term.effect.function, term.arguments
         # The function adds to what it is given; what it reads of the pose are the reported angles.

@@ -28,20 +28,21 @@ def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre
     chain = None
     for term in terms:
         about = model.with_term(term)
-        errors = chain_errors(measurement, about.terms)
+        others = chain_errors(measurement, model.without(term.name).terms)
+        errors = chain_errors(measurement, [term], others)
         if chain is None or not chain.is_about(errors):
             chain = _Chain(measurement, about, errors, centre)
-        moved = [_slope(measurement, about, term, i, chain) for i in range(len(term.parameters))]
+        moved = [_slope(measurement, others, term, i, chain) for i in range(len(term.parameters))]
         yield np.array(moved).reshape(len(moved), measurement.views.count, 6)
 
 
-def _slope(measurement: Measurement, about: Model, term: Term, i: int, chain: "_Chain") -> Array:
-    """(V, 6) of one parameter."""
+def _slope(measurement: Measurement, others: ChainErrors, term: Term, i: int, chain: "_Chain") -> Array:
+    """(V, 6) of one parameter beside what all other terms do."""
     parameter = term.parameters[i]
     if parameter.discrete:
         return np.zeros((measurement.views.count, 6))
     size = (_STEP_GRIDDED if parameter.grid else STEP) * parameter.typical
-    up, down = (chain_errors(measurement, about.with_term(t).terms) for t in stepped(term, i, size))
+    up, down = (chain_errors(measurement, [t], others) for t in stepped(term, i, size))
     return chain.twists(up, down, moves_arm(term)) / (2 * size)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import SEEN, form_weights
 from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL
-from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, log_prior
+from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, some_law
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.planning.candidate_tests import CandidateTest, candidate_test, covariance_tests
@@ -43,7 +43,7 @@ class ExpectedDiagnosis:
         self._half = np.linalg.cholesky(linear.covariance[0])
         self._of_arm = set({} if linear.pose_errors is None else linear.pose_errors.effects)
         self._tests: dict[tuple[frozenset[str], str], CandidateTest] = {}
-        self._laws: dict[int, tuple[CandidateTest, ...]] = {}
+        self._laws: dict[int, tuple[tuple[CandidateTest, ...], ...]] = {}  # by law its tests at several sizes
 
     def seen(self, shift: Array, rng: np.random.Generator) -> Array:
         """(n, D) numbers of the channel: shifts (n, D) under all other errors."""
@@ -87,15 +87,15 @@ class ExpectedDiagnosis:
         return out
 
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
-        """(D,) whether a candidate is ahead of every joint that follows by no law (`joint_laws.py`)."""
+        """(D,) whether a candidate is ahead of joints that follow by no law (`joint_laws.py`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
             found = law_covariances(own.linear)
-            self._laws[k] = tuple(test for C in found for test in covariance_tests(own.linear, C, np.sqrt(TIMES)))
+            self._laws[k] = tuple(tuple(covariance_tests(own.linear, C, np.sqrt(TIMES))) for C in found)
         laws = self._laws[k]
         if not laws:
             return np.ones(numbers.shape[1], bool)
-        rival = np.max([law.evaluate(numbers)[0] for law in laws], axis=0) + log_prior(own.linear)
+        rival = some_law(np.array([np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in laws]))
         return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:

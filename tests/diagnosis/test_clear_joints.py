@@ -12,7 +12,7 @@ from stitch import frames
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import joint_laws
+from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, some_law
 from stitch.observations.pose_errors import THE_WAY
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -43,6 +43,13 @@ def test_no_joint_is_told_where_all_are_off(cell, size):
     for seed in range(4):
         arm = draw_arm(cell.measured.plan.arm.joints, size, np.random.default_rng(seed))
         assert not clear_laws(cell.seen(arm.flange(cell.measured.plan.arm, cell.measured.plan.joints)))
+
+
+def test_that_some_law_is_there_is_their_mean_over_a_twentieth():
+    """However many kinds of laws are asked for: those that explain nothing take their share of the prior."""
+    factors = np.array([50.0, 3.0, 1.0, 0.0])
+    asked = some_law(np.log(np.maximum(factors, 1e-300))[:, None])
+    assert asked.shape == (1,) and np.exp(asked[0] + ANY_SIZE) == pytest.approx(0.05 * factors.mean())
 
 
 def test_no_joint_is_told_where_poses_wander(cell):

@@ -12,14 +12,19 @@ import pytest
 from rerun.chunk import RrdReader
 
 from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import write_session
 from stitch.comparison.model_history import model_history
+from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.pipeline import diagnose, run
 from stitch.runs.run import Note
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
+from viz.diagnosis_recording import log_diagnosis
 from viz.model_timeline import one_above_the_other
 from viz.recording import RerunRecorder
+from viz.rrd_file import RecordingFile
 from viz.run_page import write_report
 from viz.unbroken import unbroken
 
@@ -90,8 +95,8 @@ def test_no_name_of_a_view_covers_another():
 
 
 def test_titles_and_words_say_what_the_result_says(recorded):
-    run, path = recorded
-    stated = result_document(run)["disagreement"]["steps"]
+    result, path = recorded
+    stated = result_document(result)["disagreement"]["steps"]
     before, after = titles([stated[1], stated[-1]])
     after = f"{after} (single views moved)"
     assert {before, after} <= names_of_views(path)
@@ -121,6 +126,17 @@ def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp
     assert rerun("rrd", "verify", str(recording)).returncode == 0
     words = columns(recording, "TextDocument:text")["/diagnosis/verdict"][0]
     assert unbroken(json.loads((tmp_path / "r" / "diagnosis.json").read_text())["sentence"]) in words
+
+
+def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
+    found = diagnose(run(labelled_cell(3, views=30)[0]))
+    angle, error = np.radians([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
+    course = JointCurve(2, 3, False, 0.8, angle, error, np.full(3, 1e-5), stood=angle)
+    file = RecordingFile("stitch", tmp_path / "d.rrd")
+    log_diagnosis(file.stream, replace(found, curves=(course,)), None, "mm")
+    file.write()
+    said = columns(tmp_path / "d.rrd", "TextDocument:text")["/diagnosis/verdict"][0]
+    assert unbroken("Joint 2 is off by -0.1 ± 0.01 mrad at j3 = -60°, and by 0.25 ± 0.01 mrad at j3 = 40°") in said
 
 
 def test_page_needs_nothing_beside_it_and_says_everything(recorded, tmp_path):

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.streams import emit
-from stitch.diagnosis.course_sentences import curve_text, time_curve_text
+from stitch.diagnosis.course_sentences import course_texts
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of
 from stitch.model.hand_eye_uncertainty import stands_for
@@ -111,10 +111,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
         _show_missed(terminal, found, length_unit)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
         terminal.print(f"What the present model leaves follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
-    for curve in found.curves[:2]:
-        terminal.print(curve_text(curve), soft_wrap=True)
-    if found.time_curve is not None:
-        terminal.print(time_curve_text(found.time_curve, length_unit), soft_wrap=True)
+    for told in course_texts(found, length_unit):
+        terminal.print(told, soft_wrap=True)
     for p in found.next[:3]:
         terminal.print(f"To measure next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
 

@@ -1,6 +1,7 @@
 """Whether the effects of a model still hold their place beside each other."""
 
 from collections.abc import Collection
+from functools import partial
 
 from stitch.diagnosis.candidates import as_fitted
 from stitch.diagnosis.selection.ranking import certain, ranked_one
@@ -9,6 +10,7 @@ from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.model.term import Term
 from stitch.runs.state import State
 from stitch.stages.course import linearise
+from stitch.system.threads import parallel
 
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
@@ -17,8 +19,9 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
     Args:
         names: effects of the model that may go.
     """
-    asked = [(term.name, *_objection(state, term)) for term in state.model.terms if term.name in names]
-    failing = [(factor, name, reason) for name, factor, reason in asked if reason is not None]
+    asked = [term for term in state.model.terms if term.name in names]
+    found = zip(asked, parallel(partial(_objection, state), asked), strict=True)
+    failing = [(factor, term.name, reason) for term, (factor, reason) in found if reason is not None]
     if not failing:
         return None
     _, name, reason = min(failing)

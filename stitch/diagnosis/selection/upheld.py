@@ -1,5 +1,6 @@
 """Whether a name stands before the views that took no part in choosing it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from stitch.diagnosis.selection.ranking import Ranked, conditioned
@@ -11,7 +12,7 @@ from stitch.observations.linear_model import LinearModel
 
 
 def validated(
-    selection: Selection, found: dict[str, CrossValidation | None], in_halves: dict[str, Halves | None]
+    selection: Selection, found: Mapping[str, CrossValidation], in_halves: Mapping[str, Halves | None]
 ) -> Selection:
     """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
     one may be. Where neither holds, something is there of another form: the alarm that asked for a name stands.

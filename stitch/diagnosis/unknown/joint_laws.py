@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.special import logsumexp
 
 from stitch.diagnosis.form_trial import SCALES
 from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
@@ -42,23 +43,24 @@ class JointLaw:
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
     """What such a law of each joint explains beside a model, likeliest first; () without joints or prior of errors.
 
-    Its size is fitted with all others; `log_posterior` charges it for that.
+    Its size is fitted with all others; `some_law` charges it for that.
     """
     laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE))
     return tuple(sorted(laws, key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
-    """Of the likeliest law of a joint, by the angles or by the way it came, as those of effects in the same model
-    (`Ranked`); −∞ where there is none."""
+    """That some joint follows such a law, by the angles or by the way it came, as those of effects in the same model
+    (`Ranked`); −∞ where the views tell of none."""
     laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
-    return max((law.log_bayes_factor for law in laws), default=-np.inf) + log_prior(base)
+    return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
-def log_prior(base: LinearModel) -> float:
-    """What the likeliest law is charged: its share of the prior, which the joints divide and each kind of law has, and
-    that its size is not known."""
-    return float(np.log(PRIOR_UNKNOWN / max(base.measurement.views.joints.shape[1], 1))) - ANY_SIZE
+def some_law(log_bayes_factors: Array) -> Array:
+    """(…) log posterior that one of the laws is there, from the log Bayes factors (L, …) of each: all kinds of laws of
+    all joints share the prior alike, and none of their sizes is known."""
+    every = logsumexp(log_bayes_factors, axis=0) - np.log(len(log_bayes_factors))
+    return np.asarray(every + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
 
 
 def law_covariances(base: LinearModel) -> list[Array]:

@@ -1,9 +1,9 @@
-"""The likeliest law without a name as a rival of names: of one joint, or of the flange in time."""
+"""Laws without a name as rivals of names: of some joint, or of the flange in time."""
 
 from stitch.diagnosis.unknown import joint_laws, time_laws
 from stitch.observations.linear_model import LinearModel
 
 
 def log_posterior(base: LinearModel) -> float:
-    """Of the likeliest of them, as those of effects in the same model (`Ranked`); −∞ where there is none."""
+    """Of the likelier, as those of effects in the same model (`Ranked`); −∞ where there is none."""
     return max(joint_laws.log_posterior(base), time_laws.log_posterior(base))

@@ -3,6 +3,7 @@ leading eigenvectors of their covariance between views."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import eigh
@@ -19,6 +20,8 @@ from stitch.statistics.kernels import REACH, SHORT_REACH, alike_in_joints, alike
 _MOST, _LEAST = 96, 1e-3
 # Of so many views the covariance is drawn apart, and the others follow these.
 _KNOTS = 400
+# Of so many processes what takes longest is kept: those of a session with six or seven joints.
+_KEPT = 64
 
 
 @dataclass(frozen=True)
@@ -67,24 +70,32 @@ def wandering(linear: LinearModel) -> SmoothProcess:
     knots = _knots(len(time))
     alike = alike_in_time(time, WANDERING["slowly wandering"], time[knots])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
-    return SmoothProcess(None, carried, _shapes(alike, knots, _MOST // 6))
+    return SmoothProcess(None, carried, alike @ _leading(alike[knots], _MOST // 6))
 
 
 def _following(angles: Array, reach: float = REACH) -> Array:
     """(V, R) smooth courses over some angles (V, a), without what is alike in all views: that has a name."""
-    knots = _knots(len(angles))
-    shapes = _shapes(alike_in_joints(angles, angles[knots], reach), knots, _MOST)
+    knots = angles[_knots(len(angles))]
+    leading = _leading_among(np.ascontiguousarray(knots).tobytes(), len(knots), reach)
+    shapes = alike_in_joints(angles, knots, reach) @ leading
     return np.asarray(shapes - shapes.mean(axis=0))
+
+
+@lru_cache(maxsize=_KEPT)
+def _leading_among(angles: bytes, views: int, reach: float) -> Array:
+    """(K, R) of the knots whose angles these are: the same in every diagnosis of a session."""
+    knots = np.frombuffer(angles).reshape(views, -1)
+    return _leading(alike_in_joints(knots, knots, reach), _MOST)
 
 
 def _knots(views: int) -> Indices:
     return np.unique(np.linspace(0, views - 1, min(views, _KNOTS)).astype(np.int64))
 
 
-def _shapes(alike: Array, knots: Indices, most: int) -> Array:
-    """(V, R) courses with unit coefficients of which a process is made, from its covariance with the knots (V, K)."""
-    last = len(knots) - 1
-    values, vectors = eigh(alike[knots], subset_by_index=(max(last + 1 - most, 0), last))
+def _leading(covariance: Array, most: int) -> Array:
+    """(K, R) of which the courses with unit coefficients of a process are made, by its covariance with the knots."""
+    last = len(covariance) - 1
+    values, vectors = eigh(covariance, subset_by_index=(max(last + 1 - most, 0), last))
     values, vectors = values[::-1], vectors[:, ::-1]
     keep = values > _LEAST * values[0]
-    return np.asarray(alike @ (vectors[:, keep] / np.sqrt(values[keep])))
+    return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
