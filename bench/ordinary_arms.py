@@ -7,7 +7,8 @@ pose channel: true poses of data_synth's own kinematics, noise of the normal equ
 over draws. χ²/6 is 1 on the average where sigmas are right; medians are put over the median of χ²(6)/6, 0.891.
 --alone fits as if poses scattered independently. Seeds are of two kinds: those of development, and held-out ones, to be
 run once for each version of the statistics. Used up: 700 and 701 (one size for quick and slow wandering, sizes by a
-chain that follows the slope), 710 to 712 (sizes drawn in turn, one slow wandering), 720 to 725 (each size by itself).
+chain that follows the slope), 710 to 712 (sizes drawn in turn, one slow wandering), 720 to 725 (each size by itself), 726
+to 729 (one factor on all sizes of an arm).
 """
 
 import argparse
@@ -25,7 +26,7 @@ from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (726, 727, 728, 729)
+DEVELOPMENT, HELD_OUT = (0, 1), (730, 731, 732, 733)
 KINDS = (
     *(("clean", 0.0), ("ordinary arm", 0.1), ("ordinary arm", 0.3), ("ordinary arm", 1.0), ("ordinary arm", 2.0)),
     *(("memory", 0.5), ("memory", 0.9), ("stops", 1.0), ("coupling", 1.5e-4), ("coupling", 6e-4)),
