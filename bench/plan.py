@@ -24,7 +24,7 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.simulate import Measured
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.frames import Array
 from stitch.measurement.measurement import about_part, measurement_of

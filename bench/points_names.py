@@ -24,7 +24,7 @@ from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.frames import Array

@@ -15,7 +15,7 @@ from blind_cells import drawn, smallest
 from blind_trials import LIBRARY, cell_without, pin
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.frames import Array

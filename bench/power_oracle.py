@@ -22,7 +22,7 @@ from unknown_cells import Asked, World, asked, seen
 
 from data_synth import nature
 from stitch.diagnosis.candidates import Form
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, POWER
 from stitch.effects import EFFECTS

@@ -20,7 +20,7 @@ from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import MULTIPLES, PARTS
 
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.thresholds import IMPLAUSIBLE

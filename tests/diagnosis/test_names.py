@@ -10,7 +10,7 @@ from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unknown.clear_joints import clear_laws

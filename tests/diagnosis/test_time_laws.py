@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_law

@@ -14,7 +14,7 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.diagnose import concluded
+from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.planning.cells import cell_of_session
