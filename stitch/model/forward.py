@@ -34,7 +34,9 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], beside: ChainE
     if beside is None:
         right = right_links(*views.joints.shape)
         beside = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
-    joints, links, mount, part = beside.joints, beside.links, beside.mount, beside.part
+    joints, mount, part = beside.joints, beside.mount, beside.part
+    # A user's own effect may change the links that it is given in place.
+    links = Links(*(own.copy() for own in vars(beside.links).values()))
     for term in terms:
         function, arguments = term.effect.function, term.arguments
         # The function adds to what it is given; what it reads of the pose are the reported angles.

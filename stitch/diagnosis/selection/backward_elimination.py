@@ -14,7 +14,9 @@ from stitch.system.threads import parallel
 
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
-    """The weakest effect that does not hold its place beside all the others, and why; None if all do.
+    """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
+
+    Effects are asked at once, which scans, whose overlaps are found by all cores already, do not allow.
 
     Args:
         names: effects of the model that may go.

@@ -108,11 +108,11 @@ def _stray(empirical: Sequence[Ranked]) -> Ranked | None:
 def _outdone(best: Ranked, stray: Ranked | None, law: float, second: Ranked | None = None, tests: int = 1) -> bool:
     """True where something without a name does what an effect of the library does, with a second one or alone.
 
-    A shape without a cause must be 20 to 1 likelier; a joint that follows the joint angles by no law must be 20 to 1
-    less likely, as all others that might have the name.
+    A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows no law that has a name must be
+    20 to 1 less likely, as all others that might have the name.
 
     Args:
-        law: log posterior of such a joint.
+        law: log posterior of that (`rivals.py`).
         tests: effects among which the second was chosen.
     """
     known = best.log_posterior

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -72,6 +73,10 @@ class Surfaces:
 
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
+        return self._folds
+
+    @cached_property
+    def _folds(self) -> list[Indices]:
         return grouped_folds(self.capture.T_reference_mount, self.freed.overlaps.gram.lever)
 
     def ends(self, joints: Array) -> list[JointEnd]:

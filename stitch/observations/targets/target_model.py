@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,6 +64,10 @@ class Targets:
 
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
+        return self._folds
+
+    @cached_property
+    def _folds(self) -> list[Indices]:
         return grouped_folds(self.rows.capture.T_reference_mount, self.rows.reach)
 
     def ends(self, joints: Array) -> list[JointEnd]:

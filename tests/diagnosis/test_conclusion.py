@@ -1,0 +1,65 @@
+"""What is concluded where a name does not stand by itself: with a second effect, or without the first."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from stitch.diagnosis import conclusion
+from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.validation.cross_validation import CrossValidation
+
+HELPS = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.1, steadiness=0.9)
+USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, steadiness=0.9)
+
+
+def ranked(name, beside=None):
+    score = SimpleNamespace(name=name, beside=beside)
+    return Ranked(score, adjusted=1e-6, log_posterior=9.0, posterior=0.9)
+
+
+FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
+ALONE = Selection("missing_effect", (FIRST,), (FIRST, SECOND), ())
+PAIR = replace(ALONE, second=SECOND)
+SMOOTH = SimpleNamespace(gain=50.0)
+
+
+@pytest.fixture(autouse=True)
+def without_halves(monkeypatch):
+    monkeypatch.setattr(conclusion, "halves", lambda score: None)
+    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: HELPS)
+
+
+def upheld(monkeypatch, selection, *, together, refused):
+    """With what the views say of two effects together, and selections that the scanner's own error outweighs."""
+
+    def scanner_first(linear, s):
+        return (replace(s, verdict="unknown_effect", named=(), second=None), SMOOTH) if s in refused else (s, None)
+
+    monkeypatch.setattr(conclusion, "_together", lambda *asked: together)
+    monkeypatch.setattr(conclusion, "scanner_first", scanner_first)
+    return conclusion.upheld(None, (), selection, conclusion.on_views_left_out(None, selection))
+
+
+def test_what_looks_like_an_error_of_the_scanner_may_be_a_second_effect(monkeypatch):
+    found, smooth = upheld(monkeypatch, ALONE, together=PAIR, refused=[ALONE])
+    assert (found.named, found.second, smooth) == ((FIRST,), SECOND, None)
+
+
+@pytest.mark.parametrize("together", [None, PAIR])
+def test_what_two_effects_do_not_explain_stays_the_scanners(monkeypatch, together):
+    found, smooth = upheld(monkeypatch, ALONE, together=together, refused=[ALONE, PAIR])
+    assert found.verdict == "unknown_effect" and not found.named and smooth is SMOOTH
+
+
+@pytest.mark.parametrize("alone", [HELPS, USELESS])
+def test_a_second_effect_without_the_first_is_asked_alone(monkeypatch, alone):
+    first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
+    by_itself = ranked("fixture_drift")
+    said = {id(first.score): USELESS, id(second.score): HELPS, id(by_itself.score): alone}
+    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: said[id(score)])
+    selection = Selection("missing_effect", (first,), (ranked("backlash"), by_itself), (), second=second)
+    found, _ = upheld(monkeypatch, selection, together=None, refused=[])
+    assert found.named == ((by_itself,) if alone is HELPS else ())
+    assert "backlash" in found.notes[0]
