@@ -17,8 +17,9 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import at_variances, fit_variances
 
-# Where a prior of pose errors stands beside; labelled points show sizes whatever their prior.
-SCALES = (1.0, 0.3, 0.1)
+# Shares of the plausible sizes, the first where labelled points show sizes whatever their prior. Where a prior of pose
+# errors stands beside, all of them: the largest is the tail without which three numbers at seven sigmas cost what they gain.
+SCALES = (1.0, 3.0, 0.3, 0.1)
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
 # Among more numbers than this the variances are the same under both priors, and a fit takes half a second.
