@@ -17,8 +17,8 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import at_variances, fit_variances
 
-# Shares of the plausible sizes, the first where labelled points show sizes whatever their prior. Where a prior of pose
-# errors stands beside, all of them: the largest is the tail without which three numbers at seven sigmas cost what they gain.
+# Shares of the plausible sizes: the first where labelled points show sizes whatever their prior, all of them where a
+# prior of pose errors stands beside. The largest is a tail: without it numbers at seven sigmas cost what they gain.
 SCALES = (1.0, 3.0, 0.3, 0.1)
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
