@@ -1,7 +1,8 @@
 """Labelled points of real robots: what `stitch add --suggested` finds, judged on poses left out in several ways.
 
-Run: python bench/real_points.py [NAME...] [--at-most N] [--models ";a;a,b"]; writes the tables of docs/points.md.
-With --models these are judged instead of what the diagnosis finds. Needs the measured data beside the project.
+Run: python bench/real_points.py [NAME...] [--at-most N] [--models ";a;a,b"] [--write]; --write puts the tables into
+docs/points.md. With --models these are judged instead of what the diagnosis finds. Needs the measured data beside the
+project.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from stitch.writing.result_document import model_of
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
 PAGE = ROOT / "docs" / "points.md"
+MARKS = ("<!-- measured: begin -->", "<!-- measured: end -->")
 # The way to leave poses out whose fitted part leads the search: odd poses of the UR10 have another elbow.
 DATA = {"irb120-tracker": "even → odd", "ur10-tmac": "random halves"}
 _BLOCKS = 4
@@ -108,6 +110,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=list(DATA))
     parser.add_argument("--at-most", type=int, default=8)
     parser.add_argument("--models", help="effects by commas, models by semicolons; the first may be empty")
+    parser.add_argument("--write", action="store_true")
     parser.add_argument("--cache", type=Path, default=ROOT / "runs" / "real_points")
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)
@@ -115,10 +118,12 @@ def main() -> None:
     for name in arguments.names:
         measure(name, arguments.at_most, models, arguments.cache / f"{name}.json")
     tables = [table(json.loads(file.read_text())) for file in sorted(arguments.cache.glob("*.json"))]
-    begin, end = "<!-- tables: begin -->", "<!-- tables: end -->"
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
-    text = head + begin + "\n" + "\n".join(tables) + end + rest.partition(end)[2]
-    PAGE.write_text(text, encoding="utf-8")
+    print(*tables, sep="\n")
+    if arguments.write:
+        begin, end = MARKS
+        head, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+        text = head + begin + "\n" + "\n".join(tables) + end + rest.partition(end)[2]
+        PAGE.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
