@@ -12,6 +12,9 @@ from stitch.runs.state import State
 from stitch.stages.course import linearise
 from stitch.system.threads import parallel
 
+# From so many on, a linear model takes half a gigabyte: one at a time.
+_MANY_POSES = 1000
+
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
     """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
@@ -22,7 +25,8 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
         names: effects of the model that may go.
     """
     asked = [term for term in state.model.terms if term.name in names]
-    found = zip(asked, parallel(partial(_objection, state), asked), strict=True)
+    each = parallel if state.measurement.views.count < _MANY_POSES else map
+    found = zip(asked, each(partial(_objection, state), asked), strict=True)
     failing = [(factor, term.name, reason) for term, (factor, reason) in found if reason is not None]
     if not failing:
         return None
