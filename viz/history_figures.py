@@ -9,6 +9,9 @@ from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN
 from viz.drawing import above, plain
 
+# So many steps have room for whole names of effects.
+_SIDE_BY_SIDE = 4
+
 
 def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
     """Residual, held-out residual and noise floor over the model's history."""
@@ -22,7 +25,10 @@ def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
         axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
     floors = np.array([s.noise_floor * um for s in ledger])
     axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
-    axes.set_xticks(place, [change_of(ledger, i).replace(", ", "\n") for i in place])
+    changes = [change_of(ledger, i).replace(", ", "\n") for i in place]
+    # Of many steps a name is wider than its bars.
+    narrow = len(ledger) > _SIDE_BY_SIDE
+    axes.set_xticks(place, [name.replace("_", "_\n") if narrow else name for name in changes], fontsize=8)
     axes.set_ylabel("rms between views (µm)")
     above(axes)
     return plain(figure)
