@@ -18,7 +18,7 @@ from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
 from stitch.diagnosis.sentences import sentence_of
-from stitch.diagnosis.thresholds import PREDICTED
+from stitch.diagnosis.thresholds import MANY_POSES, PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
@@ -31,9 +31,6 @@ from stitch.stages.course import linearise
 from stitch.system.heap import return_large_arrays
 from stitch.system.threads import library_threads_off, parallel
 
-# From so many on, columns of candidates take a megabyte each.
-_MANY_POSES = 1000
-
 
 def diagnose_state(state: State) -> Diagnosis:
     """Which effect is missing in the model of a run.
@@ -41,7 +38,7 @@ def diagnose_state(state: State) -> Diagnosis:
     Raises:
         NoResultError: no two views overlap.
     """
-    if len(state.session.views) > _MANY_POSES:
+    if len(state.session.views) > MANY_POSES:
         return_large_arrays()
     with library_threads_off():
         return _diagnosed(state)

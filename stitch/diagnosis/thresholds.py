@@ -16,6 +16,8 @@ POWER = 0.8
 
 # Views from which on several missing effects can be told at once, and an effect that others made idle is dropped.
 MANY_VIEWS = 100
+# Beyond so many, columns of candidates take a megabyte each, and all of them half a gigabyte.
+MANY_POSES = 1000
 # Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
 AT_ONCE, TRIED = 6, 5
 

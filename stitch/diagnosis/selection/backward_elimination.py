@@ -5,27 +5,25 @@ from functools import partial
 
 from stitch.diagnosis.candidates import as_fitted
 from stitch.diagnosis.selection.ranking import certain, ranked_one
-from stitch.diagnosis.thresholds import WORTH
+from stitch.diagnosis.thresholds import MANY_POSES, WORTH
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.model.term import Term
 from stitch.runs.state import State
 from stitch.stages.course import linearise
 from stitch.system.threads import parallel
 
-# From so many on, a linear model takes half a gigabyte: one at a time.
-_MANY_POSES = 1000
-
 
 def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
     """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
 
-    Effects are asked at once, which scans, whose overlaps are found by all cores already, do not allow.
+    Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
+    do not allow it.
 
     Args:
         names: effects of the model that may go.
     """
     asked = [term for term in state.model.terms if term.name in names]
-    each = parallel if state.measurement.views.count < _MANY_POSES else map
+    each = parallel if state.measurement.views.count < MANY_POSES else map
     found = zip(asked, each(partial(_objection, state), asked), strict=True)
     failing = [(factor, term.name, reason) for term, (factor, reason) in found if reason is not None]
     if not failing:
