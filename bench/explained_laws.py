@@ -1,9 +1,10 @@
 """Does `stitch explain` find formulas where there are any, and none where there is none?
 
-Usage: python bench/explained_laws.py [--held-out] [--scenes A,B] [--fewer N] [--write]
+Usage: python bench/explained_laws.py [--held-out] [--parts A,B] [--scenes A,B] [--fewer N] [--write]
 
 The cells and worlds of bench/unknown_laws.py: couplings of two joints stand in the dictionary of `explain`, most other
-laws in a like form or not at all; nothing hidden and errors with memory must stay without a formula. A formula is good
+laws in a like form or not at all, and those of the part `foreign` were written without a look at it; nothing hidden and
+errors with memory must stay without a formula. A formula is good
 if on views left out it leaves at most a tenth more than the truth itself would, of one free size. Held-out seeds are
 run once for each version.
 """
@@ -11,21 +12,23 @@ run once for each version.
 import argparse
 import time
 from collections import defaultdict
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
 from unknown_cells import asked, seen, true_column
-from unknown_worlds import PARTS, UNNAMED
+from unknown_worlds import PARTS, grown
 
+from data_synth.foreign_laws import FOREIGN
+from data_synth.unnamed_laws import UNNAMED
 from stitch.explanation.explain import explain
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (816, 817, 818, 819)
+LAWS = ("unnamed", "foreign")
+DEVELOPMENT, HELD_OUT = (0, 1), (820, 821, 822, 823)
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "explain.md"
 _MARKS = ("<!-- laws: begin -->", "<!-- laws: end -->")
 _NEAR = 1.1  # of the truth's rms on views left out
@@ -47,6 +50,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--held-out", action="store_true")
+    parser.add_argument("--parts", default="nothing,memory,unnamed")
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--fewer", type=int, default=1)
     parser.add_argument("--size", type=float, default=2.0, help="of the laws, in their usual sizes")
@@ -56,25 +60,19 @@ def main() -> None:
     rows: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
     with library_threads_off():
         cells = [asked(name, seed) for name in given.scenes.split(",") for seed in seeds]
-        for part in ("nothing", "memory", "unnamed"):
+        for part in given.parts.split(","):
             make, count = PARTS[part]
             for k in range(count // given.fewer):
                 a = cells[k % len(cells)]
                 rng = np.random.default_rng([a.cell.seed, k, list(PARTS).index(part), 18])
                 world, hidden = make(a, rng, k)
-                if part == "unnamed":
-                    world = replace(
-                        world,
-                        joint_errors=given.size * np.asarray(world.joint_errors),
-                        flange_errors=given.size * np.asarray(world.flange_errors),
-                    )
-                linear, begun = seen(a, world, rng), time.process_time()
+                linear, begun = seen(a, grown(world, given.size), rng), time.process_time()
                 found = explain(linear)
                 good, truth = False, float("nan")
-                if part == "unnamed":
-                    truth = share_left(linear.scatter_only, true_column(a, world))
+                if part in LAWS:
+                    truth = share_left(linear.scatter_only, true_column(a, grown(world, given.size)))
                     good = found.found and found.heldout_share <= _NEAR**2 * truth
-                name = hidden[0] if part == "unnamed" else part
+                name = hidden[0] if part in LAWS else part
                 rows[name].append((found.found, good))
                 took = time.process_time() - begun
                 told = f"left {found.heldout_share:.2f}, by the truth {truth:.2f}"
@@ -92,11 +90,11 @@ def main() -> None:
 def _table(rows: dict[str, list[tuple[bool, bool]]]) -> str:
     """A line per hidden law: how often a formula was found, and how often one as good as the truth."""
     lines = ["| hidden | draws | a formula | as good as the truth |", "|---|---:|---:|---:|"]
-    for name in ("nothing", "memory", *UNNAMED):
+    for name in ("nothing", "memory", *UNNAMED, *FOREIGN):
         own = rows[name]
         if own:
             said, good = (sum(x) for x in zip(*own, strict=True))
-            near = _share(good, len(own)) if name in UNNAMED else "–"
+            near = _share(good, len(own)) if name in (*UNNAMED, *FOREIGN) else "–"
             lines.append(f"| {name} | {len(own)} | {_share(said, len(own))} | {near} |")
     return "\n".join(lines)
 

@@ -29,11 +29,11 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (914, 915, 916, 917)
+DEVELOPMENT, HELD_OUT = (0, 1), (918, 919, 920, 921)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
-MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES))
+MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES), "foreign_3x")
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
 
 

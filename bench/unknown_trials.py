@@ -47,7 +47,9 @@ class Trial:
 
     @property
     def right_course(self) -> bool:
-        """What it follows is said: that joint, or of what follows no joint the time."""
+        """What it follows is said: that joint, or several, or of what follows no joint the time."""
+        if "joints" in self.hidden:
+            return "joint" in self.follows
         follows_joint = any(name.startswith("joint ") for name in self.hidden)
         return self.right_joint if follows_joint else bool(self.follows) and "joint" not in self.follows
 

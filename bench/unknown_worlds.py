@@ -10,10 +10,12 @@ from blind_trials import LIBRARY
 from unknown_cells import Asked, World, true_column, white
 
 from data_synth import nature
+from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.unnamed_laws import IN_TIME, UNNAMED
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
 from stitch.effects import EFFECTS
+from stitch.frames import Array
 
 MULTIPLES = (1, 2, 3, 4, 6)
 # Usual sizes of a law, 0.15 mrad or 0.05 mm rms: what errs by more is broken.
@@ -33,25 +35,31 @@ def memory(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
 def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """A law outside every dictionary; couplings as often as three others."""
     law = _in_turn(["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")], k)
-    time = np.array([moment.time for moment in a.moments])
-    own = (time / np.median(np.diff(time)),) if law in IN_TIME else ()
-    error = UNNAMED[law](a.cell.plan, rng, *own)
-    of_flange = error.shape[1] == 6 and law in IN_TIME
-    world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
-    return world, (law,) if of_flange else (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))
+    return _erring(a, rng, law, UNNAMED[law], of_flange=law in IN_TIME)
 
 
-def unnamed_at(a: Asked, rng: np.random.Generator, k: int, multiple: float = 1.0) -> tuple[World, tuple[str, ...]]:
-    """The same at a multiple of the size that one test for this very law would find; nothing where no arm errs so."""
-    world, hidden = unnamed(a, rng, k)
+def foreign(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """A law of those that were written apart from all that looks for laws."""
+    law = _in_turn(list(FOREIGN), k)
+    return _erring(a, rng, law, FOREIGN[law], of_flange=law in FOREIGN_OF_FLANGE)
+
+
+def at_multiple(
+    a: Asked, rng: np.random.Generator, k: int, make: "Part", multiple: float
+) -> tuple[World, tuple[str, ...]]:
+    """A law at a multiple of the size that one test for this very law would find; nothing where no arm errs so."""
+    world, hidden = make(a, rng, k)
     size = multiple * _least(a, world)
-    if size > _MOST:
-        return World(_laws(a, {}, rng)), ()
+    return (grown(world, size), hidden) if size <= _MOST else (World(_laws(a, {}, rng)), ())
+
+
+def grown(world: World, size: float) -> World:
+    """With the errors of joints and flange so many times as large."""
     return replace(
         world,
         joint_errors=size * np.asarray(world.joint_errors),
         flange_errors=size * np.asarray(world.flange_errors),
-    ), hidden
+    )
 
 
 def effect(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
@@ -90,9 +98,24 @@ PARTS: dict[str, tuple[Part, int]] = {
     "beside": (beside, 42),
     "two": (two, 42),
     "three": (three, 42),
-    **{f"unnamed_{n}x": (partial(unnamed_at, multiple=float(n)), 60) for n in MULTIPLES},
+    **{f"unnamed_{n}x": (partial(at_multiple, make=unnamed, multiple=float(n)), 60) for n in MULTIPLES},
     "arm": (arm, 36),
+    "foreign": (foreign, 64),
+    "foreign_3x": (partial(at_multiple, make=foreign, multiple=3.0), 64),
 }
+
+
+def _erring(
+    a: Asked, rng: np.random.Generator, law: str, errors: Callable[..., Array], of_flange: bool
+) -> tuple[World, tuple[str, ...]]:
+    """A world with a law, and what of it may be told: the joint that follows it, or that it is of all of them."""
+    time = np.array([moment.time for moment in a.moments])
+    own = ((time / np.median(np.diff(time))),) if law in (*IN_TIME, *FOREIGN_IN_TIME) else ()
+    error = errors(a.cell.plan, rng, *own)
+    world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
+    if of_flange:
+        return world, (law,) if own else (law, "joints")
+    return world, (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))
 
 
 def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> nature.Nature:

@@ -71,7 +71,9 @@ class _Asked:
         sums = [self.addends[k]]
         while len(sums[-1]) < _AT_MOST:
             worth, gains, ranks, rest = self.further(_basis(refined(sums[-1])))
-            k = int(worth.argmax())
+            # What it holds may have moved, and would seem to be wanted once more where it stood.
+            held = [set(own) <= set(sums[-1]) for own in self.addends]
+            k = int(np.where(held, -np.inf, worth).argmax())
             rank = int(ranks[k])
             left = self.free - len(sums[-1]) - rank
             if not rank or left < 1:

@@ -1,17 +1,18 @@
 """What a cell knows of its views, as factors of a formula: each with its text, its code and its values."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from stitch.explanation.quantity import Quantity
-from stitch.explanation.shapes import behind, bump_in_time, bump_of_joint, swing, warming
+from stitch.explanation.shapes import behind, beside_line, bump_in_time, bump_of_joint, saw_of_joint, swing, warming
 from stitch.frames import Array
 from stitch.measurement.views import Views
 
 # Time constants of warming up that are tried, h; instants of a step, as a share of the session; swings in it, half a
-# swing apart, at the most and from view to view, and their phases; stretches as wide (standard deviation) as these
-# shares of it.
+# swing apart, at the most and from view to view (teeth of a belt likewise), and their phases; stretches as wide
+# (standard deviation) as these shares of it.
 _WARMING = (0.25, 1.0)
 _STEPS = (0.2, 0.35, 0.5, 0.65, 0.8)
 _SWINGS, _FASTEST, _PHASES = 20, 0.45, (0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5)
@@ -19,6 +20,8 @@ _STRETCHES = (0.06, 0.12, 0.2)
 # Periods a turn of gears beyond two; how wide a damaged tooth is, rad, and how far apart its places are tried.
 _PERIODS = (3, 4, 5, 6, 7, 8)
 _WIDTH, _APART = 0.2, 0.15
+# Teeth of a belt's pulley: rad from one to the next, how many of them more a range may hold, and places of the jump.
+_TEETH, _MORE, _JUMPS = (0.17, 0.52), 0.5, 6
 # Play of a gear with friction, as a share of the range that the joint was driven over.
 _PLAYS = (0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4)
 _STILL = 1e-9
@@ -58,20 +61,33 @@ def _of_joints(views: Views) -> Iterator[Quantity]:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
         torque, at = views.torques.values[:, k], f"views.torques.values[:, {k}]"
-        text, spring = f"τ{name}", f"{_SPRING} τ{name}"
-        yield Quantity(text, at, "N m", "torque", joint, torque, together=(text, spring))
-        code = f"({at} * np.abs({at}))"
-        yield Quantity(f"{text}|{text}|", code, "(N m)²", "torque", joint, torque * np.abs(torque))
-        yield Quantity(f"{text}³", f"{at} ** 3", "(N m)³", "torque", joint, torque**3, together=(spring,))
+        yield from _of_torque(Quantity(f"τ{name}", at, "N m", "torque", joint, torque))
+
+
+def _of_torque(plain: Quantity) -> Iterator[Quantity]:
+    """A spring's pull, how it yields more one way, and how it stiffens."""
+    torque, text = plain.values, plain.text
+    spring = f"{_SPRING} {text}"
+    yield replace(plain, together=(text, spring))
+    if np.ptp(torque) > _STILL:
+        square = beside_line(plain, f"{text}|{text}|", f"{plain.code} * np.abs({plain.code})", torque * np.abs(torque))
+        yield replace(square, unit="(N m)²")
+        cube = beside_line(plain, f"{text}³", f"{plain.code} ** 3", torque**3)
+        yield replace(cube, unit="(N m)³", together=(cube.text, spring))
 
 
 def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
-    """Higher harmonics of a joint's angle, and bumps at places of its range."""
+    """Higher harmonics of a joint's angle, bumps at places of its range, and teeth of a belt."""
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
     for n in _PERIODS:
         yield from _wave(f"{n}q{k + 1}", f"{n} * {at}", "gear", k, n * q)
     for middle in np.arange(q.min(), q.max() + _APART, _APART).round(3):
         yield bump_of_joint(views, k, float(middle), _WIDTH)
+    whole = float(np.ptp(q))
+    most = min(whole / _TEETH[0], _FASTEST * (views.count - 1))
+    for teeth in np.arange(max(whole / _TEETH[1], 1.5), most, _MORE):
+        for jump in np.arange(_JUMPS) / _JUMPS:
+            yield saw_of_joint(views, k, float(f"{whole / teeth:.4g}"), float(f"{whole / teeth * jump:.4g}"))
 
 
 def _of_time(views: Views) -> Iterator[Quantity]:

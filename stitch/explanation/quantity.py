@@ -37,7 +37,7 @@ class Quantity:
     text: str  # for people
     code: str  # of numpy, of `views`
     unit: str  # "" without one
-    kind: str  # constant, angle, gear, direction, move, torque, speed, time, course or covariate
+    kind: str  # constant, angle, gear, teeth, direction, move, torque, speed, time, course or covariate
     joint: int | None  # that it belongs to, counted from 0
     values: Array  # (V,)
     together: tuple[str, ...] = ()  # addends that it is a part of, where it is not one alone
@@ -52,7 +52,7 @@ class Quantity:
     @property
     def bounded(self) -> bool:
         """True if it is one at the most, in views that nobody has measured too."""
-        return set(self.kind.split("·")) <= {"constant", "angle", "gear", "direction"}
+        return set(self.kind.split("·")) <= {"constant", "angle", "gear", "teeth", "direction"}
 
     def times(self, other: "Quantity") -> "Quantity":
         """The product; it belongs to no joint."""

@@ -1,5 +1,7 @@
-"""Quantities with nonlinear parameters, which a formula may move: bumps, what stays behind, swings, warming up."""
+"""Shapes of quantities: bumps, teeth, what stays behind, swings and warming up, whose nonlinear parameters a formula
+may move; and powers beside their line."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +14,8 @@ from stitch.measurement.views import Views
 # may lie off, in its widths; by how many swings in the session there may be more or fewer, and rad of their phase.
 _WIDTH, _PLAY, _CONSTANT = 0.4, 0.2, 0.7
 _MIDDLE, _SWINGS, _PHASE = 0.5, 0.25, 0.8
+# By what share of itself a tooth, and by what share of a tooth its jump, may lie off.
+_TOOTH, _JUMP = 0.05, 0.1
 
 
 def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity:
@@ -19,6 +23,33 @@ def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
     text = f"bump of q{k + 1} at {np.degrees(middle):.0f}°, {np.degrees(width):.2g}° wide"
     return _bump(text, q, at, middle, width, "gear", k, partial(bump_of_joint, views, k))
+
+
+def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
+    """From −1/2 to 1/2 along each tooth of so many rad, back at once where joint k passes `jump`; rad."""
+    q, at = views.joints[:, k], f"views.joints[:, {k}]"
+    return Quantity(
+        f"saw of q{k + 1}, a tooth {np.degrees(tooth):.3g}° and a jump at {np.degrees(jump):.3g}°",
+        f"(({at} - {jump:.6g}) / {tooth:.6g} % 1 - 0.5)",
+        "",
+        "teeth",
+        k,
+        (q - jump) / tooth % 1 - 0.5,
+        nonlinear=(Nonlinear(tooth, _TOOTH, positive=True), Nonlinear(jump, _JUMP * tooth)),
+        family=partial(saw_of_joint, views, k),
+    )
+
+
+def beside_line(torque: Quantity, text: str, code: str, power: Array) -> Quantity:
+    """What a power (V,) of a torque does that no line does, in these views: the line is the part of the zero and of a
+    spring that does not stiffen, and far from zero nearly all of the power."""
+    zero, slope = np.polynomial.Polynomial.fit(torque.values, power, 1).convert().coef
+    return replace(
+        torque,
+        text=f"({text} beside its line)",
+        code=f"({code} - {slope:.12g} * {torque.code} - {zero:.12g})",
+        values=power - slope * torque.values - zero,
+    )
 
 
 def bump_in_time(views: Views, middle: float, width: float) -> Quantity:

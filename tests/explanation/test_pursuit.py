@@ -50,3 +50,11 @@ def test_columns_of_nothing_are_not_chosen(columns):
     columns[:, 0] = 0.0
     columns[:, 1] = 1e-9 * columns[:, 2]
     assert not any(k in found for found in sums_of(columns, columns[:, 5], NUMBERS, singles(120), 5) for k in (0, 1))
+
+
+def test_what_a_sum_holds_is_not_wanted_again_where_it_stood(columns):
+    """A column that was moved elsewhere explains as much as before where it was tried: it would be added for ever."""
+    z = 3 * columns[:, 7] + 0.5 * np.random.default_rng(4).standard_normal(NUMBERS)
+    elsewhere = np.random.default_rng(8).standard_normal((NUMBERS, 1))
+    sums = sums_of(columns, z, NUMBERS, singles(120), 3, lambda numbers: np.tile(elsewhere, (1, len(numbers))))
+    assert all(len(set(found)) == len(found) for found in sums)

@@ -1,0 +1,59 @@
+"""Teeth of a belt and springs that stiffen: found as what they are, of as few numbers as they have."""
+
+import re
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.explanation.explain import explain
+from stitch.explanation.quantities import quantities
+from stitch.explanation.quantity import Quantity
+from stitch.explanation.shapes import beside_line, saw_of_joint
+from stitch.measurement.views import views_of
+from stitch.pipeline import run
+from stitch.runs.state import state_of
+
+TOOTH, HEIGHT = 0.33, 8e-4  # rad
+
+
+def belt(q):
+    """Joint 3 creeps by `HEIGHT` along each tooth and jumps back."""
+    teeth = q[2] / TOOTH + 0.3
+    return HEIGHT * np.array([0, 0, teeth - np.floor(teeth) - 0.5, 0, 0, 0])
+
+
+@pytest.mark.parametrize("views", [40, 80])
+def test_a_belt_that_jumps_is_found_with_its_tooth(views):
+    session, *_ = labelled_cell(1, views=views, targets=TARGETS[:2], gears=belt)
+    found = explain(linear_model_of(state_of(run(session))))
+    assert found.found and found.formula.startswith("q*3 = q3")
+    saws = re.findall(r"([-+0-9.e]+) rad · saw of q3, a tooth ([0-9.]+)°", found.formula)
+    size, tooth = max((tuple(map(float, saw)) for saw in saws), key=lambda saw: abs(saw[0]))
+    assert size == pytest.approx(HEIGHT, rel=0.1) and np.radians(tooth) == pytest.approx(TOOTH, rel=0.02)
+
+
+def test_a_saw_jumps_where_it_says_and_belongs_to_its_own_joint():
+    views = views_of(labelled_cell(3, views=12)[0])
+    saw = saw_of_joint(views, 1, 0.2, 0.05)
+    at_jump = saw_of_joint(views, 1, 0.2, float(views.joints[4, 1]))
+    assert at_jump.values[4] == -0.5
+    slope = np.diff(saw.values) - np.diff(views.joints[:, 1]) / 0.2
+    np.testing.assert_allclose(slope, np.round(slope), atol=1e-9)  # whole teeth are jumped over
+    assert {q.joint for q in quantities(views) if q.kind == "teeth"} <= set(range(6))
+
+
+@pytest.mark.parametrize("torque", [np.linspace(570, 612, 18), np.linspace(-5, 7, 18)], ids=["far from 0", "about 0"])
+def test_what_no_line_does_is_left_of_a_power(torque):
+    """Far from zero a cube is nearly a line: as it stands nothing of it would count as its own."""
+    plain = Quantity("τ", "torque", "N m", "torque", 2, torque)
+    cube = beside_line(plain, "τ³", "torque ** 3", torque**3)
+    beside = np.vander(torque - torque.mean(), 2)
+    np.testing.assert_allclose(
+        beside.T @ cube.values / np.linalg.norm(beside, axis=0) / np.linalg.norm(cube.values), 0, atol=1e-6
+    )
+    of_code = eval(cube.code, {"torque": torque})
+    np.testing.assert_allclose(of_code, cube.values, atol=1e-4 * np.abs(cube.values).max())
+    third = np.diff(cube.values, 3)
+    np.testing.assert_allclose(third, 6 * (torque[1] - torque[0]) ** 3, rtol=1e-3)
