@@ -43,12 +43,12 @@ def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
 def beside_line(torque: Quantity, text: str, code: str, power: Array) -> Quantity:
     """What a power (V,) of a torque does that no line does, in these views: the line is the part of the zero and of a
     spring that does not stiffen, and far from zero nearly all of the power."""
-    zero, slope = np.polynomial.Polynomial.fit(torque.values, power, 1).convert().coef
+    slope, zero = np.polyfit(torque.values, power, 1)
     return replace(
         torque,
         text=f"({text} beside its line)",
         code=f"({code} - {slope:.12g} * {torque.code} - {zero:.12g})",
-        values=power - slope * torque.values - zero,
+        values=np.asarray(power - slope * torque.values - zero, float),
     )
 
 

@@ -137,14 +137,18 @@ class LinearModel(ErrorModel):
         white = self.whiten(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
-    def conditioned_on(self, columns: Array, sizes: Array) -> "LinearModel":
-        """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,)."""
+    def conditioned_on(self, columns: Array, sizes: Array, near: "LinearModel | None" = None) -> "LinearModel":
+        """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,).
+
+        Args:
+            near: one that leaves about as much scatter, from which the search for it begins.
+        """
         mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
         design = np.hstack([self.design, self.observation.expand(columns)])
         own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
         out = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, whole=None)
         if self.pose_errors is None:
-            return replace(out, null=fit_variances(mixed, start=self.null.variances))
+            return replace(out, null=fit_variances(mixed, start=(near or self).null.variances))
         return out.refitted()
 
     def trial(self, response: Array, points: PointSums | None = None, prior: Prior | None = None) -> Trial:

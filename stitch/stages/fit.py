@@ -115,9 +115,11 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
         at += len(term.parameters)
     if not groups:
         return before
-    free = before
+    free, seen = before, whitened(before)
     for _ in range(_CHOOSING):
         # What is found explains scatter, and less scatter shows more.
-        free = supported(whitened(free), sizes, groups, effects)
-    seen = whitened(free)
+        found = supported(seen, sizes, groups, effects)
+        if (found == free).all():
+            break
+        free, seen = found, whitened(found)
     return np.logical_and(free, independent(seen.base, seen.further * free, sizes, 1 / UNSEEN))

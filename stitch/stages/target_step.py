@@ -131,7 +131,14 @@ class Linearised:
 
     def _variances(self, mixed: MixedModel) -> Array:
         """(3,) by REML."""
-        return fit_variances(mixed, start=self.start, both_starts=self.start is None).variances
+        return fit_variances(mixed, start=self._begun).variances
+
+    @cached_property
+    def _begun(self) -> Array:
+        """(3,) variances from which any search begins: of the step before, or where all effects take what they can."""
+        if self.start is not None:
+            return self.start
+        return fit_variances(self._mixed(np.concatenate([self.base, self.columns], axis=2)), both_starts=True).variances
 
     def _whitened(self, free: Mask) -> Whitened:
         mixed = self._mixed(self.base)

@@ -5,7 +5,7 @@ from functools import partial
 
 from stitch.diagnosis.candidates import as_fitted
 from stitch.diagnosis.selection.ranking import certain, ranked_one
-from stitch.diagnosis.thresholds import MANY_POSES, WORTH
+from stitch.diagnosis.thresholds import MANY_POSES
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.model.term import Term
 from stitch.runs.state import State
@@ -43,8 +43,4 @@ def _objection(state: State, term: Term) -> tuple[float, str | None]:
     factor = own.score.log_bayes_factor
     if not certain(own):
         return factor, f"{name} explains too little beside the others"
-    left_out = cross_validate(linear, own.score)
-    if not left_out.helps or left_out.poses > WORTH:
-        share = f"{left_out.poses:.3f} ± {left_out.poses_sigma:.3f}"
-        return factor, f"{name} hardly helps on views left out (mean square error {share} of without)"
-    return factor, None
+    return factor, cross_validate(linear, own.score).idle(name)

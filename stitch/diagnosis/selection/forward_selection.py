@@ -9,6 +9,7 @@ from stitch.diagnosis.score import promising, score
 from stitch.diagnosis.selection.exchange import likelier_beyond
 from stitch.diagnosis.selection.ranking import Ranked, certain, conditioned, rank, ranked_one, without
 from stitch.diagnosis.thresholds import AT_ONCE, TRIED
+from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import parallel
@@ -55,6 +56,23 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         chosen = _grown(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
 
 
+def worth_adding(linear: LinearModel, chosen: Sequence[Ranked]) -> tuple[list[Ranked], dict[str, str]]:
+    """Effects beside each other from the first on that helps on views left out, and what is idle of those before.
+
+    What would be dropped again as soon as it is in the model is not named: of hundreds of poses an effect is seen that
+    moves hardly anything, and that anything else may do as well.
+    """
+    chosen, idle = list(chosen), dict[str, str]()
+    while chosen:
+        name = chosen[0].name
+        objection = cross_validate(conditioned(linear, chosen[1:]), chosen[0].score).idle(name)
+        if objection is None:
+            break
+        idle[name] = objection
+        del chosen[0]
+    return chosen, idle
+
+
 def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
     """Further effects, one by one, as long as one can be named beside those before."""
     chosen = list(chosen)
@@ -90,8 +108,10 @@ def _eliminated_back(
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
     """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
 
+    near = conditioned(linear, chosen) if linear.pose_errors is None else None
+
     def asked(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
-        beside = without(linear, among, r)
+        beside = without(linear, among, r, near)
         own = ranked_one(beside, r.score.candidate, tests)
         return own, extrapolate(beside, own.score) if certain(own) else None
 
@@ -107,7 +127,7 @@ def _eliminated_back(
             beyond[own.name] = found
     for r in kept:
         if r.name not in beyond:
-            beyond[r.name] = extrapolate(without(linear, kept, r), r.score)
+            beyond[r.name] = extrapolate(without(linear, kept, r, near), r.score)
     return kept, {r.name: beyond[r.name] for r in kept}
 
 

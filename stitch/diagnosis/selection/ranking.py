@@ -97,14 +97,18 @@ def certain(r: Ranked) -> bool:
     return contends(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR
 
 
-def without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked) -> LinearModel:
-    """The evidence beside all effects but one."""
-    return conditioned(linear, [r for r in chosen if r.name != one.name])
+def without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, near: LinearModel | None = None) -> LinearModel:
+    """The evidence beside all effects but one.
+
+    Args:
+        near: of `conditioned_on`.
+    """
+    return conditioned(linear, [r for r in chosen if r.name != one.name], near)
 
 
-def conditioned(linear: LinearModel, chosen: Sequence[Ranked]) -> LinearModel:
+def conditioned(linear: LinearModel, chosen: Sequence[Ranked], near: LinearModel | None = None) -> LinearModel:
     """The evidence beside some effects."""
     if not chosen:
         return linear
     forms = [r.score.form for r in chosen]
-    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]))
+    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]), near)

@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
-from stitch.diagnosis.selection.forward_selection import forward_selection
+from stitch.diagnosis.selection.forward_selection import forward_selection, worth_adding
 from stitch.diagnosis.selection.inclusion import contest, rescored, wanted_group
 from stitch.diagnosis.selection.pairs import both_missing, second_beside
 from stitch.diagnosis.selection.ranking import Ranked, beside, certain, conditioned, contends, ranked_all
@@ -62,7 +62,14 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         explained = max(found.explained, best.log_posterior)
         if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):
             return replace(unknown, notes=tuple(refused.values()))
-        best, *others = found.effects or (best,)
+        effects = list(found.effects or (best,))
+        if linear.pose_errors is None:
+            effects, idle = worth_adding(linear, effects)
+            refused |= idle
+        if not effects:
+            nothing = replace(adequate, notes=tuple(refused.values()))
+            return _without_name(linear, limit, nothing) if stray is None else replace(nothing, verdict=unknown.verdict)
+        best, *others = effects
         second = others[0] if others else None
     elif _outdone(best, stray, law):
         # Two known effects at once may look like none of them: try the best with a second one.
@@ -92,6 +99,11 @@ def _none_alone(
     group = wanted_group(linear, candidates, len(adequate.ranked))
     if group:
         return replace(adequate, verdict="cannot_tell", named=group)
+    return _without_name(linear, limit, adequate)
+
+
+def _without_name(linear: LinearModel, limit: ScatterLimit, adequate: Selection) -> Selection:
+    """Errors without a name, more scatter than an arm has, or nothing."""
     unnamed = unnamed_errors(linear)
     verdict = "unknown_effect" if unnamed or implausible(linear, limit) else "adequate"
     return replace(adequate, verdict=verdict, unnamed=unnamed)

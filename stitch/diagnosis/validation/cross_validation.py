@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.thresholds import WORTH
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel, Trial
 from stitch.observations.response import Prior
@@ -28,6 +29,13 @@ class CrossValidation:
     def helps(self) -> bool:
         """True if views left out are predicted better, by more than a standard error."""
         return self.poses <= 1 - self.poses_sigma
+
+    def idle(self, name: str) -> str | None:
+        """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
+        if self.helps and self.poses <= WORTH:
+            return None
+        share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
+        return f"{name} hardly helps on views left out (mean square error {share} of without)"
 
 
 def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:

@@ -98,13 +98,15 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     # Parameters that the fit left at zero are not in the model.
     used = np.array([p.value != 0 and not p.discrete for p in parameters], bool)
     whole = mixed_model_of_rows(rows, np.concatenate([base, extra[..., used]], axis=2))
-    half = whitener(whole, fit_variances(whole, both_starts=True).variances)
+    null = fit_variances(whole, both_starts=True)
+    half = whitener(whole, null.variances)
     n = rows.residual.size
     own_columns, further = ((half @ c).reshape(n, c.shape[2]) for c in (base, extra))
     seen = used & independent(own_columns, further * used, sizes, 1 / UNSEEN)
     A = np.concatenate([base, extra[..., seen]], axis=2)
     mixed = mixed_model_of_rows(rows, A)
-    null = fit_variances(mixed, both_starts=True)
+    if (seen != used).any():
+        null = fit_variances(mixed, both_starts=True)
     values = values_of(model.terms)
     return LinearModel(
         measurement,
