@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_synth import kinematics
+from data_synth.law_sizes import clock, joint_with, of_base_frame, of_flange, of_joint, torque_of
 from data_synth.moment import Plan
 
 Array = NDArray[np.float64]
-_SIZE, _SHIFT = 1.5e-4, 0.05
 _FOOT = 250.0  # mm from a base's middle to its anchor bolts
 
 
 def flank_change(plan: Plan, rng: np.random.Generator) -> Array:
     """A worn gear rests on one flank of its teeth or the other: tanh((τ_i − τ₀)/w), the balancer bears τ₀."""
-    torque = _torque(plan)
-    i = _joint(plan, np.ptp(torque, axis=0), rng)
+    torque = torque_of(plan)
+    i = joint_with(plan, np.ptp(torque, axis=0), rng)
     load = torque[:, i] - np.quantile(torque[:, i], rng.uniform(0.3, 0.7))
-    return _of_joint(plan, i, np.tanh(load / (rng.uniform(0.15, 0.4) * load.std())))
+    return of_joint(plan, i, np.tanh(load / (rng.uniform(0.15, 0.4) * load.std())))
 
 
 def softening_belt(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
@@ -31,36 +31,36 @@ def softening_belt(plan: Plan, rng: np.random.Generator, time: Array | None = No
     Args:
         time: (V,) of the views, in usual steps from one to the next; their numbers where it is not given.
     """
-    torque, (t, whole) = _torque(plan), _clock(plan, time)
-    i = _joint(plan, np.ptp(torque, axis=0), rng)
+    torque, (t, whole) = torque_of(plan), clock(plan, time)
+    i = joint_with(plan, np.ptp(torque, axis=0), rng)
     warm = 1 - np.exp(-t / (rng.uniform(0.2, 0.6) * whole))
-    return _of_joint(plan, i, torque[:, i] * (warm - warm.mean()))
+    return of_joint(plan, i, torque[:, i] * (warm - warm.mean()))
 
 
 def slack_cable(plan: Plan, rng: np.random.Generator) -> Array:
     """A cable twists with two neighbouring joints and pulls once its slack s is used up: x − clip(x, −s, s)."""
-    i = _joint(plan, np.ptp(plan.joints, axis=0), rng)
+    i = joint_with(plan, np.ptp(plan.joints, axis=0), rng)
     twist = plan.joints[:, i] + plan.joints[:, i + 1 if i + 1 < plan.joints.shape[1] else i - 1]
     twist = twist - np.quantile(twist, rng.uniform(0.35, 0.65))
     slack = np.quantile(np.abs(twist), rng.uniform(0.35, 0.65))
-    return _of_joint(plan, i, rng.choice([-1.0, 1.0]) * (twist - np.clip(twist, -slack, slack)))
+    return of_joint(plan, i, rng.choice([-1.0, 1.0]) * (twist - np.clip(twist, -slack, slack)))
 
 
 def scale_segments(plan: Plan, rng: np.random.Generator) -> Array:
     """An encoder's scale put together of three to six pieces along the way, each glued on a little off."""
-    i = _joint(plan, np.ptp(plan.joints, axis=0), rng)
+    i = joint_with(plan, np.ptp(plan.joints, axis=0), rng)
     q, pieces = plan.joints[:, i], int(rng.integers(3, 7))
     seams = q.min() + np.ptp(q) * (np.arange(1, pieces) + rng.uniform(-0.3, 0.3, pieces - 1)) / pieces
-    return _of_joint(plan, i, rng.standard_normal(pieces)[np.searchsorted(seams, q)])
+    return of_joint(plan, i, rng.standard_normal(pieces)[np.searchsorted(seams, q)])
 
 
 def motor_heat(plan: Plan, rng: np.random.Generator) -> Array:
     """The motor of one joint warms with the way it goes and cools over three to eight views: h ← ρ h + |Δq_i|."""
-    i = _joint(plan, np.ptp(plan.joints, axis=0), rng)
+    i = joint_with(plan, np.ptp(plan.joints, axis=0), rng)
     way = np.abs(np.diff(plan.joints[:, i], prepend=plan.joints[0, i]))
     ago = np.subtract.outer(np.arange(len(way)), np.arange(len(way)))
     kept = np.where(ago >= 0, np.exp(-np.maximum(ago, 0) / rng.uniform(3, 8)), 0.0)
-    return _of_joint(plan, i, rng.choice([-1.0, 1.0]) * (kept @ way))
+    return of_joint(plan, i, rng.choice([-1.0, 1.0]) * (kept @ way))
 
 
 def loose_anchor(plan: Plan, rng: np.random.Generator) -> Array:
@@ -72,26 +72,23 @@ def loose_anchor(plan: Plan, rng: np.random.Generator) -> Array:
     out = centre @ u[:2]
     tilt = np.outer(np.maximum(out - np.quantile(out, rng.uniform(0.2, 0.5)), 0.0), [-u[1], u[0], 0.0])
     shift = np.cross(tilt, T[:, :3, 3] + _FOOT * u)  # it turns about the bolt across
-    error = np.concatenate([np.einsum("vji,vj->vi", T[:, :3, :3], x) for x in (tilt, shift)], axis=1)
-    # Turn and shift belong together: the one that is larger for its kind has the usual size.
-    sizes = np.sqrt((error.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0)) / [_SIZE, _SHIFT]
-    return np.asarray(error / max(float(sizes.max()), 1e-12))
+    return of_base_frame(T, tilt, shift)
 
 
 def work_breaks(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
     """The arm warms up, cools in breaks and starts anew at t_k: 1 − e^(−(t − t_k)/T); `time` as above."""
-    t, whole = _clock(plan, time)
+    t, whole = clock(plan, time)
     spells = int(rng.integers(3, 5))
     starts = whole * (np.arange(1, spells) + rng.uniform(-0.25, 0.25, spells - 1)) / spells
     since = t - np.append(0.0, starts)[np.searchsorted(starts, t, side="right")]
-    return _of_flange(1 - np.exp(-since / (rng.uniform(0.3, 0.8) * whole / spells)), rng)
+    return of_flange(1 - np.exp(-since / (rng.uniform(0.3, 0.8) * whole / spells)), rng)
 
 
 def heating_overshoot(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
     """The hall's heating, switched on, overshoots and settles: e^(−t/T) cos(2πt/P + φ); `time` as above."""
-    t, whole = _clock(plan, time)
+    t, whole = clock(plan, time)
     swing = np.cos(2 * np.pi * t / (rng.uniform(0.2, 0.35) * whole) + rng.uniform(0, 2 * np.pi))
-    return _of_flange(np.exp(-t / (rng.uniform(0.35, 0.7) * whole)) * swing, rng)
+    return of_flange(np.exp(-t / (rng.uniform(0.35, 0.7) * whole)) * swing, rng)
 
 
 FOREIGN: dict[str, Callable[..., Array]] = {
@@ -103,40 +100,6 @@ FOREIGN: dict[str, Callable[..., Array]] = {
 }
 FOREIGN_IN_TIME = ("work_breaks", "heating_overshoot")  # the others follow the joints, `softening_belt` time as well
 FOREIGN_OF_FLANGE = (*FOREIGN_IN_TIME, "loose_anchor")
-
-
-def _joint(plan: Plan, amount: Array, rng: np.random.Generator) -> int:
-    """One of the useful joints of which there is some; where there is none, the joint of which there is most."""
-    some = [i for i in plan.useful if amount[i] > 1e-3 * amount.max()]
-    return int(rng.choice(some or [int(np.argmax(amount))]))
-
-
-def _of_joint(plan: Plan, joint: int, course: Array) -> Array:
-    """(V, n) of the usual rms about its mean."""
-    out = np.zeros_like(plan.joints)
-    out[:, joint] = _SIZE * _standard(course)
-    return out
-
-
-def _of_flange(course: Array, rng: np.random.Generator) -> Array:
-    """(V, 6) of the usual rms about its mean, along one direction."""
-    turn, shift = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
-    return np.outer(_standard(course), np.concatenate([_SIZE * turn, _SHIFT * shift]))
-
-
-def _standard(course: Array) -> Array:
-    return np.asarray((course - course.mean()) / max(float(course.std()), 1e-12))
-
-
-def _clock(plan: Plan, time: Array | None) -> tuple[Array, float]:
-    """Steps since the first view, and how many there are."""
-    steps = np.arange(len(plan.joints), dtype=float) if time is None else time - time.min()
-    return steps, float(np.ptp(steps)) + 1.0
-
-
-def _torque(plan: Plan) -> Array:
-    """(V, n) of gravity, which is there where the controller does not know it."""
-    return plan.torque if np.ptp(plan.torque, axis=0).any() else kinematics.gravity_torques(plan.arm, plan.joints)
 
 
 def _centre_of_mass(plan: Plan) -> Array:

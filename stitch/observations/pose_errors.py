@@ -21,11 +21,20 @@ from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
+from stitch.measurement.torques import Torques
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
 from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
-from stitch.statistics.kernels import SmoothErrors, alike_closely, alike_in_joints, alike_in_way, same_stop, spread_over
+from stitch.statistics.kernels import (
+    SmoothErrors,
+    alike_closely,
+    alike_in_joints,
+    alike_in_way,
+    alike_under_load,
+    same_stop,
+    spread_over,
+)
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
@@ -39,8 +48,9 @@ _EVERY_ARM = ("joints", "torque")
 _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 _CONSTANT = ("joint_offset", "link_geometry")
 # What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own within a few
-# degrees, or the way it came.
-ALL_ANGLES, OWN_ANGLE, THE_WAY = "all angles", "own angle", "the way it came"
+# degrees, the way it came, time, at each pose in another way, or what bends it.
+ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME = "all angles", "own angle", "the way it came", "time"
+ITS_LOAD = "its load"
 
 
 def usual_sizes() -> dict[str, float]:
@@ -132,7 +142,9 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
             came = joints - np.concatenate([m.views.previous for m in measurements])
             closely = np.array([alike_closely(q, q) for q in joints.T])
             in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
-            kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way}
+            with_time = (1 + alike) / 2 * near_in_time(measurements, WANDERING["slowly wandering"])
+            kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way, WITH_TIME: with_time}
+            kinds |= _by_load([m.views.torques for m in measurements], joints.shape[1])
             offsets = links[:, : joints.shape[1]]
             of_one_joint = {kind: SmoothErrors(offsets, own) for kind, own in kinds.items()}
     flange = flange_twists(measurements, centres)
@@ -156,6 +168,14 @@ def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
     ]
     per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
     return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
+
+
+def _by_load(torques: Sequence[Torques], joints: int) -> dict[str, Array]:
+    """(n, V, V) of what each joint does under its load, by that kind of law; {} where no torques are known of all."""
+    if not torques[0].names or any(own.names != torques[0].names for own in torques):
+        return {}
+    values, joint = np.concatenate([own.values for own in torques]), np.array(torques[0].joint)
+    return {ITS_LOAD: np.array([alike_under_load(values[:, joint == k]) for k in range(joints)])}
 
 
 def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:

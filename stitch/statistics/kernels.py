@@ -8,6 +8,7 @@ from stitch.frames import Array, Mask
 
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
+_FAINT = 1e-6  # share of a torque below which it does not change
 # How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike, and what a tooth does to it.
 REACH, SHORT_REACH = 1.0, 0.2
 
@@ -48,6 +49,16 @@ def alike_in_way(joint: Array, came: Array) -> Array:
 def alike_in_move(some: Array, others: Array, reach: float) -> Array:
     """(S, O) of a continuous function of how far a joint came, (S,) and (O,) rad."""
     return alike_in_time(some, reach, others)
+
+
+def alike_under_load(torques: Array) -> Array:
+    """(V, V) of a continuous function of the torques (V, m) that bend one joint (Ornstein–Uhlenbeck, over the range of
+    each); nothing where none of them changes.
+    """
+    bending = torques[:, np.ptp(torques, axis=0) > _FAINT * np.abs(torques).max(initial=0.0)]
+    share = bending / np.ptp(bending, axis=0) if bending.size else bending
+    apart = np.abs(share[:, None] - share[None]).sum(axis=2)
+    return np.asarray(np.exp(-apart) if bending.size else apart)
 
 
 def reach_of_way(joint: Array) -> float:

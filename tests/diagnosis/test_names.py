@@ -15,9 +15,10 @@ from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import joint_laws
+from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_by
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
+from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, WITH_TIME
 from stitch.statistics.variance_prior import NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -94,6 +95,28 @@ def test_friction_is_neither_play_nor_settling(cell):
     for name, off in (("backlash", 3e-4 * views.approach), ("settling", 2e-3 * (q - views.previous))):
         found, _ = said_of(cell, kinematics.flange(measured.plan.arm, q + off * fifth))
         assert [r.name for r in found.named] == [name]
+
+
+def test_a_flank_that_changes_with_the_load_is_no_spring(cell):
+    """A joint that errs by the sign of its load alone, and one that yields to it."""
+    plan, fifth = cell.measured.plan, np.eye(6)[4]
+    torque = plan.torque[:, 4]
+    flank = np.tanh((torque - np.median(torque)) / (0.2 * torque.std()))
+    found, _ = said_of(cell, kinematics.flange(plan.arm, plan.joints + (2e-4 * flank)[:, None] * fifth))
+    assert found.verdict == "unknown_effect" and not found.named
+    found, _ = said_of(cell, kinematics.flange(plan.arm, plan.joints + (2e-5 * torque)[:, None] * fifth))
+    assert [r.name for r in found.named] == ["joint_compliance"]
+
+
+def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(cell):
+    """A joint that drifts as its motor warms is likelier by a law in time than by any of its angles."""
+    plan = cell.measured.plan
+    warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
+    _, linear = said_of(cell, kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
+    base = linear.without(["joint_offset"])
+    found = {kind: laws_by(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, ITS_LOAD)}
+    best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
+    assert best[WITH_TIME] > max(own for kind, own in best.items() if kind != WITH_TIME)
 
 
 def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.kernels import alike_in_joints, alike_in_time, alike_in_way, spread_over
+from stitch.statistics.kernels import alike_in_joints, alike_in_time, alike_in_way, alike_under_load, spread_over
 
 JOINTS = np.random.default_rng(0).uniform(-np.pi, np.pi, (25, 6))
 
 
 def test_covariances_have_no_negative_direction():
     in_time, in_way = alike_in_time(np.cumsum(JOINTS[:, 0] ** 2), 2.0), alike_in_way(JOINTS[:, 0], JOINTS[:, 1])
-    for alike in (alike_in_joints(JOINTS), in_time, in_way):
+    for alike in (alike_in_joints(JOINTS), in_time, in_way, alike_under_load(40 * JOINTS[:, :2])):
         assert np.linalg.eigvalsh(alike).min() > -1e-12
         assert np.diag(alike) == pytest.approx(1.0)
 
@@ -37,6 +37,16 @@ def test_the_way_counts_in_ranges_of_the_joint():
     alike = alike_in_way(np.array([0.2, 0.2, 0.8]), np.array([-0.3, 0.3, 0.3]))
     assert alike[0, 1] == pytest.approx(np.exp(-1))
     assert np.all(alike_in_way(np.zeros(3), np.zeros(3)) == 1)
+
+
+def test_load_counts_in_its_own_range_and_an_axis_that_nothing_bends_does_nothing():
+    """Half of the range of each of two torques apart, in any unit: alike by exp(−½ − ½)."""
+    torques = np.array([[0.0, 30.0], [5.0, 10.0], [10.0, -10.0]])
+    assert alike_under_load(torques)[0, 1] == pytest.approx(np.exp(-1))
+    assert np.allclose(alike_under_load(1e3 * torques), alike_under_load(torques))
+    still = np.column_stack([torques[:, 0], np.full(3, 7.0)])
+    assert np.allclose(alike_under_load(still), alike_under_load(torques[:, :1]))
+    assert np.all(alike_under_load(np.full((3, 1), 7.0)) == 0) and np.all(alike_under_load(np.zeros((3, 0))) == 0)
 
 
 def test_spread_is_the_covariance_of_drawn_processes():

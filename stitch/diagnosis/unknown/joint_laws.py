@@ -5,7 +5,8 @@ prior of pose errors) is a poor rival: it may do so much that it is believed to 
 off by a smooth function of the joint angles is what a coupling, a hose or a gear with play really does, and where it
 explains the views about as well as an effect of the library, these views cannot tell which it is. Likewise one joint
 that is off by a function of its own angle that changes within a few degrees, as by a worn tooth or a wave of a gear, or
-by any function of the way it came, as by friction, which is neither play nor settling.
+by any function of the way it came, as by friction, which is neither play nor settling; or that changes as time passes,
+as where its motor warms, which is no drift of mount or part; or by a law of its load that is not that of a spring.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import ALL_ANGLES, OWN_ANGLE, SMOOTH, THE_WAY
+from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, SMOOTH, THE_WAY, WITH_TIME
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -52,7 +53,7 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 def log_posterior(base: LinearModel) -> float:
     """That some joint follows such a law, by the angles or by the way it came, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
-    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY))
+    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD))
     return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
@@ -78,7 +79,8 @@ def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     if errors is None or not errors.of_one_joint:
         return []
     found = []
-    for follows, k in product(kinds, range(errors.of_one_joint[ALL_ANGLES].count)):
+    known = [kind for kind in kinds if kind in errors.of_one_joint]
+    for follows, k in product(known, range(errors.of_one_joint[ALL_ANGLES].count)):
         half = base.reduce(errors.of_one_joint[follows].of(k))
         every = errors.beside(f"joint {k + 1}", base.reduce(half.T), SMOOTH)
         mixed = with_errors(base.mixed, every)
