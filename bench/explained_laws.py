@@ -3,10 +3,9 @@
 Usage: python bench/explained_laws.py [--held-out] [--parts A,B] [--scenes A,B] [--fewer N] [--write]
 
 The cells and worlds of bench/unknown_laws.py: couplings of two joints stand in the dictionary of `explain`, most other
-laws in a like form or not at all, and those of the part `foreign` were written without a look at it; nothing hidden and
-errors with memory must stay without a formula. A formula is good
-if on views left out it leaves at most a tenth more than the truth itself would, of one free size. Held-out seeds are
-run once for each version.
+laws in a like form or not at all, and those of the parts `foreign` and `further` were written without a look at it;
+nothing hidden and errors with memory must stay without a formula. A formula is good if on views left out it leaves at
+most a tenth more than the truth itself would, of one free size. Held-out seeds are run once for each version.
 """
 
 import argparse
@@ -20,6 +19,7 @@ from unknown_cells import asked, seen, true_column
 from unknown_worlds import PARTS, grown
 
 from data_synth.foreign_laws import FOREIGN
+from data_synth.further_laws import FURTHER
 from data_synth.unnamed_laws import UNNAMED
 from stitch.explanation.explain import explain
 from stitch.frames import Array
@@ -27,7 +27,8 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-LAWS = ("unnamed", "foreign")
+LAWS = ("unnamed", "foreign", "further")
+_BY_NAME = (*UNNAMED, *FOREIGN, *FURTHER)
 DEVELOPMENT, HELD_OUT = (0, 1), (820, 821, 822, 823)
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "explain.md"
 _MARKS = ("<!-- laws: begin -->", "<!-- laws: end -->")
@@ -90,11 +91,11 @@ def main() -> None:
 def _table(rows: dict[str, list[tuple[bool, bool]]]) -> str:
     """A line per hidden law: how often a formula was found, and how often one as good as the truth."""
     lines = ["| hidden | draws | a formula | as good as the truth |", "|---|---:|---:|---:|"]
-    for name in ("nothing", "memory", *UNNAMED, *FOREIGN):
+    for name in ("nothing", "memory", *_BY_NAME):
         own = rows[name]
         if own:
             said, good = (sum(x) for x in zip(*own, strict=True))
-            near = _share(good, len(own)) if name in (*UNNAMED, *FOREIGN) else "–"
+            near = _share(good, len(own)) if name in _BY_NAME else "–"
             lines.append(f"| {name} | {len(own)} | {_share(said, len(own))} | {near} |")
     return "\n".join(lines)
 

@@ -33,7 +33,7 @@ DEVELOPMENT, HELD_OUT = (0, 1), (922, 923, 924, 925)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
-MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES), "foreign_3x")
+MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES), "foreign_3x", "further_3x")
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
 
 

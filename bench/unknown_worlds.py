@@ -11,6 +11,7 @@ from unknown_cells import Asked, World, true_column, white
 
 from data_synth import nature
 from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
+from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.unnamed_laws import IN_TIME, UNNAMED
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
@@ -42,6 +43,12 @@ def foreign(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[st
     """A law of those that were written apart from all that looks for laws."""
     law = _in_turn(list(FOREIGN), k)
     return _erring(a, rng, law, FOREIGN[law], of_flange=law in FOREIGN_OF_FLANGE)
+
+
+def further(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """The same of eight more, written after what the first ones showed was mended."""
+    law = _in_turn(list(FURTHER), k)
+    return _erring(a, rng, law, FURTHER[law], of_flange=law in FURTHER_OF_FLANGE)
 
 
 def at_multiple(
@@ -102,6 +109,8 @@ PARTS: dict[str, tuple[Part, int]] = {
     "arm": (arm, 36),
     "foreign": (foreign, 64),
     "foreign_3x": (partial(at_multiple, make=foreign, multiple=3.0), 64),
+    "further": (further, 64),
+    "further_3x": (partial(at_multiple, make=further, multiple=3.0), 64),
 }
 
 
@@ -110,7 +119,7 @@ def _erring(
 ) -> tuple[World, tuple[str, ...]]:
     """A world with a law, and what of it may be told: the joint that follows it, or that it is of all of them."""
     time = np.array([moment.time for moment in a.moments])
-    own = ((time / np.median(np.diff(time))),) if law in (*IN_TIME, *FOREIGN_IN_TIME) else ()
+    own = (time / np.median(np.diff(time)),) if law in (*IN_TIME, *FOREIGN_IN_TIME, *FURTHER_IN_TIME) else ()
     error = errors(a.cell.plan, rng, *own)
     world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
     if of_flange:
