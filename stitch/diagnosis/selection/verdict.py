@@ -57,18 +57,10 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     ranked = beside(ranked, best, law)
     adequate, unknown = replace(adequate, ranked=ranked), replace(unknown, ranked=ranked)
     if linear.measurement.views.count >= MANY_VIEWS:
-        found = forward_selection(linear, candidates, best)
-        refused = found.refused
-        explained = max(found.explained, best.log_posterior)
-        if (stray is not None and stray.log_posterior > explained + ODDS) or (refused and not found.effects):
-            return replace(unknown, notes=tuple(refused.values()))
-        effects = list(found.effects or (best,))
-        if linear.pose_errors is None:
-            effects, idle = worth_adding(linear, effects)
-            refused |= idle
+        effects, refused, other = _at_once(linear, candidates, best, stray)
         if not effects:
-            nothing = replace(adequate, notes=tuple(refused.values()))
-            return _without_name(linear, limit, nothing) if stray is None else replace(nothing, verdict=unknown.verdict)
+            rest = replace(adequate, notes=tuple(refused.values()))
+            return replace(rest, verdict="unknown_effect") if other else _without_name(linear, limit, rest)
         best, *others = effects
         second = others[0] if others else None
     elif _outdone(best, stray, law):
@@ -90,6 +82,21 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
     verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
     return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
+
+
+def _at_once(
+    linear: LinearModel, candidates: Sequence[Candidate], best: Ranked, stray: Ranked | None
+) -> tuple[list[Ranked], dict[str, str], bool]:
+    """Of many views: effects that are missing at once, the one first that is to be named; what is not among them, and
+    why; and whether there is something of another form."""
+    found = forward_selection(linear, candidates, best)
+    explained = max(found.explained, best.log_posterior)
+    if (stray is not None and stray.log_posterior > explained + ODDS) or (found.refused and not found.effects):
+        return [], found.refused, True
+    effects, idle = list(found.effects or (best,)), dict[str, str]()
+    if linear.pose_errors is None:
+        effects, idle = worth_adding(linear, effects)
+    return effects, found.refused | idle, stray is not None
 
 
 def _none_alone(

@@ -1,0 +1,46 @@
+"""Of many poses nothing is named that would be dropped again as soon as it is in the model."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from stitch.diagnosis.selection import forward_selection
+from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.thresholds import WORTH
+from stitch.diagnosis.validation.cross_validation import CrossValidation
+
+
+def leaving(poses: float, sigma: float = 1e-3) -> CrossValidation:
+    return CrossValidation(inside=poses, heldout=poses, poses=poses, poses_sigma=sigma, steadiness=1.0)
+
+
+def ranked(name: str) -> Ranked:
+    return Ranked(SimpleNamespace(name=name), adjusted=1e-9, log_posterior=9.0, posterior=0.99)
+
+
+@pytest.mark.parametrize(
+    ("left", "named", "idle"),
+    [
+        ({"part_sag": 0.999, "backlash": 0.9}, ["backlash"], ["part_sag"]),
+        ({"part_sag": 0.9, "backlash": 0.999}, ["part_sag", "backlash"], []),
+        ({"part_sag": 0.999, "backlash": 0.995}, [], ["part_sag", "backlash"]),
+    ],
+)
+def test_the_first_that_helps_is_named_and_what_is_idle_before_it_said(monkeypatch, left, named, idle):
+    asked = []
+
+    def cross_validated(beside, score):
+        asked.append((score.name, beside))
+        return leaving(left[score.name])
+
+    monkeypatch.setattr(forward_selection, "cross_validate", cross_validated)
+    monkeypatch.setattr(forward_selection, "conditioned", lambda linear, others: [r.name for r in others])
+    kept, why = forward_selection.worth_adding(None, [ranked(name) for name in left])
+    assert [r.name for r in kept] == named and list(why) == idle
+    assert asked[0] == ("part_sag", ["backlash"])  # beside all others that are missing
+    assert all("hardly helps on views left out" in text for text in why.values())
+
+
+def test_a_hundredth_of_the_distances_is_worth_it_and_chance_is_not():
+    assert leaving(WORTH - 1e-6).idle("x") is None and leaving(WORTH + 1e-6).idle("x") is not None
+    assert leaving(0.9, sigma=0.2).idle("x") is not None
