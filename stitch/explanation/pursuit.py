@@ -73,8 +73,9 @@ class _Asked:
             worth, gains, ranks, rest = self.further(_basis(refined(sums[-1])))
             # What it holds may have moved, and would seem to be wanted once more where it stood.
             held = [set(own) <= set(sums[-1]) for own in self.addends]
-            k = int(np.where(held, -np.inf, worth).argmax())
-            rank = int(ranks[k])
+            open_ = np.where(held, -np.inf, worth)
+            k = int(open_.argmax())
+            rank = int(ranks[k]) if np.isfinite(open_[k]) else 0
             left = self.free - len(sums[-1]) - rank
             if not rank or left < 1:
                 break

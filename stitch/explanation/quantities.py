@@ -36,11 +36,12 @@ def quantities(views: Views) -> list[Quantity]:
         for name in views.covariates
     ]
     # Where the law of a joint has its zero nobody knows.
-    springs = tuple(label for q in found for label in q.together if label.startswith(_SPRING))
+    told = [q for q in found if np.isfinite(q.values).all() and np.ptp(q.values) > _STILL]
+    springs = tuple(label for q in told for label in q.together if label.startswith(_SPRING))
     zero = Quantity(
         "1", "np.ones(views.count)", "", "constant", None, np.ones(views.count), ("1", *dict.fromkeys(springs))
     )
-    return [zero, *(q for q in found if np.isfinite(q.values).all() and np.ptp(q.values) > _STILL)]
+    return [zero, *told]
 
 
 def _of_joints(views: Views) -> Iterator[Quantity]:
@@ -70,10 +71,10 @@ def _of_torque(plain: Quantity) -> Iterator[Quantity]:
     spring = f"{_SPRING} {text}"
     yield replace(plain, together=(text, spring))
     if np.ptp(torque) > _STILL:
-        square = beside_line(plain, f"{text}|{text}|", f"{plain.code} * np.abs({plain.code})", torque * np.abs(torque))
-        yield replace(square, unit="(N m)²")
-        cube = beside_line(plain, f"{text}³", f"{plain.code} ** 3", torque**3)
-        yield replace(cube, unit="(N m)³", together=(cube.text, spring))
+        square = beside_line(plain, lambda x: x * np.abs(x), "x|x|", "x * np.abs(x)")
+        cube = beside_line(plain, lambda x: x**3, "x³", "x**3")
+        yield from () if square is None else (square,)
+        yield from () if cube is None else (replace(cube, together=(cube.text, spring)),)
 
 
 def _of_gear(views: Views, k: int) -> Iterator[Quantity]:

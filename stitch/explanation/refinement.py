@@ -6,6 +6,7 @@ them keeps finite what the views do not tell.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -16,10 +17,13 @@ from stitch.explanation.quantity import Quantity
 from stitch.frames import Array
 
 _MOST = 20  # steps
+# Of teeth, in the spreads of tooth and jump: a tenth of the tooth either way, and all places of the jump.
+_TEETH, _JUMPS = np.linspace(-2, 2, 13), np.linspace(-5, 5, 20, endpoint=False)
 
 
 def refined(ingredients: Sequence[Ingredient], half: Half) -> tuple[Ingredient, ...]:
     """The same ingredients, their quantities as some views want them."""
+    ingredients = _scanned(ingredients, half)
     tuned = [q for q in quantities_of(ingredients) if q.nonlinear]
     count = sum(len(q.nonlinear) for q in tuned)
     if not count:
@@ -33,6 +37,15 @@ def refined(ingredients: Sequence[Ingredient], half: Half) -> tuple[Ingredient, 
 
     found = least_squares(off, np.zeros(count), method="lm", max_nfev=_MOST * (count + 1))
     return _moved(ingredients, tuned, found.x)
+
+
+def _scanned(ingredients: Sequence[Ingredient], half: Half) -> Sequence[Ingredient]:
+    """With teeth tried over a grid: where a view passes a jump no slope shows it."""
+    for q in quantities_of(ingredients):
+        if q.kind == "teeth":
+            tried = [_moved(ingredients, [q], np.array(steps)) for steps in product(_TEETH, _JUMPS)]
+            ingredients = min(tried, key=lambda own: float(np.sum(left_beside(own, half) ** 2)))
+    return ingredients
 
 
 def rounded(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:

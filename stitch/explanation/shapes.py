@@ -1,6 +1,7 @@
 """Shapes of quantities: bumps, teeth, what stays behind, swings and warming up, whose nonlinear parameters a formula
 may move; and powers beside their line."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -16,6 +17,9 @@ _WIDTH, _PLAY, _CONSTANT = 0.4, 0.2, 0.7
 _MIDDLE, _SWINGS, _PHASE = 0.5, 0.25, 0.8
 # By what share of itself a tooth, and by what share of a tooth its jump, may lie off.
 _TOOTH, _JUMP = 0.05, 0.1
+# Share of what a power changes, below which rounding may be all that is beside its line; torques that any power may
+# have on a line, or nearly.
+_SHOWN, _AS_A_LINE = 1e-6, 3
 
 
 def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity:
@@ -26,8 +30,13 @@ def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity
 
 
 def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
-    """From −1/2 to 1/2 along each tooth of so many rad, back at once where joint k passes `jump`; rad."""
+    """From −1/2 to 1/2 along each tooth of so many rad, back at once where joint k passes `jump`; rad.
+
+    Of its jumps the one next to the middle of the joint's range is told: there tooth and jump hardly depend on each
+    other.
+    """
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
+    jump += tooth * round((0.5 * float(q.min() + q.max()) - jump) / tooth)
     return Quantity(
         f"saw of q{k + 1}, a tooth {np.degrees(tooth):.3g}° and a jump at {np.degrees(jump):.3g}°",
         f"(({at} - {jump:.6g}) / {tooth:.6g} % 1 - 0.5)",
@@ -40,15 +49,27 @@ def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
     )
 
 
-def beside_line(torque: Quantity, text: str, code: str, power: Array) -> Quantity:
-    """What a power (V,) of a torque does that no line does, in these views: the line is the part of the zero and of a
-    spring that does not stiffen, and far from zero nearly all of the power."""
-    slope, zero = np.polyfit(torque.values, power, 1)
+def beside_line(torque: Quantity, power: Callable[[Array], Array], text: str, code: str) -> Quantity | None:
+    """What a power of a torque does that no line does, in these views: the line is the part of the zero and of a
+    spring that does not stiffen, and far from zero nearly all of the power. None where the views show nothing of it.
+
+    Args:
+        power: of the torque as a share of the largest.
+        text: of it, and `code`: of `x`.
+    """
+    largest = float(f"{np.abs(torque.values).max():.3g}")
+    share = torque.values / largest
+    slope, zero = np.polyfit(share, power(share), 1)
+    values = np.asarray(power(share) - slope * share - zero, float)
+    if np.abs(values).max() < _SHOWN * np.ptp(power(share)) or len(np.unique(share)) <= _AS_A_LINE:
+        return None
+    x = f"({torque.code} / {largest:g})"
     return replace(
         torque,
-        text=f"({text} beside its line)",
-        code=f"({code} - {slope:.12g} * {torque.code} - {zero:.12g})",
-        values=np.asarray(power - slope * torque.values - zero, float),
+        text=f"({text.replace('x', f'({torque.text}/{largest:g} {torque.unit})')} beside its line)",
+        code=f"({code.replace('x', x)} - {slope:.15g} * {x} - {zero:.15g})",
+        unit="",
+        values=values,
     )
 
 

@@ -12,7 +12,7 @@ from stitch.measurement.robot import Robot
 PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
 # Joint angles that show which torques of an arm differ.
 _ANYWHERE = 100
-_STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
+STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
         return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
     # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
     links = _by_link(robot, joints)
-    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _everywhere(robot)), axis=0) > _STILL)
+    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _everywhere(robot)), axis=0) > STILL)
     names = (*links.names, *(str(i + 1) for i in bent))
     return Torques(names, (*links.joint, *(int(i) for i in bent)), np.hstack([links.values, carried[:, bent]]))
 
@@ -84,7 +84,7 @@ def _different(torques: Array, links: Sequence[int]) -> list[int]:
     for k in links:
         own = torques[:, k]
         rest = own - basis @ (basis.T @ own)
-        if np.ptp(own) > _STILL and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
+        if np.ptp(own) > STILL and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
             chosen.append(k)
             basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
     return chosen

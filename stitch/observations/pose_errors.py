@@ -21,7 +21,7 @@ from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
-from stitch.measurement.torques import Torques
+from stitch.measurement.torques import STILL, Torques
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
@@ -144,9 +144,10 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
             in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
             with_time = (1 + alike) / 2 * near_in_time(measurements, WANDERING["slowly wandering"])
             kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way, WITH_TIME: with_time}
-            kinds |= _by_load([m.views.torques for m in measurements], joints.shape[1])
             offsets = links[:, : joints.shape[1]]
-            of_one_joint = {kind: SmoothErrors(offsets, own) for kind, own in kinds.items()}
+            each = tuple(range(joints.shape[1]))
+            of_one_joint = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
+            of_one_joint |= _by_load([m.views.torques for m in measurements], offsets)
     flange = flange_twists(measurements, centres)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
@@ -170,12 +171,22 @@ def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
     return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
 
 
-def _by_load(torques: Sequence[Torques], joints: int) -> dict[str, Array]:
-    """(n, V, V) of what each joint does under its load, by that kind of law; {} where no torques are known of all."""
-    if not torques[0].names or any(own.names != torques[0].names for own in torques):
+def _by_load(torques: Sequence[Torques], offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint that is bent does under its load, by that kind of law; {} where not the same is known of all.
+
+    Args:
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    first = torques[0]
+    if any((own.names, own.measured) != (first.names, first.measured) for own in torques):
         return {}
-    values, joint = np.concatenate([own.values for own in torques]), np.array(torques[0].joint)
-    return {ITS_LOAD: np.array([alike_under_load(values[:, joint == k]) for k in range(joints)])}
+    values, joint = np.concatenate([own.values for own in torques]), np.array(first.joint)
+    changes = np.ptp(values, axis=0) > STILL
+    bent = tuple(int(k) for k in np.unique(joint[changes]))
+    if not bent:
+        return {}
+    alike = np.array([alike_under_load(values[:, changes & (joint == k)]) for k in bent])
+    return {ITS_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
 
 
 def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:

@@ -3,7 +3,7 @@
 What planned views would see is drawn: an effect of a given size, beside everything that poses err by otherwise. Every
 candidate effect is then judged as a diagnosis judges it (`diagnosis/selection`), at the expected variances: family-wise
 p, Bayes factor, and odds over every rival in the model in which neither of the two is among the errors that remain, and
-over joints that follow the joint angles, or the way they came, by no law; not over laws in time.
+over joints that follow by no law; not over a flange that errs in time by no law.
 What a diagnosis asks of views left out is not drawn.
 """
 

@@ -22,6 +22,8 @@ from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.stacked_blocks import mixed_of_all, one_below_the_other, side_by_side
 from stitch.statistics.variance_components import fit_variances, whitener
 
+_ENOUGH = 3  # numbers for each that is free
+
 
 @dataclass(frozen=True)
 class Step:
@@ -138,7 +140,10 @@ class Linearised:
         """(3,) variances from which any search begins: of the step before, or where all effects take what they can."""
         if self.start is not None:
             return self.start
-        return fit_variances(self._mixed(np.concatenate([self.base, self.columns], axis=2)), both_starts=True).variances
+        every = np.concatenate([self.base, self.columns], axis=2)
+        # Of few numbers all effects leave no scatter to be seen.
+        enough = self._mixed(self.base).size > _ENOUGH * every.shape[2]
+        return fit_variances(self._mixed(every if enough else self.base), both_starts=True).variances
 
     def _whitened(self, free: Mask) -> Whitened:
         mixed = self._mixed(self.base)

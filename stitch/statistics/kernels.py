@@ -8,7 +8,6 @@ from stitch.frames import Array, Mask
 
 # Poses that differ by less, in rad and as a share of their distance from the base, are the same stop.
 _SAME = 1e-4
-_FAINT = 1e-6  # share of a torque below which it does not change
 # How far in its own unit (a radian, a turn's 57°) an error of a joint stays alike, and what a tooth does to it.
 REACH, SHORT_REACH = 1.0, 0.2
 
@@ -52,13 +51,10 @@ def alike_in_move(some: Array, others: Array, reach: float) -> Array:
 
 
 def alike_under_load(torques: Array) -> Array:
-    """(V, V) of a continuous function of the torques (V, m) that bend one joint (Ornstein–Uhlenbeck, over the range of
-    each); nothing where none of them changes.
-    """
-    bending = torques[:, np.ptp(torques, axis=0) > _FAINT * np.abs(torques).max(initial=0.0)]
-    share = bending / np.ptp(bending, axis=0) if bending.size else bending
-    apart = np.abs(share[:, None] - share[None]).sum(axis=2)
-    return np.asarray(np.exp(-apart) if bending.size else apart)
+    """(V, V) of a continuous function of the torques (V, m) that bend one joint, each of which changes
+    (Ornstein–Uhlenbeck, over the range of each)."""
+    share = torques / np.ptp(torques, axis=0)
+    return np.asarray(np.exp(-np.abs(share[:, None] - share[None]).mean(axis=2)))
 
 
 def reach_of_way(joint: Array) -> float:
@@ -90,6 +86,7 @@ class SmoothErrors:
 
     columns: Array  # (6V, P) twists of the views per unit of each process
     alike: Array  # (V, V) covariance of each, or (P, V, V) where they differ
+    joints: tuple[int, ...]  # (P,) that each is of, counted from 0
 
     @property
     def count(self) -> int:

@@ -11,7 +11,6 @@ as where its motor warms, which is no drift of mount or part; or by a law of its
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from scipy.special import logsumexp
@@ -21,7 +20,7 @@ from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, SMOOTH, THE_WAY, WITH_TIME
+from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, SMOOTH, THE_WAY, WITH_TIME, PoseErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -33,10 +32,10 @@ ANY_SIZE = float(np.log(len(SCALES)))
 
 @dataclass(frozen=True)
 class JointLaw:
-    """One joint that follows the joint angles by a law without a name."""
+    """One joint that follows a law without a name."""
 
     joint: int  # counted from 1
-    follows: str  # ALL_ANGLES, OWN_ANGLE or THE_WAY
+    follows: str  # ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME or ITS_LOAD
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size
     model: LinearModel  # with the law as the last of its pose errors, all sizes fitted
 
@@ -51,7 +50,7 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
 
 def log_posterior(base: LinearModel) -> float:
-    """That some joint follows such a law, by the angles or by the way it came, as those of effects in the same model
+    """That some joint follows such a law, of any kind, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
     laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD))
     return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
@@ -65,7 +64,7 @@ def some_law(log_bayes_factors: Array) -> Array:
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints, by the angles, closely, and by the way they came; usual size."""
+    """(n, n) in the channel of the laws of all joints, of every kind; usual size."""
     errors = base.pose_errors
     if errors is None or not errors.of_one_joint:
         return []
@@ -78,16 +77,20 @@ def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     errors = base.pose_errors
     if errors is None or not errors.of_one_joint:
         return []
-    found = []
-    known = [kind for kind in kinds if kind in errors.of_one_joint]
-    for follows, k in product(known, range(errors.of_one_joint[ALL_ANGLES].count)):
-        half = base.reduce(errors.of_one_joint[follows].of(k))
-        every = errors.beside(f"joint {k + 1}", base.reduce(half.T), SMOOTH)
-        mixed = with_errors(base.mixed, every)
-        fit = _fit(base, mixed)
-        model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
-        found.append(JointLaw(k + 1, follows, 0.5 * (base.null.deviance - fit.deviance), model))
+    found = list[JointLaw]()
+    for follows in (kind for kind in kinds if kind in errors.of_one_joint):
+        smooth = errors.of_one_joint[follows]
+        found += [_law(base, errors, joint + 1, follows, smooth.of(p)) for p, joint in enumerate(smooth.joints)]
     return found
+
+
+def _law(base: LinearModel, errors: PoseErrors, joint: int, follows: str, covariance: Array) -> JointLaw:
+    """Of a joint, counted from 1, by the covariance (6V, 6V) of the twists."""
+    every = errors.beside(f"joint {joint}", base.reduce(base.reduce(covariance).T), SMOOTH)
+    mixed = with_errors(base.mixed, every)
+    fit = _fit(base, mixed)
+    model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
+    return JointLaw(joint, follows, 0.5 * (base.null.deviance - fit.deviance), model)
 
 
 def _fit(base: LinearModel, mixed: MixedModel) -> VarianceFit:
