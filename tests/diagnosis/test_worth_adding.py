@@ -15,30 +15,42 @@ def leaving(poses: float, sigma: float = 1e-3) -> CrossValidation:
 
 
 def ranked(name: str) -> Ranked:
-    return Ranked(SimpleNamespace(name=name), adjusted=1e-9, log_posterior=9.0, posterior=0.99)
+    score = SimpleNamespace(name=name, candidate=SimpleNamespace(name=name))
+    return Ranked(score, adjusted=1e-9, log_posterior=9.0, posterior=0.99)
 
 
 @pytest.mark.parametrize(
     ("left", "named", "idle"),
     [
         ({"part_sag": 0.999, "backlash": 0.9}, ["backlash"], ["part_sag"]),
-        ({"part_sag": 0.9, "backlash": 0.999}, ["part_sag", "backlash"], []),
+        ({"part_sag": 0.9, "backlash": 0.999}, ["part_sag"], ["backlash"]),
+        ({"part_sag": 0.9, "backlash": 0.9, "settling": 0.999}, ["part_sag", "backlash", "settling"], []),
         ({"part_sag": 0.999, "backlash": 0.995}, [], ["part_sag", "backlash"]),
     ],
 )
-def test_the_first_that_helps_is_named_and_what_is_idle_before_it_said(monkeypatch, left, named, idle):
-    asked = []
+def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, idle):
+    monkeypatch.setattr(
+        forward_selection, "without", lambda linear, chosen, one: [r.name for r in chosen if r.name != one.name]
+    )
+    asked, scored = [], []
 
     def cross_validated(beside, score):
         asked.append((score.name, beside))
         return leaving(left[score.name])
 
+    def again(beside, candidate, tests):
+        scored.append((candidate.name, beside))
+        return ranked(candidate.name)
+
     monkeypatch.setattr(forward_selection, "cross_validate", cross_validated)
-    monkeypatch.setattr(forward_selection, "conditioned", lambda linear, others: [r.name for r in others])
-    kept, why = forward_selection.worth_adding(None, [ranked(name) for name in left])
+    monkeypatch.setattr(forward_selection, "ranked_one", again)
+    monkeypatch.setattr(forward_selection, "certain", lambda r: True)
+    kept, why = forward_selection.worth_adding(None, [ranked(name) for name in left], 20)
     assert [r.name for r in kept] == named and list(why) == idle
-    assert asked[0] == ("part_sag", ["backlash"])  # beside all others that are missing
+    assert asked[0] == ("part_sag", [name for name in left if name != "part_sag"])  # beside all that are missing
     assert all("hardly helps on views left out" in text for text in why.values())
+    # What stays was scored beside what went: it is asked again.
+    assert {name for name, _ in scored} >= (set(named) if idle else set())
 
 
 def test_a_hundredth_of_the_distances_is_worth_it_and_chance_is_not():

@@ -56,21 +56,25 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         chosen = _grown(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
 
 
-def worth_adding(linear: LinearModel, chosen: Sequence[Ranked]) -> tuple[list[Ranked], dict[str, str]]:
-    """Effects beside each other from the first on that helps on views left out, and what is idle of those before.
+def worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> tuple[list[Ranked], dict[str, str]]:
+    """Effects beside each other of which the first two, those that are told, help on views left out; and what is idle.
 
     What would be dropped again as soon as it is in the model is not named: of hundreds of poses an effect is seen that
     moves hardly anything, and that anything else may do as well.
+
+    Args:
+        tests: candidates among which they were chosen.
     """
     chosen, idle = list(chosen), dict[str, str]()
-    while chosen:
-        name = chosen[0].name
-        objection = cross_validate(conditioned(linear, chosen[1:]), chosen[0].score).idle(name)
-        if objection is None:
-            break
-        idle[name] = objection
-        del chosen[0]
-    return chosen, idle
+    while True:
+        objections = ((r, cross_validate(without(linear, chosen, r), r.score).idle(r.name)) for r in chosen[:2])
+        first = next(((r, why) for r, why in objections if why is not None), None)
+        if first is None:
+            return chosen, idle
+        gone, idle[first[0].name] = first
+        rest = [r for r in chosen if r.name != gone.name]
+        again = [ranked_one(without(linear, rest, r), r.score.candidate, tests) for r in rest]
+        chosen = sorted(filter(certain, again), key=lambda r: -r.log_posterior)
 
 
 def _grown(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:

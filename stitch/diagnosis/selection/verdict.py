@@ -95,8 +95,8 @@ def _at_once(
         return [], found.refused, True
     effects, idle = list(found.effects or (best,)), dict[str, str]()
     if linear.pose_errors is None:
-        effects, idle = worth_adding(linear, effects)
-    return effects, found.refused | idle, stray is not None
+        effects, idle = worth_adding(linear, effects, sum(not c.empirical for c in candidates))
+    return effects, found.refused | idle, False
 
 
 def _none_alone(
