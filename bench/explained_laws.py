@@ -27,7 +27,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-LAWS = ("unnamed", "foreign", "further")
+LAWS, _ON_THE_PAGE = ("unnamed", "foreign", "further"), ("nothing", "memory", "unnamed")
 _BY_NAME = (*UNNAMED, *FOREIGN, *FURTHER)
 DEVELOPMENT, HELD_OUT = (0, 1), (820, 821, 822, 823)
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "explain.md"
@@ -51,12 +51,14 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--held-out", action="store_true")
-    parser.add_argument("--parts", default="nothing,memory,unnamed")
+    parser.add_argument("--parts", default=",".join(_ON_THE_PAGE))
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--fewer", type=int, default=1)
     parser.add_argument("--size", type=float, default=2.0, help="of the laws, in their usual sizes")
     parser.add_argument("--write", action="store_true", help="put the table into docs/explain.md")
     given = parser.parse_args()
+    if given.write and given.parts != ",".join(_ON_THE_PAGE):
+        parser.error(f"--write puts {' and '.join(_ON_THE_PAGE)} into the page, and no other parts")
     seeds = HELD_OUT if given.held_out else DEVELOPMENT
     rows: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
     with library_threads_off():
