@@ -69,11 +69,12 @@ def main() -> None:
                 a = cells[k % len(cells)]
                 rng = np.random.default_rng([a.cell.seed, k, list(PARTS).index(part), 18])
                 world, hidden = make(a, rng, k)
-                linear, begun = seen(a, grown(world, given.size), rng), time.process_time()
+                world = grown(world, given.size)
+                linear, begun = seen(a, world, rng), time.process_time()
                 found = explain(linear)
                 good, truth = False, float("nan")
                 if part in LAWS:
-                    truth = share_left(linear.scatter_only, true_column(a, grown(world, given.size)))
+                    truth = share_left(linear.scatter_only, true_column(a, world))
                     good = found.found and found.heldout_share <= _NEAR**2 * truth
                 name = hidden[0] if part in LAWS else part
                 rows[name].append((found.found, good))

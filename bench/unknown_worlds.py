@@ -1,6 +1,6 @@
 """Worlds of the benchmark of names: what is hidden in a cell, drawn for one trial."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -39,16 +39,12 @@ def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[st
     return _erring(a, rng, law, UNNAMED[law], of_flange=law in IN_TIME)
 
 
-def foreign(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+def by_another_hand(
+    a: Asked, rng: np.random.Generator, k: int, laws: Mapping[str, Callable[..., Array]], of_flange: Sequence[str]
+) -> tuple[World, tuple[str, ...]]:
     """A law of those that were written apart from all that looks for laws."""
-    law = _in_turn(list(FOREIGN), k)
-    return _erring(a, rng, law, FOREIGN[law], of_flange=law in FOREIGN_OF_FLANGE)
-
-
-def further(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
-    """The same of eight more, written after what the first ones showed was mended."""
-    law = _in_turn(list(FURTHER), k)
-    return _erring(a, rng, law, FURTHER[law], of_flange=law in FURTHER_OF_FLANGE)
+    law = _in_turn(list(laws), k)
+    return _erring(a, rng, law, laws[law], of_flange=law in of_flange)
 
 
 def at_multiple(
@@ -97,6 +93,9 @@ def three(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str,
 
 
 Part = Callable[[Asked, np.random.Generator, int], tuple[World, tuple[str, ...]]]
+# The second eight were written after what the first showed was mended.
+FIRST_EIGHT = partial(by_another_hand, laws=FOREIGN, of_flange=FOREIGN_OF_FLANGE)
+SECOND_EIGHT = partial(by_another_hand, laws=FURTHER, of_flange=FURTHER_OF_FLANGE)
 PARTS: dict[str, tuple[Part, int]] = {
     "nothing": (nothing, 100),
     "memory": (memory, 100),
@@ -107,10 +106,10 @@ PARTS: dict[str, tuple[Part, int]] = {
     "three": (three, 42),
     **{f"unnamed_{n}x": (partial(at_multiple, make=unnamed, multiple=float(n)), 60) for n in MULTIPLES},
     "arm": (arm, 36),
-    "foreign": (foreign, 64),
-    "foreign_3x": (partial(at_multiple, make=foreign, multiple=3.0), 64),
-    "further": (further, 64),
-    "further_3x": (partial(at_multiple, make=further, multiple=3.0), 64),
+    "foreign": (FIRST_EIGHT, 64),
+    "foreign_3x": (partial(at_multiple, make=FIRST_EIGHT, multiple=3.0), 64),
+    "further": (SECOND_EIGHT, 64),
+    "further_3x": (partial(at_multiple, make=SECOND_EIGHT, multiple=3.0), 64),
 }
 
 

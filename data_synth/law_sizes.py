@@ -22,15 +22,25 @@ def joint_with(plan: Plan, amount: Array, rng: np.random.Generator) -> int:
 
 def of_joint(plan: Plan, joint: int, course: Array) -> Array:
     """(V, n) of the usual rms about its mean."""
+    return at_joint(plan, joint, SIZE * standard(course))
+
+
+def at_joint(plan: Plan, joint: int, error: Array) -> Array:
+    """(V, n) of one joint that errs (V,), rad."""
     out = np.zeros_like(plan.joints)
-    out[:, joint] = SIZE * standard(course)
+    out[:, joint] = error
     return out
 
 
 def of_flange(course: Array, rng: np.random.Generator) -> Array:
     """(V, 6) of the usual rms about its mean, along one direction."""
+    return np.outer(standard(course), direction(rng))
+
+
+def direction(rng: np.random.Generator) -> Array:
+    """(6,) of the usual size: 50 µm and 0.15 mrad."""
     turn, shift = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
-    return np.outer(standard(course), np.concatenate([SIZE * turn, SHIFT * shift]))
+    return np.concatenate([SIZE * turn, SHIFT * shift])
 
 
 def of_base_frame(T: Array, turn: Array, shift: Array) -> Array:

@@ -7,33 +7,31 @@ rad and mm. Sizes are about 0.15 mrad or 0.05 mm rms, what a good arm is off by.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data_synth.law_sizes import SIZE, Array, at_joint, direction, of_joint
 from data_synth.moment import Plan
 
-Array = NDArray[np.float64]
-_SIZE, _SHIFT = 1.5e-4, 0.05
 _RMS_OF_WAVE, _RMS_OF_SAW = float(np.sqrt(2.0)), float(np.sqrt(12.0))
 
 
 def coupling(plan: Plan, rng: np.random.Generator) -> Array:
     """Two joints drag each other: sin q_i sin 2q_k, of 0.15 mrad."""
     i, k = rng.choice(plan.useful, 2, replace=False)
-    return _of_joint(plan, i, _SIZE * np.sin(plan.joints[:, i]) * np.sin(2 * plan.joints[:, k]))
+    return at_joint(plan, i, SIZE * np.sin(plan.joints[:, i]) * np.sin(2 * plan.joints[:, k]))
 
 
 def dress_pack(plan: Plan, rng: np.random.Generator) -> Array:
     """Hoses pull one joint the harder, the farther two others are from where the hoses hang free."""
     i, k, m = rng.choice(plan.useful, 3, replace=False)
     off = [plan.joints[:, j] - rng.uniform(*_range(plan, j)) for j in (k, m)]
-    return _of_joint(plan, i, _scaled(np.hypot(*off) ** 1.5 * np.sign(np.sin(off[0]))))
+    return of_joint(plan, i, np.hypot(*off) ** 1.5 * np.sign(np.sin(off[0])))
 
 
 def spall(plan: Plan, rng: np.random.Generator) -> Array:
     """A damaged tooth: a bump of 10° in the angle of one joint."""
     i = int(rng.choice(plan.useful))
     middle = rng.uniform(*_range(plan, i))
-    return _of_joint(plan, i, 3 * _SIZE * np.exp(-0.5 * ((plan.joints[:, i] - middle) / np.radians(10)) ** 2))
+    return at_joint(plan, i, 3 * SIZE * np.exp(-0.5 * ((plan.joints[:, i] - middle) / np.radians(10)) ** 2))
 
 
 def hysteresis(plan: Plan, rng: np.random.Generator) -> Array:
@@ -44,20 +42,20 @@ def hysteresis(plan: Plan, rng: np.random.Generator) -> Array:
     state[0] = q[0]
     for v in range(1, len(q)):
         state[v] = np.clip(state[v - 1], q[v] - low_high, q[v] + low_high)
-    return _of_joint(plan, i, _scaled(state - q))
+    return of_joint(plan, i, state - q)
 
 
 def ripple(plan: Plan, rng: np.random.Generator) -> Array:
     """A wave generator: seven periods a turn of one joint."""
     i, phase = int(rng.choice(plan.useful)), rng.uniform(0, 2 * np.pi)
-    return _of_joint(plan, i, _SIZE * _RMS_OF_WAVE * np.sin(7 * plan.joints[:, i] + phase))
+    return at_joint(plan, i, SIZE * _RMS_OF_WAVE * np.sin(7 * plan.joints[:, i] + phase))
 
 
 def cogging(plan: Plan, rng: np.random.Generator) -> Array:
     """A belt that creeps and jumps a tooth on: a saw of 12 to 25° along one joint."""
     i, phase = int(rng.choice(plan.useful)), rng.uniform()
     teeth = plan.joints[:, i] / np.radians(rng.uniform(12, 25)) + phase
-    return _of_joint(plan, i, _SIZE * _RMS_OF_SAW * (teeth - np.floor(teeth) - 0.5))
+    return at_joint(plan, i, SIZE * _RMS_OF_SAW * (teeth - np.floor(teeth) - 0.5))
 
 
 def stiffening(plan: Plan, rng: np.random.Generator) -> Array:
@@ -66,7 +64,7 @@ def stiffening(plan: Plan, rng: np.random.Generator) -> Array:
     i = int(rng.choice(borne))
     torque = plan.torque[:, i] / np.abs(plan.torque[:, i]).max()
     line = np.polynomial.Polynomial.fit(torque, torque**3, 1)
-    return _of_joint(plan, i, _scaled(torque**3 - line(torque)))
+    return of_joint(plan, i, torque**3 - line(torque))
 
 
 def thermal_cycle(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
@@ -77,7 +75,7 @@ def thermal_cycle(plan: Plan, rng: np.random.Generator, time: Array | None = Non
     """
     steps = np.arange(len(plan.joints)) if time is None else time
     swing = np.sin(2 * np.pi * steps / rng.uniform(4, 9) + rng.uniform(0, 2 * np.pi))
-    return _RMS_OF_WAVE * swing[:, None] * _direction(rng)
+    return _RMS_OF_WAVE * swing[:, None] * direction(rng)
 
 
 def gust(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:
@@ -85,7 +83,7 @@ def gust(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Arr
     steps = np.arange(len(plan.joints)) if time is None else time
     whole = float(np.ptp(steps)) + 1.0
     middle, width = rng.uniform(0.25, 0.75) * whole, rng.uniform(0.08, 0.16) * whole
-    return 2 * np.exp(-0.5 * ((steps - middle) / width) ** 2)[:, None] * _direction(rng)
+    return 2 * np.exp(-0.5 * ((steps - middle) / width) ** 2)[:, None] * direction(rng)
 
 
 UNNAMED: dict[str, Callable[..., Array]] = {
@@ -95,23 +93,6 @@ UNNAMED: dict[str, Callable[..., Array]] = {
 IN_TIME = ("thermal_cycle", "gust")  # the others follow the joints
 
 
-def _of_joint(plan: Plan, joint: int, error: Array) -> Array:
-    out = np.zeros_like(plan.joints)
-    out[:, joint] = error
-    return out
-
-
-def _scaled(error: Array) -> Array:
-    """Of the usual rms about its mean."""
-    return np.asarray(_SIZE * (error - error.mean()) / max(float(error.std()), 1e-12))
-
-
 def _range(plan: Plan, joint: int) -> tuple[float, float]:
     q = plan.joints[:, joint]
     return float(q.min()), float(q.max())
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    """(6,) of 50 µm and 0.15 mrad."""
-    turn, shift = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
-    return np.concatenate([_SIZE * turn, _SHIFT * shift])

@@ -72,10 +72,11 @@ class _Asked:
         while len(sums[-1]) < _AT_MOST:
             worth, gains, ranks, rest = self.further(_basis(refined(sums[-1])))
             # What it holds may have moved, and would seem to be wanted once more where it stood.
-            held = [set(own) <= set(sums[-1]) for own in self.addends]
-            open_ = np.where(held, -np.inf, worth)
-            k = int(open_.argmax())
-            rank = int(ranks[k]) if np.isfinite(open_[k]) else 0
+            inside = set(sums[-1])
+            held = [inside.issuperset(own) for own in self.addends]
+            worth, ranks = np.where(held, -np.inf, worth), np.where(held, 0, ranks)
+            k = int(worth.argmax())
+            rank = int(ranks[k])
             left = self.free - len(sums[-1]) - rank
             if not rank or left < 1:
                 break

@@ -73,8 +73,10 @@ def _of_torque(plain: Quantity) -> Iterator[Quantity]:
     if np.ptp(torque) > _STILL:
         square = beside_line(plain, lambda x: x * np.abs(x), "x|x|", "x * np.abs(x)")
         cube = beside_line(plain, lambda x: x**3, "x³", "x**3")
-        yield from () if square is None else (square,)
-        yield from () if cube is None else (replace(cube, together=(cube.text, spring)),)
+        if square is not None:
+            yield square
+        if cube is not None:
+            yield replace(cube, together=(cube.text, spring))
 
 
 def _of_gear(views: Views, k: int) -> Iterator[Quantity]:

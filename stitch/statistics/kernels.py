@@ -82,24 +82,23 @@ def same_stop(T_base_flange: Array) -> Mask:
 
 @dataclass(frozen=True)
 class SmoothErrors:
-    """Errors Σ_p f_p(view)·column_p of all views, with smooth processes f_p that nobody wrote down."""
+    """Errors f_k(view)·column_k of all views by a joint k, with smooth processes f_k that nobody wrote down."""
 
     columns: Array  # (6V, P) twists of the views per unit of each process
     alike: Array  # (V, V) covariance of each, or (P, V, V) where they differ
     joints: tuple[int, ...]  # (P,) that each is of, counted from 0
 
-    @property
-    def count(self) -> int:
-        """P."""
-        return int(self.columns.shape[1])
+    def of(self, joint: int) -> Array:
+        """(6V, 6V) covariance of the twists by one joint alone."""
+        return spread_over(self.column_of(joint)[:, None], self.alike_of(joint))
 
-    def of(self, p: int) -> Array:
-        """(6V, 6V) covariance of the twists by process p alone."""
-        return spread_over(self.columns[:, [p]], self.alike_of(p))
+    def column_of(self, joint: int) -> Array:
+        """(6V,) twists of the views per unit of its process."""
+        return np.asarray(self.columns[:, self.joints.index(joint)])
 
-    def alike_of(self, p: int) -> Array:
-        """(V, V) covariance of process p."""
-        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[p])
+    def alike_of(self, joint: int) -> Array:
+        """(V, V) covariance of its process."""
+        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[self.joints.index(joint)])
 
 
 def spread_over(columns: Array, alike: Array) -> Array:

@@ -108,6 +108,17 @@ def test_a_flank_that_changes_with_the_load_is_no_spring(cell):
     assert [r.name for r in found.named] == ["joint_compliance"]
 
 
+def test_only_joints_that_are_bent_have_a_law_of_their_load(cell):
+    """The first axis stands upright, and the payload hangs on the sixth: what is left there is rounding."""
+    torque = cell.measurement.views.torques.values
+    assert np.ptp(torque[:, [0, 5]], axis=0).max() < 1e-9 and np.ptp(torque[:, 1:5], axis=0).min() > 1
+    _, linear = said_of(cell, cell.measured.T_base_flange)
+    law = linear.pose_errors.of_one_joint[ITS_LOAD]
+    assert law.joints == (1, 2, 3, 4)
+    for joint in law.joints:
+        np.testing.assert_allclose(np.diag(law.alike_of(joint)), 1)
+
+
 def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(cell):
     """A joint that drifts as its motor warms is likelier by a law in time than by any of its angles."""
     plan = cell.measured.plan

@@ -7,6 +7,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.diagnose import linear_model_of
+from stitch.explanation.dictionary import dictionary
 from stitch.explanation.explain import explain
 from stitch.explanation.quantities import quantities
 from stitch.explanation.quantity import Quantity
@@ -43,6 +44,9 @@ def test_a_saw_jumps_where_it_says_and_belongs_to_its_own_joint():
     slope = np.diff(saw.values) - np.diff(views.joints[:, 1]) / 0.2
     np.testing.assert_allclose(slope, np.round(slope), atol=1e-9)  # whole teeth are jumped over
     assert {q.joint for q in quantities(views) if q.kind == "teeth"} <= set(range(6))
+    linear = linear_model_of(state_of(run(labelled_cell(3, views=12)[0])))
+    of_teeth = [i for i in dictionary(linear, quantities(views)).ingredients if i.quantity.kind == "teeth"]
+    assert of_teeth and all(i.index == i.quantity.joint for i in of_teeth)
 
 
 @pytest.mark.parametrize("torque", [np.linspace(570, 612, 18), np.linspace(-5, 7, 18)], ids=["far from 0", "about 0"])

@@ -131,7 +131,7 @@ def _given_views(law: JointLaw, with_views: Array, prior: Array) -> tuple[Array,
     linear, k = law.model, law.joint - 1
     assert linear.pose_errors is not None
     variance, usual = linear.null.variances[-1], float(term_of(linear.measurement, EFFECTS["joint_offset"]).typical[k])
-    columns = linear.pose_errors.of_one_joint[law.follows].columns[:, k].reshape(-1, 6, 1)
+    columns = linear.pose_errors.of_one_joint[law.follows].column_of(k).reshape(-1, 6, 1)
     seen = linear.residual(linear.reduce((columns * with_views.T[:, None, :]).reshape(-1, len(with_views))))
     mean = variance * seen.T @ linear.white_residual
     return usual * mean, usual**2 * (variance * prior - variance**2 * seen.T @ seen)

@@ -68,7 +68,7 @@ def law_covariances(base: LinearModel) -> list[Array]:
     errors = base.pose_errors
     if errors is None or not errors.of_one_joint:
         return []
-    every = [smooth.of(k) for smooth in errors.of_one_joint.values() for k in range(smooth.count)]
+    every = [smooth.of(k) for smooth in errors.of_one_joint.values() for k in smooth.joints]
     return [SMOOTH**2 * base.reduce(base.reduce(law).T) for law in every]
 
 
@@ -80,7 +80,7 @@ def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     found = list[JointLaw]()
     for follows in (kind for kind in kinds if kind in errors.of_one_joint):
         smooth = errors.of_one_joint[follows]
-        found += [_law(base, errors, joint + 1, follows, smooth.of(p)) for p, joint in enumerate(smooth.joints)]
+        found += [_law(base, errors, joint + 1, follows, smooth.of(joint)) for joint in smooth.joints]
     return found
 
 
