@@ -19,10 +19,12 @@ class Trial:
     group: tuple[str, ...]  # of which one is there at the end, if it ends so
     follows: str  # what is said to repeat without a name
     seconds: float
+    certain: bool = True  # False where the name is said to be less than 20 to 1 over chance
 
     def __str__(self) -> str:
         hidden, named = ", ".join(self.hidden) or "nothing", " ".join((*self.named, *(f"then {n}" for n in self.then)))
         named += f" then one of {' '.join(self.group)}" if self.then and self.group else ""
+        named += "" if self.certain else " (perhaps)"
         return f"{self.cell}: {hidden} → {self.verdict} {named}{self.follows} ({self.seconds:.1f} s)"
 
     @property
@@ -77,8 +79,10 @@ class Trial:
 
 _COLUMNS: dict[str, Callable[[Trial], bool]] = {
     "wrong name": lambda t: t.single and t.wrong,
+    "wrong name said to be certain": lambda t: t.single and t.wrong and t.certain,
     "wrong group": lambda t: t.verdict == "cannot_tell" and t.wrong,
     "right name": lambda t: t.single and t.right,
+    "right name said to be certain": lambda t: t.single and t.right and t.certain,
     "right name or group": lambda t: t.right,
     "all of it, asked again": lambda t: t.whole,
     "all of it, or the last in a group": lambda t: t.whole_or_group,

@@ -12,6 +12,7 @@ from unknown_cells import Asked, World, true_column, white
 from data_synth import nature
 from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
 from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
+from data_synth.later_laws import LATER, LATER_IN_TIME, LATER_OF_FLANGE
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.unnamed_laws import IN_TIME, UNNAMED
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
@@ -93,9 +94,10 @@ def three(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str,
 
 
 Part = Callable[[Asked, np.random.Generator, int], tuple[World, tuple[str, ...]]]
-# The second eight were written after what the first showed was mended.
+# The second eight were written after what the first showed was mended, the third after the second were measured.
 FIRST_EIGHT = partial(by_another_hand, laws=FOREIGN, of_flange=FOREIGN_OF_FLANGE)
 SECOND_EIGHT = partial(by_another_hand, laws=FURTHER, of_flange=FURTHER_OF_FLANGE)
+THIRD_EIGHT = partial(by_another_hand, laws=LATER, of_flange=LATER_OF_FLANGE)
 PARTS: dict[str, tuple[Part, int]] = {
     "nothing": (nothing, 100),
     "memory": (memory, 100),
@@ -110,6 +112,8 @@ PARTS: dict[str, tuple[Part, int]] = {
     "foreign_3x": (partial(at_multiple, make=FIRST_EIGHT, multiple=3.0), 64),
     "further": (SECOND_EIGHT, 64),
     "further_3x": (partial(at_multiple, make=SECOND_EIGHT, multiple=3.0), 64),
+    "later": (THIRD_EIGHT, 64),
+    "later_3x": (partial(at_multiple, make=THIRD_EIGHT, multiple=3.0), 64),
 }
 
 
@@ -118,7 +122,8 @@ def _erring(
 ) -> tuple[World, tuple[str, ...]]:
     """A world with a law, and what of it may be told: the joint that follows it, or that it is of all of them."""
     time = np.array([moment.time for moment in a.moments])
-    own = (time / np.median(np.diff(time)),) if law in (*IN_TIME, *FOREIGN_IN_TIME, *FURTHER_IN_TIME) else ()
+    in_time = (*IN_TIME, *FOREIGN_IN_TIME, *FURTHER_IN_TIME, *LATER_IN_TIME)
+    own = (time / np.median(np.diff(time)),) if law in in_time else ()
     error = errors(a.cell.plan, rng, *own)
     world = World(_laws(a, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
     if of_flange:

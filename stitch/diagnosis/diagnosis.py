@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from stitch.diagnosis.covariate_dependence import Dependence
 from stitch.diagnosis.design.next_view import Proposal
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.sensitivity.aliases import Alias
+from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import TimeCurve
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said
@@ -56,12 +59,18 @@ class Diagnosis:
     unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
     curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, along angles and moves
+    over_nothing: float = np.inf  # log odds of what is named over nothing being missing
     within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
     of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
     doubts: tuple[
         str, ...
     ] = ()  # of the session as a whole, as sentences: what is found may be no more than their mark
+
+    @property
+    def certain(self) -> bool:
+        """False where a name is less than 20 to 1 likelier than nothing being missing."""
+        return self.verdict != "missing_effect" or self.over_nothing > ODDS
 
     @property
     def time_curve(self) -> TimeCurve | None:

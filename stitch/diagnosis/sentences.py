@@ -41,9 +41,11 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
         left, out = (length_text(d.residual_rms * np.sqrt(share), length_unit) for share in (inside, heldout))
         gain = f"; adding it should leave about {left}, {out} on views left out"
     more = f" {second.name} seems to be there too." if second else ""
+    missing = "is missing" if d.certain else "may be missing"
+    chance = "" if d.certain else f", {odds_text(d.over_nothing)} that it is more than chance"
     return (
-        f"{name} is missing ({amounts}; p = {candidate.ranked.adjusted:.1g}): {now} remain where noise would leave "
-        f"{floor}{gain}.{more}"
+        f"{name} {missing} ({amounts}; p = {candidate.ranked.adjusted:.1g}{chance}): {now} remain where noise "
+        f"would leave {floor}{gain}.{more}"
     )
 
 
@@ -118,6 +120,12 @@ def _lack(d: Diagnosis) -> str:
     if not untested:
         return ""
     return f"; without joint angles and the robot's geometry joint effects ({', '.join(untested)}) cannot be tested"
+
+
+def odds_text(log_odds: float) -> str:
+    """3 to 1, or 1 to 3."""
+    likelier = float(np.exp(abs(log_odds)))
+    return f"{likelier:.2g} to 1" if log_odds >= 0 else f"1 to {likelier:.2g}"
 
 
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:

@@ -4,6 +4,9 @@ Terminal, page, recording and review all say it so; the diagnosis' own sentence 
 """
 
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.sentences import odds_text
+from stitch.diagnosis.thresholds import FALL
+from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.doubt_headline import doubt_headline
 from stitch.units import length_text
@@ -33,11 +36,24 @@ def _finding(found: Diagnosis, length_unit: str) -> str:
         case "unknown_effect":
             return f"Something is missing in the model that no effect of the library explains{_where(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
+    missing = "Missing in the model" if found.certain else "Perhaps missing in the model"
+    doubt = "" if found.certain else f" It is {odds_text(found.over_nothing)} that this is more than chance."
     if validation is None:
-        return f"Missing in the model: {named}."
-    then = found.residual_rms * validation.inside**0.5
-    before, after = (length_text(rms, length_unit) for rms in (found.residual_rms, then))
-    return f"Missing in the model: {named}. Adding it should bring the error from {before} to {after} (rms)."
+        return f"{missing}: {named}.{doubt}"
+    return f"{missing}: {named}.{doubt} {_gain(found.residual_rms, validation, length_unit)}"
+
+
+def _gain(residual_rms: float, validation: CrossValidation, length_unit: str) -> str:
+    """How far the error should fall, or where else the effect shows: a small one moves poses by less than chance
+    moves a residual."""
+    share = validation.inside**0.5
+    before, after = (length_text(rms, length_unit) for rms in (residual_rms, share * residual_rms))
+    if share < FALL:
+        return f"Adding it should bring the error from {before} to {after} (rms)."
+    return (
+        f"It is too small for the error to show ({before} now, {after} with it, rms), but the poses of views left out "
+        f"should be off by {1 - validation.poses**0.5:.0%} less."
+    )
 
 
 def _rest(smooth: FieldError | None, length_unit: str) -> str:

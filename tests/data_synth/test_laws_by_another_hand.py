@@ -6,13 +6,14 @@ import pytest
 from data_synth.arms import ARMS
 from data_synth.foreign_laws import FOREIGN, FOREIGN_OF_FLANGE
 from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
+from data_synth.later_laws import LATER, LATER_IN_TIME, LATER_OF_FLANGE
 from data_synth.moment import Plan
 from data_synth.unnamed_laws import UNNAMED
 from tests.data_synth.law_plans import SEEDS, VIEWS, plan_of, relative
 
-LAWS, OF_FLANGE = FOREIGN | FURTHER, (*FOREIGN_OF_FLANGE, *FURTHER_OF_FLANGE)
+LAWS, OF_FLANGE = FOREIGN | FURTHER | LATER, (*FOREIGN_OF_FLANGE, *FURTHER_OF_FLANGE, *LATER_OF_FLANGE)
 # Their load says which joint errs, where no useful one bears any.
-ELSEWHERE_TOO = ("flank_change", "softening_belt", "ring_bolts")
+ELSEWHERE_TOO = ("flank_change", "softening_belt", "ring_bolts", "creeping_belt")
 
 
 def drawn(law: str, plan: Plan, seed: int) -> np.ndarray:
@@ -20,9 +21,11 @@ def drawn(law: str, plan: Plan, seed: int) -> np.ndarray:
     return LAWS[law](plan, np.random.default_rng(seed))
 
 
-def test_they_are_eight_and_none_has_the_name_of_a_law_before():
-    assert len(FURTHER) == 8 and not set(FURTHER) & {*UNNAMED, *FOREIGN}
+def test_they_are_eight_each_and_none_has_the_name_of_another():
+    assert len(FOREIGN) == len(FURTHER) == len(LATER) == 8
+    assert len({*UNNAMED, *LAWS}) == len(UNNAMED) + 24
     assert set(FURTHER_IN_TIME) <= set(FURTHER_OF_FLANGE) <= set(FURTHER)
+    assert set(LATER_IN_TIME) <= set(LATER_OF_FLANGE) <= set(LATER)
 
 
 @pytest.mark.parametrize("arm", ARMS)

@@ -7,10 +7,12 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.selection.exchange import likelier_beyond
 from stitch.diagnosis.selection.ranking import certain, ranked_one
-from stitch.diagnosis.validation.extrapolation import extrapolate
+from stitch.diagnosis.selection.verdict import _notes
+from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate, unseen_beyond
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
 from stitch.runs.state import state_of
+from stitch.statistics.folds import JointEnd
 
 
 def stands(session, name):
@@ -48,6 +50,18 @@ def test_gear_errors_that_imitate_another_error_are_told_by_left_out_ends():
         refused += not found.helps
     # Of bumps near the middle two periods a turn may be a fair picture.
     assert refused >= 3
+
+
+def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
+    end = JointEnd(1, upper=True, views=np.arange(3))
+    for share, unseen in ((0.95, False), (0.985, True), (1.0, True), (1.015, True), (1.5, False)):
+        assert Extrapolation(share, 0.1, end, 1.2, 0.1, 0.5).unseen == unseen
+    told = unseen_beyond(["backlash", "settling"])
+    assert told.startswith("backlash and settling would help") and "less than 2% of the mean square" in told
+    assert _notes({"backlash": told, "settling": told, "mount_drift": "mount_drift does not"}) == (
+        told,
+        "mount_drift does not",
+    )
 
 
 def exchanged(session, name, rivals):

@@ -2,8 +2,10 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.sentences import sentence_of
 
@@ -29,3 +31,21 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
     silent = sentence_of(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
     assert "13.2 µm" in silent and "mrad" not in silent and "repeatability" not in silent
     assert silent.endswith("; a note.")
+
+
+@pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
+def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
+    ranked = SimpleNamespace(score=SimpleNamespace(fitted=False), adjusted=1e-3)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=(SimpleNamespace(name="settling", ranked=ranked, cross_validation=None),),
+        residual_rms=0.0132,
+        noise_floor=0.0110,
+        rotation=0.0,
+        translation=0.0,
+        over_nothing=np.log(odds),
+    )
+    found.certain = Diagnosis.certain.fget(found)
+    told = sentence_of(found, "mm", None)
+    assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)

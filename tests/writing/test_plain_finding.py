@@ -2,9 +2,12 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from bench.page_blocks import refused
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.writing.plain_effects import in_words
@@ -42,3 +45,36 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
         found = SimpleNamespace(verdict="adequate", effects=(), smooth=smooth, doubts=())
         assert said in plain_finding(found, "mm")
+
+
+@pytest.mark.parametrize(
+    ("odds", "said"),
+    [(25.0, "Missing in the model: settling"), (4.0, "It is 4 to 1 that"), (0.5, "It is 1 to 2 that")],
+)
+def test_a_name_that_may_be_chance_is_no_statement(odds, said):
+    """20 to 1 over nothing, as over every other name."""
+    candidate = SimpleNamespace(name="settling", cross_validation=None)
+    found = SimpleNamespace(
+        verdict="missing_effect", effects=("settling",), candidates=(candidate,), doubts=(), over_nothing=np.log(odds)
+    )
+    found.certain = Diagnosis.certain.fget(found)
+    told = plain_finding(found, "mm")
+    assert said in told and told.startswith("Perhaps missing") == (odds < 20)
+
+
+@pytest.mark.parametrize(
+    ("inside", "said"), [(0.25, "bring the error from 40 µm to 20 µm"), (1.02, "should be off by 20% less")]
+)
+def test_an_error_that_should_rise_is_no_gain(inside, said):
+    """Of 20 µm of scatter a small effect moves the residual by less than chance does, either way."""
+    left = CrossValidation(inside=inside, heldout=1.0, poses=0.64, poses_sigma=0.1, steadiness=0.9)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=(SimpleNamespace(name="settling", cross_validation=left),),
+        doubts=(),
+        certain=True,
+        residual_rms=0.04,
+    )
+    told = plain_finding(found, "mm")
+    assert said in told and ("bring the error" in told) == (inside < 1)

@@ -40,11 +40,7 @@ def remarks(result: Run) -> list[str]:
             earned = set(grown)
         elif grown:
             clear = max(_clearest(term) for term in result.terms if term.name in grown)
-            out.append(
-                f"{', '.join(grown)}: {clear:.0f} sigmas from zero, but too small for a residual to show."
-                if clear > CLEAR
-                else f"{', '.join(grown)} did not earn a place: the held-out residual did not fall."
-            )
+            out.append(_unseen_in_residuals(", ".join(grown), clear))
     for term in result.terms:
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
@@ -56,6 +52,18 @@ def remarks(result: Run) -> list[str]:
                 else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
             )
     return out
+
+
+def _unseen_in_residuals(names: str, clear: float) -> str:
+    """Of effects without which the held-out residual was no larger, so many sigmas from zero."""
+    if clear > CLEAR:
+        return f"{names}: {clear:.0f} sigmas from zero, but too small for a residual to show."
+    if clear < FAINT:
+        return f"{names} did not earn a place: the held-out residual did not fall."
+    return (
+        f"{names}: the held-out residual did not fall, and {clear:.1f} sigmas from zero may be chance; a diagnosis of "
+        "the model without says whether the poses of views left out want it."
+    )
 
 
 def _clearest(term: Term) -> float:

@@ -10,7 +10,7 @@ from stitch.diagnosis.selection.exchange import likelier_beyond
 from stitch.diagnosis.selection.ranking import Ranked, certain, conditioned, rank, ranked_one, without
 from stitch.diagnosis.thresholds import AT_ONCE, TRIED
 from stitch.diagnosis.validation.cross_validation import cross_validate
-from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
+from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate, unseen_beyond
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import parallel
 
@@ -34,7 +34,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     does the same and is likelier to hold beyond.
     """
     every, gone = [c for c in candidates if not c.empirical], set[str]()
-    candidates = every
+    candidates, unseen = every, list[str]()
     chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
@@ -43,6 +43,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         if erring:
             name = max(erring, key=lambda name: erring[name].share)
             refused[name], instead = erring[name].objection(name), list[Ranked]()
+            unseen += [name] if erring[name].unseen else []
         elif (
             exchange := likelier_beyond(linear, [c for c in every if c.name not in gone], chosen, beyond)
         ) is not None:
@@ -51,6 +52,8 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
             refused[name] = exchange.objection
             gone.add(name)
         else:
+            unseen = [name for name in unseen if name in refused]
+            refused |= dict.fromkeys(unseen, unseen_beyond(unseen))
             return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
         candidates = [c for c in candidates if c.name != name]
         chosen = _grown(linear, candidates, [*(r for r in chosen if r.name != name), *instead])

@@ -39,6 +39,11 @@ class Ranked:
         """True for an effect of the library or a user's own; False for a shape without a cause."""
         return not self.score.candidate.empirical
 
+    @property
+    def over_nothing(self) -> float:
+        """Log odds over nothing being missing."""
+        return self.log_posterior - float(np.log(PRIOR_NOTHING))
+
 
 def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """Physical and empirical candidates, best first; posterior shares among all and nothing.

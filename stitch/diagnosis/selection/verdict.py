@@ -1,6 +1,6 @@
 """The verdict: which effect is named, which cannot be told apart, whether something unknown is there, or nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,7 +59,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if linear.measurement.views.count >= MANY_VIEWS:
         effects, refused, other = _at_once(linear, candidates, best, stray)
         if not effects:
-            rest = replace(adequate, notes=tuple(refused.values()))
+            rest = replace(adequate, notes=_notes(refused))
             return replace(rest, verdict="unknown_effect") if other else _without_name(linear, limit, rest)
         best, *others = effects
         second = others[0] if others else None
@@ -70,7 +70,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
             return unknown
         others = [second]
     if not _wanted(linear, best, others):
-        return replace(unknown, notes=(*refused.values(), _UNWANTED.format(best.name)))
+        return replace(unknown, notes=(*_notes(refused), _UNWANTED.format(best.name)))
     if _order_open(base, best, empirical):
         return unknown
     likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
@@ -81,7 +81,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         if two is not None:
             return replace(adequate, verdict="missing_effect", named=two[:1], second=two[1])
     verdict = "missing_effect" if len(group) == 1 else "cannot_tell"
-    return Selection(verdict, group, ranked, empirical, second, tuple(refused.values()))
+    return Selection(verdict, group, ranked, empirical, second, _notes(refused))
 
 
 def _at_once(
@@ -97,6 +97,11 @@ def _at_once(
     if linear.pose_errors is None:
         effects, idle = worth_adding(linear, effects, sum(not c.empirical for c in candidates))
     return effects, found.refused | idle, False
+
+
+def _notes(refused: Mapping[str, str]) -> tuple[str, ...]:
+    """Why effects that explain much are not named; what speaks against several is said once."""
+    return tuple(dict.fromkeys(refused.values()))
 
 
 def _none_alone(

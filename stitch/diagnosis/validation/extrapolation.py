@@ -6,11 +6,13 @@ right effect takes away what hid another at some end and makes that one a little
 and is far off at others. So a further end must be likely to become better, the ends being samples of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from stitch.diagnosis.score import Score
+from stitch.diagnosis.thresholds import WORTH
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import Prior
@@ -45,6 +47,11 @@ class Extrapolation:
         """True if an end is predicted worse by more than a standard error."""
         return self.worst_share > 1 + self.worst_sigma
 
+    @property
+    def unseen(self) -> bool:
+        """True if the ends together are as well predicted with the effect as without."""
+        return WORTH <= self.share <= 1 / WORTH
+
     def objection(self, name: str) -> str:
         """What speaks against an effect that explains much."""
         return (
@@ -53,6 +60,14 @@ class Extrapolation:
             f"{self.worst_share:.2f} ± {self.worst_sigma:.2f} in {self.worst.name}; a further end would become better "
             f"with a probability of {self.likely:.0%}"
         )
+
+
+def unseen_beyond(names: Sequence[str]) -> str:
+    """What speaks against effects of which the ends together tell nothing."""
+    return (
+        f"{' and '.join(names)} would help among the poses that were measured, but not beyond: by less than "
+        f"{1 - WORTH:.0%} of the mean square error at all ends of joints' ranges that are left out"
+    )
 
 
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
