@@ -81,7 +81,7 @@ def _diagnosed(state: State) -> Diagnosis:
         implausible=beyond,
         unnamed=unnamed,
         curves=curves,
-        over_nothing=selection.named[0].over_nothing if selection.named else np.inf,
+        over_nothing=selection.over_nothing,
         within=within,
         of_field=of_field,
         smooth=smooth or (scanner_error(linear) if unknown else None),

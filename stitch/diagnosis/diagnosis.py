@@ -70,7 +70,7 @@ class Diagnosis:
     @property
     def certain(self) -> bool:
         """False where a name is less than 20 to 1 likelier than nothing being missing."""
-        return self.verdict != "missing_effect" or self.over_nothing > ODDS
+        return self.over_nothing > ODDS
 
     @property
     def time_curve(self) -> TimeCurve | None:

@@ -123,9 +123,9 @@ def _lack(d: Diagnosis) -> str:
 
 
 def odds_text(log_odds: float) -> str:
-    """3 to 1, or 1 to 3."""
-    likelier = float(np.exp(abs(log_odds)))
-    return f"{likelier:.2g} to 1" if log_odds >= 0 else f"1 to {likelier:.2g}"
+    """3 to 1, or 1 to 3; nobody can vouch for more than a hundred."""
+    likelier = f"{np.exp(abs(log_odds)):.2g}" if abs(log_odds) < np.log(99.5) else "more than 100"
+    return f"{likelier} to 1" if log_odds >= 0 else f"1 to {likelier}"
 
 
 def amounts_of(ranked: Ranked, at_most: int = 3) -> str:

@@ -33,6 +33,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "time_law": None if d.time_curve is None else _time_curve(d.time_curve),
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
+        "log_odds_over_nothing": d.over_nothing if np.isfinite(d.over_nothing) else None,
         "notes": list(d.notes),
         "doubts": list(d.doubts),
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),

@@ -5,7 +5,7 @@ Terminal, page, recording and review all say it so; the diagnosis' own sentence 
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import odds_text
-from stitch.diagnosis.thresholds import FALL
+from stitch.diagnosis.thresholds import FALL, WORTH
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.doubt_headline import doubt_headline
@@ -37,7 +37,7 @@ def _finding(found: Diagnosis, length_unit: str) -> str:
             return f"Something is missing in the model that no effect of the library explains{_where(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
     missing = "Missing in the model" if found.certain else "Perhaps missing in the model"
-    doubt = "" if found.certain else f" It is {odds_text(found.over_nothing)} that this is more than chance."
+    doubt = "" if found.certain else f" The odds that it is more than chance are {odds_text(found.over_nothing)}."
     if validation is None:
         return f"{missing}: {named}.{doubt}"
     return f"{missing}: {named}.{doubt} {_gain(found.residual_rms, validation, length_unit)}"
@@ -50,9 +50,12 @@ def _gain(residual_rms: float, validation: CrossValidation, length_unit: str) ->
     before, after = (length_text(rms, length_unit) for rms in (residual_rms, share * residual_rms))
     if share < FALL:
         return f"Adding it should bring the error from {before} to {after} (rms)."
+    small = f"It is too small for the error to show ({before} now, {after} with it, rms)"
+    if validation.poses > WORTH:
+        return f"{small}."
     return (
-        f"It is too small for the error to show ({before} now, {after} with it, rms), but the poses of views left out "
-        f"should be off by {1 - validation.poses**0.5:.0%} less."
+        f"{small}, but views left out should be predicted about {1 - validation.poses**0.5:.0%} better, in units of "
+        "their scatter."
     )
 
 

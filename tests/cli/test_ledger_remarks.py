@@ -19,7 +19,8 @@ def with_effect(sigmas: float, heldout: float) -> SimpleNamespace:
     [
         (9.0, 0.5, None),
         (9.0, 1.01, "9 sigmas from zero, but too small"),
-        (3.8, 1.01, "3.8 sigmas from zero may be chance"),
+        (3.8, 1.01, "did not fall, and the clearest number is 3.8 sigmas"),
+        (3.8, 1.2, "residual rose, and"),
         (1.0, 1.01, "did not earn a place"),
     ],
 )

@@ -56,8 +56,8 @@ def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
     end = JointEnd(1, upper=True, views=np.arange(3))
     for share, unseen in ((0.95, False), (0.985, True), (1.0, True), (1.015, True), (1.5, False)):
         assert Extrapolation(share, 0.1, end, 1.2, 0.1, 0.5).unseen == unseen
-    told = unseen_beyond(["backlash", "settling"])
-    assert told.startswith("backlash and settling would help") and "less than 2% of the mean square" in told
+    told = unseen_beyond(["backlash", "mount_warmup", "settling"])
+    assert told.startswith("backlash, mount_warmup and settling would help") and "less than 2% together" in told
     assert _notes({"backlash": told, "settling": told, "mount_drift": "mount_drift does not"}) == (
         told,
         "mount_drift does not",

@@ -4,7 +4,7 @@ from rich.table import Table
 
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
-from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL
+from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL, RISE
 from stitch.model.term import Term
 from stitch.runs.run import Run
 from stitch.system.console import console
@@ -40,7 +40,8 @@ def remarks(result: Run) -> list[str]:
             earned = set(grown)
         elif grown:
             clear = max(_clearest(term) for term in result.terms if term.name in grown)
-            out.append(_unseen_in_residuals(", ".join(grown), clear))
+            rose = after.heldout_rms > RISE * before.heldout_rms
+            out.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
     for term in result.terms:
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
@@ -54,15 +55,15 @@ def remarks(result: Run) -> list[str]:
     return out
 
 
-def _unseen_in_residuals(names: str, clear: float) -> str:
-    """Of effects without which the held-out residual was no larger, so many sigmas from zero."""
+def _unseen_in_residuals(names: str, clear: float, residual: str) -> str:
+    """Of effects with which the held-out residual is no smaller, the clearest number so many sigmas from zero."""
     if clear > CLEAR:
         return f"{names}: {clear:.0f} sigmas from zero, but too small for a residual to show."
     if clear < FAINT:
-        return f"{names} did not earn a place: the held-out residual did not fall."
+        return f"{names} did not earn a place: the held-out residual {residual}."
     return (
-        f"{names}: the held-out residual did not fall, and {clear:.1f} sigmas from zero may be chance; a diagnosis of "
-        "the model without says whether the poses of views left out want it."
+        f"{names}: the held-out residual {residual}, and the clearest number is {clear:.1f} sigmas from zero; a "
+        "diagnosis of the model without it asks the poses of views left out whether it is there."
     )
 
 

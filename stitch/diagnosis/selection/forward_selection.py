@@ -34,7 +34,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     does the same and is likelier to hold beyond.
     """
     every, gone = [c for c in candidates if not c.empirical], set[str]()
-    candidates, unseen = every, list[str]()
+    candidates, unseen = every, set[str]()
     chosen, refused = _grown(linear, candidates, [best]), dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
@@ -43,7 +43,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         if erring:
             name = max(erring, key=lambda name: erring[name].share)
             refused[name], instead = erring[name].objection(name), list[Ranked]()
-            unseen += [name] if erring[name].unseen else []
+            (unseen.add if erring[name].unseen else unseen.discard)(name)
         elif (
             exchange := likelier_beyond(linear, [c for c in every if c.name not in gone], chosen, beyond)
         ) is not None:
@@ -51,9 +51,10 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
             refused.pop(exchange.instead.name, None)  # it erred beside the one that gives way
             refused[name] = exchange.objection
             gone.add(name)
+            unseen -= {name, exchange.instead.name}
         else:
-            unseen = [name for name in unseen if name in refused]
-            refused |= dict.fromkeys(unseen, unseen_beyond(unseen))
+            if len(unseen) > 1:
+                refused |= dict.fromkeys(unseen, unseen_beyond(sorted(unseen)))
             return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
         candidates = [c for c in candidates if c.name != name]
         chosen = _grown(linear, candidates, [*(r for r in chosen if r.name != name), *instead])

@@ -39,6 +39,11 @@ class Selection:
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
     unnamed: tuple[Unnamed, ...] | None = None  # what repeats without a name; None where the verdict asked for none
 
+    @property
+    def over_nothing(self) -> float:
+        """Log odds of a single name over nothing being missing; infinite where none is given."""
+        return self.named[0].over_nothing if self.verdict == "missing_effect" else np.inf
+
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
     """Name what is missing, or abstain."""

@@ -65,8 +65,8 @@ class Extrapolation:
 def unseen_beyond(names: Sequence[str]) -> str:
     """What speaks against effects of which the ends together tell nothing."""
     return (
-        f"{' and '.join(names)} would help among the poses that were measured, but not beyond: by less than "
-        f"{1 - WORTH:.0%} of the mean square error at all ends of joints' ranges that are left out"
+        f"{', '.join(names[:-1])} and {names[-1]} would help among the poses that were measured, but not beyond: ends "
+        f"of joints' ranges that are left out change by less than {1 - WORTH:.0%} together, for better or worse"
     )
 
 
