@@ -69,7 +69,7 @@ class Diagnosis:
 
     @property
     def certain(self) -> bool:
-        """False where a name is less than 20 to 1 likelier than nothing being missing."""
+        """False where a name, or a group, is less than 20 to 1 likelier than nothing being missing."""
         return self.over_nothing > ODDS
 
     @property

@@ -24,11 +24,15 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
     if d.verdict == "missing_effect":
         return _missing(d, length_unit, now, floor, second)
     if d.verdict == "cannot_tell":
-        names = " or ".join(d.effects)
-        return f"Something is missing ({now} remain, noise {floor}), but these views cannot tell {names} apart" + (
-            f"; {d.next[0].do}." if d.next else "."
-        )
+        return _not_told_apart(d, now, floor)
     return _unknown(d, length_unit, now, floor, scatter)
+
+
+def _not_told_apart(d: Diagnosis, now: str, floor: str) -> str:
+    missing = "is missing" if d.certain else "may be missing"
+    start = f"Something {missing} ({now} remain, noise {floor}{_chance(d)})"
+    then = f"; {d.next[0].do}." if d.next else "."
+    return f"{start}, but these views cannot tell {' or '.join(d.effects)} apart{then}"
 
 
 def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranked | None) -> str:
@@ -42,11 +46,15 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranke
         gain = f"; adding it should leave about {left}, {out} on views left out"
     more = f" {second.name} seems to be there too." if second else ""
     missing = "is missing" if d.certain else "may be missing"
-    chance = "" if d.certain else f", {odds_text(d.over_nothing)} that it is more than chance"
     return (
-        f"{name} {missing} ({amounts}; p = {candidate.ranked.adjusted:.1g}{chance}): {now} remain where noise "
+        f"{name} {missing} ({amounts}; p = {candidate.ranked.adjusted:.1g}{_chance(d)}): {now} remain where noise "
         f"would leave {floor}{gain}.{more}"
     )
+
+
+def _chance(d: Diagnosis) -> str:
+    """How much likelier than chance it is, where that is little."""
+    return "" if d.certain else f", {odds_text(d.over_nothing)} that it is more than chance"
 
 
 def _unknown(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:

@@ -28,16 +28,17 @@ def plain_finding(found: Diagnosis, length_unit: str) -> str:
 def _finding(found: Diagnosis, length_unit: str) -> str:
     """What is missing, and how far the error should fall with it."""
     named = " or ".join(in_words(name) for name in found.effects)
+    doubt = "" if found.certain else f" The odds that it is more than chance are {odds_text(found.over_nothing)}."
     match found.verdict:
         case "adequate":
             return f"No effect is found missing: {_rest(found.smooth, length_unit)} explain what is left."
         case "cannot_tell":
-            return f"Something is missing in the model, and these views cannot tell whether it is {named}."
+            something = "Something is" if found.certain else "Something may be"
+            return f"{something} missing in the model, and these views cannot tell whether it is {named}.{doubt}"
         case "unknown_effect":
             return f"Something is missing in the model that no effect of the library explains{_where(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
     missing = "Missing in the model" if found.certain else "Perhaps missing in the model"
-    doubt = "" if found.certain else f" The odds that it is more than chance are {odds_text(found.over_nothing)}."
     if validation is None:
         return f"{missing}: {named}.{doubt}"
     return f"{missing}: {named}.{doubt} {_gain(found.residual_rms, validation, length_unit)}"

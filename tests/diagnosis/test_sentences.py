@@ -7,7 +7,8 @@ import pytest
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.plausible_scatter import ScatterLimit
-from stitch.diagnosis.sentences import sentence_of
+from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.sentences import odds_text, sentence_of
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
@@ -49,3 +50,39 @@ def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     found.certain = Diagnosis.certain.fget(found)
     told = sentence_of(found, "mm", None)
     assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)
+
+
+@pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])
+def test_so_may_a_group(odds, said):
+    found = SimpleNamespace(
+        verdict="cannot_tell",
+        effects=("settling", "backlash"),
+        next=(),
+        residual_rms=0.0132,
+        noise_floor=0.0110,
+        rotation=0.0,
+        translation=0.0,
+        over_nothing=np.log(odds),
+    )
+    found.certain = Diagnosis.certain.fget(found)
+    told = sentence_of(found, "mm", None)
+    assert told.startswith(said) and ("4 to 1 that it is more than chance" in told) == (odds < 20)
+    assert told.endswith("cannot tell settling or backlash apart.")
+
+
+def test_of_a_group_one_is_enough():
+    """Odds add up: two at 10 to 1 each are 20 to 1 that one is there."""
+    each = SimpleNamespace(over_nothing=np.log(10.0))
+    group = Selection("cannot_tell", (each, each), (), ())
+    assert group.over_nothing == pytest.approx(np.log(20.0))
+    assert Selection("adequate", (), (), ()).over_nothing == np.inf
+
+
+def test_odds_are_told_as_far_as_anybody_can_vouch_for_them():
+    assert [odds_text(np.log(x)) for x in (4.0, 0.5, 1e4, 1e-4)] == [
+        "4 to 1",
+        "1 to 2",
+        "more than 100 to 1",
+        "1 to more than 100",
+    ]
+    assert odds_text(-np.inf) == "1 to more than 100"

@@ -43,7 +43,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     same = FieldError(0.017, 0.0, 9.0, over_noise=False)
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
-        found = SimpleNamespace(verdict="adequate", effects=(), smooth=smooth, doubts=())
+        found = SimpleNamespace(verdict="adequate", effects=(), smooth=smooth, doubts=(), certain=True)
         assert said in plain_finding(found, "mm")
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit, implausible
@@ -41,8 +42,9 @@ class Selection:
 
     @property
     def over_nothing(self) -> float:
-        """Log odds of a single name over nothing being missing; infinite where none is given."""
-        return self.named[0].over_nothing if self.verdict == "missing_effect" else np.inf
+        """Log odds of the name, or of one of the group, over nothing being missing; infinite where none is given."""
+        odds = [r.over_nothing for r in self.named]
+        return float(logsumexp(odds)) if odds else np.inf
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Selection:
