@@ -7,13 +7,11 @@ rad and mm. Sizes are about 0.15 mrad or 0.05 mm rms, what a good arm is off by.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_synth import kinematics
-from data_synth.law_sizes import clock, joint_with, of_base_frame, of_flange, of_joint, torque_of
+from data_synth.law_sizes import Array, clock, joint_with, of_base_frame, of_flange, of_joint, torque_of
 from data_synth.moment import Plan
 
-Array = NDArray[np.float64]
 _FOOT = 250.0  # mm from a base's middle to its anchor bolts
 
 
@@ -22,7 +20,7 @@ def flank_change(plan: Plan, rng: np.random.Generator) -> Array:
     torque = torque_of(plan)
     i = joint_with(plan, np.ptp(torque, axis=0), rng)
     load = torque[:, i] - np.quantile(torque[:, i], rng.uniform(0.3, 0.7))
-    return of_joint(plan, i, np.tanh(load / (rng.uniform(0.15, 0.4) * load.std())))
+    return of_joint(plan, i, np.tanh(load / (rng.uniform(0.15, 0.4) * max(float(load.std()), 1e-12))))
 
 
 def softening_belt(plan: Plan, rng: np.random.Generator, time: Array | None = None) -> Array:

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from data_synth import kinematics
 from data_synth.law_sizes import (
     SHIFT,
     SIZE,
+    Array,
     clock,
     joint_with,
     of_base_frame,
@@ -24,7 +24,6 @@ from data_synth.law_sizes import (
 )
 from data_synth.moment import Plan
 
-Array = NDArray[np.float64]
 _KNOTS = 3  # of a correction table, along either joint
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME
+from data_synth.foreign_laws import FOREIGN
 from data_synth.moment import Plan
 from tests.data_synth.law_plans import VIEWS, plan_of
 
@@ -11,17 +11,6 @@ from tests.data_synth.law_plans import VIEWS, plan_of
 def drawn(law: str, plan: Plan, seed: int, **time: np.ndarray) -> np.ndarray:
     """Errors of one arm."""
     return FOREIGN[law](plan, np.random.default_rng(seed), **time)
-
-
-def test_what_follows_time_follows_it_and_not_the_joints():
-    one, other = plan_of("UR10"), plan_of("KUKA KR30-3")
-    for law in FOREIGN_IN_TIME:
-        assert np.array_equal(drawn(law, one, 2), drawn(law, other, 2))
-    pauses = np.cumsum(np.random.default_rng(0).uniform(0.5, 3.0, VIEWS))
-    for law in (*FOREIGN_IN_TIME, "softening_belt"):
-        late = drawn(law, one, 2, time=pauses)
-        assert np.isfinite(late).all() and not np.array_equal(late, drawn(law, one, 2))
-        assert np.allclose(late, drawn(law, one, 2, time=pauses + 100.0))
 
 
 def test_a_loose_anchor_leaves_the_base_where_the_arm_leans_away():

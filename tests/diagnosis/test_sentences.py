@@ -34,29 +34,13 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
     assert silent.endswith("; a note.")
 
 
-@pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
-def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
+def said_at(odds: float, verdict: str, *effects: str) -> str:
+    """What is said of effects at such odds over nothing."""
     ranked = SimpleNamespace(score=SimpleNamespace(fitted=False), adjusted=1e-3)
     found = SimpleNamespace(
-        verdict="missing_effect",
-        effects=("settling",),
-        candidates=(SimpleNamespace(name="settling", ranked=ranked, cross_validation=None),),
-        residual_rms=0.0132,
-        noise_floor=0.0110,
-        rotation=0.0,
-        translation=0.0,
-        over_nothing=np.log(odds),
-    )
-    found.certain = Diagnosis.certain.fget(found)
-    told = sentence_of(found, "mm", None)
-    assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)
-
-
-@pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])
-def test_so_may_a_group(odds, said):
-    found = SimpleNamespace(
-        verdict="cannot_tell",
-        effects=("settling", "backlash"),
+        verdict=verdict,
+        effects=effects,
+        candidates=[SimpleNamespace(name=name, ranked=ranked, cross_validation=None) for name in effects],
         next=(),
         residual_rms=0.0132,
         noise_floor=0.0110,
@@ -65,7 +49,18 @@ def test_so_may_a_group(odds, said):
         over_nothing=np.log(odds),
     )
     found.certain = Diagnosis.certain.fget(found)
-    told = sentence_of(found, "mm", None)
+    return sentence_of(found, "mm", None)
+
+
+@pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
+def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
+    told = said_at(odds, "missing_effect", "settling")
+    assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)
+
+
+@pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])
+def test_so_may_a_group(odds, said):
+    told = said_at(odds, "cannot_tell", "settling", "backlash")
     assert told.startswith(said) and ("4 to 1 that it is more than chance" in told) == (odds < 20)
     assert told.endswith("cannot tell settling or backlash apart.")
 
