@@ -17,19 +17,18 @@ _HOURS_FROM = 7200.0  # s that are better told in hours than in minutes
 
 
 def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
-    """How far joints are off by no known law as joints turn, with two sigmas."""
+    """How far joints are off by no known law along what they follow, with two sigmas."""
     shown = found.curves[:at_most]
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, c in zip(axes, shown, strict=False):
-        angle, error, sigma = np.degrees(c.angle), 1e3 * c.error, 1e3 * c.sigma
-        ax.fill_between(angle, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
-        ax.plot(angle, error, color=BLUE)
-        stood = np.degrees(c.stood)
-        ax.plot(stood, np.zeros(len(stood)), "|", color="k", ms=8)
+        error, sigma = 1e3 * c.error, 1e3 * c.sigma
+        ax.fill_between(c.at, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
+        ax.plot(c.at, error, color=BLUE)
+        ax.plot(c.stood, np.zeros(len(c.stood)), "|", color="k", ms=8)
         ax.axhline(0, color="k", lw=0.6)
         ax.set_title(f"{c.share:.0%} of it", fontsize=9)
-        ax.set(xlabel=covariate(c.name), ylabel=f"joint {c.joint} off by (mrad)")
+        ax.set(xlabel=covariate(c.covariate), ylabel=f"joint {c.joint} off by (mrad)")
     return plain(figure)
 
 

@@ -3,6 +3,8 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+_UNITS = (("_deg", "°"), ("_c", "°C"), ("_percent", "%"), ("_s", "s"), ("_nm", "N m"), ("_nm_per_kg", "N m/kg"))
+
 
 def plain(figure: Figure) -> Figure:
     """No frame at the top and on the right."""
@@ -19,7 +21,7 @@ def above(axes: Axes) -> None:
 
 def covariate(name: str) -> str:
     """A covariate with its unit in brackets: j2_deg → j2 (°)."""
-    for ending, unit in (("_deg", "°"), ("_c", "°C"), ("_percent", "%"), ("_s", "s")):
+    for ending, unit in _UNITS:
         if name.endswith(ending):
             return f"{name.removesuffix(ending)} ({unit})".replace("_", " ")
     return name.replace("_", " ")

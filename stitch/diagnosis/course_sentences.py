@@ -1,7 +1,5 @@
 """What errs by no known law in words: where in the range of a joint, when in the session."""
 
-import numpy as np
-
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
@@ -29,8 +27,19 @@ def curve_text(curve: JointCurve) -> str:
 
 
 def _where(curve: JointCurve, k: int) -> str:
-    there = f"{np.degrees(curve.angle[k]):.0f}°"
-    return f"after a move of {there}" if curve.of_move else f"at j{curve.along} = {there}"
+    """At j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each kg."""
+    there, name = curve.at[k], curve.covariate
+    match name.split("_", 1)[-1]:
+        case "move_deg":
+            return f"after a move of {there:.0f}°"
+        case "deg":
+            return f"at {name.removesuffix('_deg')} = {there:.0f}°"
+        case "s":
+            return f"{duration_text(there - curve.stood.min())} into the session"
+        case "view":
+            return f"at view {there:.0f}"
+    load = rounded(there, 0.1 * (curve.at[-1] - curve.at[0]))
+    return f"under {load} N m" + (" of each kg" if name.endswith("_per_kg") else "")
 
 
 def time_curve_text(curve: TimeCurve, length_unit: str) -> str:

@@ -38,15 +38,28 @@ def alike_closely(some: Array, others: Array) -> Array:
     return np.asarray(2 * alike_joint_by_joint(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1)
 
 
+def alike_in_waves(some: Array, others: Array, period: float) -> Array:
+    """(S, O) of a function of one joint's angle, (S,) and (O,) rad, that repeats after a period, rad; smooth within it
+    (MacKay 1998)."""
+    phase = np.pi * (some[:, None] - others[None, :]) / period
+    return np.asarray(np.exp(-2 * np.sin(phase) ** 2))
+
+
+def alike_in_two(one: Array, other: Array) -> Array:
+    """(V, V) of a smooth function of the angles of two joints, (V,) rad each."""
+    both = np.column_stack([one, other])
+    return np.asarray((2 * alike_joint_by_joint(both, both) - 1).prod(axis=2))
+
+
 def alike_in_way(joint: Array, came: Array) -> Array:
     """(V, V) of a function of one joint's angle (V,) rad, smooth, and of how far it came, (V,) rad, by any law:
     continuous and no more (Ornstein–Uhlenbeck, over the range of the joint), as play, friction and settling are.
     """
-    return np.asarray(alike_in_joints(joint[:, None]) * alike_in_move(came, came, reach_of_way(joint)))
+    return np.asarray(alike_in_joints(joint[:, None]) * alike_within(came, came, reach_of_way(joint)))
 
 
-def alike_in_move(some: Array, others: Array, reach: float) -> Array:
-    """(S, O) of a continuous function of how far a joint came, (S,) and (O,) rad."""
+def alike_within(some: Array, others: Array, reach: float) -> Array:
+    """(S, O) of a continuous function of one number, (S,) and (O,), alike as far as `reach`."""
     return alike_in_time(some, reach, others)
 
 
@@ -82,23 +95,26 @@ def same_stop(T_base_flange: Array) -> Mask:
 
 @dataclass(frozen=True)
 class SmoothErrors:
-    """Errors f_k(view)·column_k of all views by a joint k, with smooth processes f_k that nobody wrote down."""
+    """Errors f_p(view)·column_p of all views by a joint, with smooth processes f_p that nobody wrote down; a joint may
+    have several, of which one is there."""
 
     columns: Array  # (6V, P) twists of the views per unit of each process
     alike: Array  # (V, V) covariance of each, or (P, V, V) where they differ
     joints: tuple[int, ...]  # (P,) that each is of, counted from 0
+    others: tuple[int, ...] = ()  # (P,) whose angle it follows beside the joint's own, counted from 0; () if none
+    periods: tuple[float, ...] = ()  # (P,) after which it repeats, rad; () if it does not
 
-    def of(self, joint: int) -> Array:
-        """(6V, 6V) covariance of the twists by one joint alone."""
-        return spread_over(self.column_of(joint)[:, None], self.alike_of(joint))
+    def of_joint(self, joint: int) -> list[int]:
+        """The processes of a joint, counted from 0."""
+        return [p for p, own in enumerate(self.joints) if own == joint]
 
-    def column_of(self, joint: int) -> Array:
-        """(6V,) twists of the views per unit of its process."""
-        return np.asarray(self.columns[:, self.joints.index(joint)])
+    def of(self, process: int) -> Array:
+        """(6V, 6V) covariance of the twists by one process alone."""
+        return spread_over(self.columns[:, [process]], self.alike_of(process))
 
-    def alike_of(self, joint: int) -> Array:
-        """(V, V) covariance of its process."""
-        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[self.joints.index(joint)])
+    def alike_of(self, process: int) -> Array:
+        """(V, V) covariance of a process."""
+        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[process])
 
 
 def spread_over(columns: Array, alike: Array) -> Array:

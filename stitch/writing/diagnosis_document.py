@@ -46,9 +46,9 @@ def _curve(curve: JointCurve) -> dict[str, Any]:
     """Where in the range or by which move a joint errs by no known law; angles in degrees, errors in rad."""
     return {
         "joint": curve.joint,
-        "covariate": curve.name,
+        "covariate": curve.covariate,
         "share": curve.share,
-        "angle_deg": np.degrees(curve.angle).tolist(),
+        "at": curve.at.tolist(),
         "error": curve.error.tolist(),
         "sigma": curve.sigma.tolist(),
     }

@@ -1,19 +1,23 @@
 """Which joint errs by a law without a name: told where it is one joint, and not told where it is all of them."""
 
+import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
 
 from data_synth import kinematics
 from data_synth.ordinary_arm import draw_arm, with_memory
-from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
+from stitch.diagnosis.course_sentences import curve_text
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, some_law
-from stitch.observations.pose_errors import THE_WAY
+from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_by, some_law
+from stitch.observations.flange_errors import usual_step
+from stitch.observations.pose_errors import ITS_LOAD, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
 from tests.diagnosis.freed_blade import freed_blade
 
 
@@ -29,13 +33,12 @@ def with_joints_off(cell, off):
 
 
 def test_a_joint_is_told_where_all_of_them_together_explain_no_more(cell):
-    """Friction in joint 5: beside what all joints and links may do its law is not 20 to 1 likelier than none."""
-    off = 2 * UNNAMED["hysteresis"](cell.measured.plan, np.random.default_rng(0))
-    (joint,) = np.flatnonzero(np.ptp(off, axis=0)) + 1
+    """One that goes with its own angle: beside what all joints and links may do its law is not 20 to 1 likelier."""
+    off = np.zeros_like(cell.measured.plan.joints)
+    off[:, 4] = 3e-4 * np.sin(2 * cell.measured.plan.joints[:, 4])
     linear = with_joints_off(cell, off)
-    beside = joint_laws(linear)
-    assert beside[0].log_bayes_factor < ODDS + np.log(len(beside))
-    assert [law.joint for law in clear_laws(linear)] == [joint]
+    assert joint_laws(linear)[0].log_bayes_factor < ODDS
+    assert [law.joint for law in clear_laws(linear)] == [5]
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
@@ -67,8 +70,88 @@ def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
     laws = clear_laws(with_joints_off(cell, off))
     assert [(law.joint, law.follows) for law in laws] == [(5, THE_WAY)]
     course = joint_curves(laws)[0]
-    true = 4e-4 * np.tanh(4 * course.angle) - off[:, 4].mean()
-    assert (course.name, course.of_move) == ("j5_move_deg", True)
-    np.testing.assert_allclose(course.stood, move[:, 4])
+    true = 4e-4 * np.tanh(4 * np.radians(course.at)) - off[:, 4].mean()
+    assert course.covariate == "j5_move_deg"
+    np.testing.assert_allclose(course.stood, np.degrees(move[:, 4]))
     assert np.all(np.abs(course.error - true) < 3 * course.sigma)
     assert all(a <= b + 1e-5 for a, b in pairwise(course.error)) and np.ptp(course.error) > 0.6 * np.ptp(true)
+
+
+def test_two_joints_that_drag_each_other_are_told_by_the_two_angles(cell):
+    """The law is the likeliest of all kinds, and of the joint's partners it is the true one; courses along both."""
+    q = cell.measured.plan.joints
+    off = np.zeros_like(q)
+    off[:, 2] = 3e-4 * np.sin(q[:, 2]) * np.sin(2 * q[:, 4])
+    (law,) = clear_laws(with_joints_off(cell, off))
+    assert (law.joint, law.follows, law.errors.others[law.process]) == (3, TWO_ANGLES, 4)
+    curves = joint_curves([law])
+    assert {c.covariate for c in curves} <= {"j3_deg", "j5_deg"} and curves[0].covariate == "j5_deg"
+
+
+def test_what_a_joint_does_by_two_angles_is_the_mean_over_its_partners(cell):
+    """By hand from each partner's own law; and a function of two angles falls off as the product of both."""
+    q = cell.measured.plan.joints
+    off = np.zeros_like(q)
+    off[:, 3] = 2e-4 * np.sin(q[:, 1])
+    linear = with_joints_off(cell, off)
+    smooth = linear.pose_errors.of_one_joint[TWO_ANGLES]
+    factors = []
+    for p in smooth.of_joint(3):
+        own = replace(smooth, joints=(3,), columns=smooth.columns[:, [p]], alike=smooth.alike[[p]])
+        errors = replace(linear.pose_errors, of_one_joint={TWO_ANGLES: own})
+        (law,) = laws_by(replace(linear, pose_errors=errors), [TWO_ANGLES])
+        factors.append(np.exp(law.log_bayes_factor))
+    whole = next(law for law in laws_by(linear, [TWO_ANGLES]) if law.joint == 4)
+    assert len(factors) == 5 and np.exp(whole.log_bayes_factor) == pytest.approx(np.mean(factors))
+    apart = 2 * np.sin(0.5 * np.abs(q[0] - q[5]))
+    process = smooth.of_joint(3)[0]
+    alike = smooth.alike_of(process)[0, 5]
+    assert alike == pytest.approx(np.exp(-0.5 * (apart[3] ** 2 + apart[smooth.others[process]] ** 2)))
+
+
+def test_the_teeth_of_a_belt_are_told_as_waves_with_their_period(cell):
+    """A saw of 20° along joint 5: its waves are likelier than any function that changes within a few degrees."""
+    q = cell.measured.plan.joints
+    tooth = np.radians(20.0)
+    off = np.zeros_like(q)
+    off[:, 4] = 6e-4 * (np.mod(q[:, 4] / tooth, 1.0) - 0.5)
+    laws = joint_laws(with_joints_off(cell, off).arm_right)
+    law = laws[0]
+    assert (law.joint, law.follows) == (5, WAVES)
+    # Half a wave more or less over the range looks alike.
+    waves = np.ptp(q[:, 4]) / np.array([tooth, law.errors.periods[law.process]])
+    assert abs(waves[0] - waves[1]) <= 0.5
+    (course,) = joint_curves([law])
+    there = np.radians(course.at)
+    again = np.interp(there[:10] + law.errors.periods[law.process], there, course.error)
+    np.testing.assert_allclose(again, course.error[:10], atol=0.2 * np.ptp(course.error))
+
+
+def test_the_course_in_time_of_a_joint_that_warms_is_the_true_one_within_its_sigma(cell):
+    steps = np.arange(14.0)
+    off = np.zeros_like(cell.measured.plan.joints)
+    off[:, 4] = 8e-4 * (1 - np.exp(-steps / 4.0))
+    (law,) = clear_laws(with_joints_off(cell, off))
+    assert (law.joint, law.follows) == (5, WITH_TIME)
+    (course,) = joint_curves([law])
+    assert course.covariate == "time_s"
+    at = (course.at - course.at.min()) / usual_step(law.model.measurement)
+    true = 8e-4 * (1 - np.exp(-at / 4.0)) - off[:, 4].mean()
+    assert np.all(np.abs(course.error - true) < 4 * course.sigma)
+    assert np.corrcoef(course.error, true)[0, 1] > 0.9
+    assert re.fullmatch(r"Joint 5 is off by -\S+ ± \S+ mrad 0 s into the session, and by .*", curve_text(course))
+
+
+def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_its_sigma(cell):
+    plan, torques = cell.measured.plan, with_joints_off(cell, 0.0).measurement.views.torques
+    load = torques.values[:, torques.names.index("2")]
+    yields = Polynomial.fit(load, (load / np.abs(load).max()) ** 3, 5)
+    off = np.zeros_like(plan.joints)
+    off[:, 1] = 1e-3 * yields(load)
+    laws = joint_laws(with_joints_off(cell, off).arm_right)
+    (course,) = joint_curves([next(law for law in laws if law.joint == 2 and law.follows == ITS_LOAD)])
+    assert course.covariate == "j2_torque_nm"
+    true = 1e-3 * yields(course.at) - off[:, 1].mean()
+    assert np.all(np.abs(course.error - true) < 4 * course.sigma)
+    assert np.corrcoef(course.error, true)[0, 1] > 0.9
+    assert re.search(r" under -?\d+ N m, and by .* under -?\d+ N m, beside", curve_text(course))

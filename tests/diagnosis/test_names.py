@@ -115,8 +115,8 @@ def test_only_joints_that_are_bent_have_a_law_of_their_load(cell):
     _, linear = said_of(cell, cell.measured.T_base_flange)
     law = linear.pose_errors.of_one_joint[ITS_LOAD]
     assert law.joints == (1, 2, 3, 4)
-    for joint in law.joints:
-        np.testing.assert_allclose(np.diag(law.alike_of(joint)), 1)
+    for process in range(4):
+        np.testing.assert_allclose(np.diag(law.alike_of(process)), 1)
 
 
 def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(cell):
@@ -139,7 +139,7 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     free = null_space(linear.mixed.A[0].T).T
     R, usual = free @ linear.observation.channel.reduction, errors.scales[errors.names.index("smooth")]
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
-    own, scales = R @ errors.of_one_joint[law.follows].of(law.joint - 1) @ R.T, np.append(errors.scales, usual)
+    own, scales = R @ law.errors.of(law.process) @ R.T, np.append(errors.scales, usual)
 
     def likely(variances, components):
         covariance = np.tensordot(variances, components, axes=1)
@@ -170,11 +170,12 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
     off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
     course = joint_curves(clear_laws(linear))[0]
-    true = 4e-4 * np.sin(2 * course.angle) - off[:, 2].mean()
-    assert (course.joint, course.name) == (3, "j4_deg") and course.share > 0.9
+    true = 4e-4 * np.sin(2 * np.radians(course.at)) - off[:, 2].mean()
+    assert (course.joint, course.covariate) == (3, "j4_deg") and course.share > 0.9
     assert np.all(np.abs(course.error - true) < 3 * course.sigma)
     # Where views stood the sigma is worth something: a fifth of what there is.
-    inside = course.sigma[(course.angle > np.quantile(q[:, 3], 0.1)) & (course.angle < np.quantile(q[:, 3], 0.9))]
+    low, high = np.degrees(np.quantile(q[:, 3], [0.1, 0.9]))
+    inside = course.sigma[(course.at > low) & (course.at < high)]
     assert inside.max() < 0.2 * np.ptp(true)
 
 
@@ -186,7 +187,7 @@ def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
     off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
     (course,) = joint_curves(clear_laws(linear))
-    true = 4e-4 * np.sin(7 * course.angle) - off[:, 4].mean()
-    assert (course.joint, course.name) == (5, "j5_deg")
+    true = 4e-4 * np.sin(7 * np.radians(course.at)) - off[:, 4].mean()
+    assert (course.joint, course.covariate) == (5, "j5_deg")
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)
     assert np.corrcoef(course.error, true)[0, 1] > 0.9

@@ -7,23 +7,45 @@ explains the views about as well as an effect of the library, these views cannot
 that is off by a function of its own angle that changes within a few degrees, as by a worn tooth or a wave of a gear, or
 by any function of the way it came, as by friction, which is neither play nor settling; or that changes as time passes,
 as where its motor warms, which is no drift of mount or part; or by a law of its load that is not that of a spring.
+
+Where nothing has a name, two more are asked for. A function of all angles holds them, and so does one that changes
+within a few degrees, but with a number of its own in nearly every view: a joint that follows its own angle and one
+other's, as two do that drag each other, and one that errs in waves along its angle, as teeth of gears and belts do.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.form_trial import SCALES
 from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
+from stitch.diagnosis.unknown.process_size import at_likeliest_size
+from stitch.diagnosis.unknown.smooth_processes import with_covariance
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, SMOOTH, THE_WAY, WITH_TIME, PoseErrors
+from stitch.observations.pose_errors import (
+    ALL_ANGLES,
+    ITS_LOAD,
+    OWN_ANGLE,
+    SMOOTH,
+    THE_WAY,
+    TWO_ANGLES,
+    WAVES,
+    WITH_TIME,
+)
+from stitch.statistics.kernels import SmoothErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
+# Of all laws those whose size is sought with all variances.
+_FITTED = 12
+# Kinds of laws that stand against names, and all that are told where nothing has one.
+RIVALS = (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD)
+KINDS = (*RIVALS, TWO_ANGLES, WAVES)
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
@@ -35,24 +57,45 @@ class JointLaw:
     """One joint that follows a law without a name."""
 
     joint: int  # counted from 1
-    follows: str  # ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME or ITS_LOAD
-    log_bayes_factor: float  # over everything else that may be there, at the likeliest size
-    model: LinearModel  # with the law as the last of its pose errors, all sizes fitted
+    follows: str  # ALL_ANGLES, TWO_ANGLES, OWN_ANGLE, WAVES, …
+    process: int  # of that kind; the likeliest, where a joint has several
+    log_bayes_factor: float  # over everything else that may be there, at the likeliest size; their mean, of several
+    base: LinearModel  # without the law
+
+    @property
+    def errors(self) -> SmoothErrors:
+        """Of its kind, of all joints."""
+        assert self.base.pose_errors is not None
+        return self.base.pose_errors.of_one_joint[self.follows]
+
+    @cached_property
+    def model(self) -> LinearModel:
+        """With the law as the last of its pose errors, all sizes fitted."""
+        errors = self.base.pose_errors
+        assert errors is not None
+        own = self.base.reduce(self.base.reduce(self.errors.of(self.process)).T)
+        every = errors.beside(f"joint {self.joint}", own, SMOOTH)
+        mixed = with_errors(self.base.mixed, every)
+        return replace(self.base, mixed=mixed, pose_errors=every, null=_fit(self.base, mixed), whole=None)
+
+    def fitted(self) -> "JointLaw":
+        """With all variances sought anew: what a law explains is no scatter."""
+        return replace(self, log_bayes_factor=0.5 * (self.base.null.deviance - self.model.null.deviance))
 
 
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
-    """What such a law of each joint explains beside a model, likeliest first; () without joints or prior of errors.
+    """What a law of each kind of each joint explains beside a model, likeliest first; () without joints or prior of
+    errors.
 
     Its size is fitted with all others; `some_law` charges it for that.
     """
-    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE))
-    return tuple(sorted(laws, key=lambda law: -law.log_bayes_factor))
+    return tuple(sorted(laws_by(base, KINDS), key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
     """That some joint follows such a law, of any kind, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
-    laws = laws_by(base, (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD))
+    laws = laws_by(base, RIVALS)
     return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
@@ -64,33 +107,48 @@ def some_law(log_bayes_factors: Array) -> Array:
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints, of every kind; usual size."""
+    """(n, n) in the channel of the laws of all joints that stand against names; usual size."""
     errors = base.pose_errors
-    if errors is None or not errors.of_one_joint:
-        return []
-    every = [smooth.of(k) for smooth in errors.of_one_joint.values() for k in smooth.joints]
-    return [SMOOTH**2 * base.reduce(base.reduce(law).T) for law in every]
+    of_one_joint = {} if errors is None else errors.of_one_joint
+    rivals = [of_one_joint[kind] for kind in RIVALS if kind in of_one_joint]
+    return [
+        SMOOTH**2 * base.reduce(base.reduce(smooth.of(p)).T) for smooth in rivals for p in range(len(smooth.joints))
+    ]
 
 
 def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
-    """Of every joint, by each of these kinds that the views tell of."""
-    errors = base.pose_errors
-    if errors is None or not errors.of_one_joint:
-        return []
-    found = list[JointLaw]()
-    for follows in (kind for kind in kinds if kind in errors.of_one_joint):
-        smooth = errors.of_one_joint[follows]
-        found += [_law(base, errors, joint + 1, follows, smooth.of(joint)) for joint in smooth.joints]
-    return found
+    """Of every joint, by each of these kinds that the views tell of.
+
+    All variances are sought anew for the likeliest few; for the others their likelihood at the null's is a bound.
+    """
+    of_one_joint = {} if base.pose_errors is None else base.pose_errors.of_one_joint
+    tried = [
+        _at_the_null(base, follows, process)
+        for follows in kinds
+        if follows in of_one_joint
+        for process in range(len(of_one_joint[follows].joints))
+    ]
+    tried.sort(key=lambda law: -law.log_bayes_factor)
+    tried = [law.fitted() if k < _FITTED else law for k, law in enumerate(tried)]
+    every: dict[tuple[int, str], list[JointLaw]] = {}
+    for law in tried:
+        every.setdefault((law.joint, law.follows), []).append(law)
+    return [_mean(laws) for laws in every.values()]
 
 
-def _law(base: LinearModel, errors: PoseErrors, joint: int, follows: str, covariance: Array) -> JointLaw:
-    """Of a joint, counted from 1, by the covariance (6V, 6V) of the twists."""
-    every = errors.beside(f"joint {joint}", base.reduce(base.reduce(covariance).T), SMOOTH)
-    mixed = with_errors(base.mixed, every)
-    fit = _fit(base, mixed)
-    model = replace(base, mixed=mixed, pose_errors=every, null=fit, whole=None)
-    return JointLaw(joint, follows, 0.5 * (base.null.deviance - fit.deviance), model)
+def _mean(laws: Sequence[JointLaw]) -> JointLaw:
+    """The likeliest of a joint's laws of a kind; which of them it is, nobody knows."""
+    likeliest = max(laws, key=lambda law: law.log_bayes_factor)
+    mean = logsumexp([law.log_bayes_factor for law in laws]) - np.log(len(laws))
+    return replace(likeliest, log_bayes_factor=float(mean))
+
+
+def _at_the_null(base: LinearModel, follows: str, process: int) -> JointLaw:
+    assert base.pose_errors is not None
+    smooth = base.pose_errors.of_one_joint[follows]
+    joint, motions = smooth.joints[process] + 1, smooth.columns[:, process].reshape(-1, 6, 1)
+    sized = at_likeliest_size(base, with_covariance(joint, motions, smooth.alike_of(process)))
+    return JointLaw(joint, follows, process, sized.gain, base)
 
 
 def _fit(base: LinearModel, mixed: MixedModel) -> VarianceFit:

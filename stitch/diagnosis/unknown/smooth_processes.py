@@ -64,6 +64,11 @@ def in_pairs(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProc
             yield SmoothProcess(k + 1, motions[k], _following(joints[:, [k, other]]))
 
 
+def with_covariance(joint: int, motions: Array, alike: Array) -> SmoothProcess:
+    """A joint, counted from 1, that follows a process of covariance (V, V); motions (V, 6, 1) as above."""
+    return SmoothProcess(joint, motions, alike @ _leading(alike, len(alike)))
+
+
 def wandering(linear: LinearModel) -> SmoothProcess:
     """A flange that wanders."""
     measurement, time = linear.measurement, in_steps(linear.measurement)

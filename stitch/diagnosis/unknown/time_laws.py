@@ -9,6 +9,7 @@ adequate; or an effect that goes with time got its name from a part of a swing.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.diagnosis.unknown.joint_laws import ANY_SIZE
@@ -18,41 +19,46 @@ from stitch.observations.linear_model import LinearModel
 
 # Of all courses those whose size is sought with all variances.
 _FITTED = 3
-# What a size without a prior costs where the question is whether there is anything, nats: ∫ of the prior that other
-# pose errors have over log σ, against its value at the maximum (`variance_prior.py`).
-_WIDTH = 3.0
 
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """The flange errs in one course of time."""
+    """The flange errs in one course of time, of which this is the likeliest."""
 
     course: TimeProcess
-    log_bayes_factor: float  # over everything else at its likeliest size, charged for all courses that were tried
+    log_bayes_factor: float  # of all courses that were tried, over everything else, each at its likeliest size
     fitted: FittedProcess
 
     @property
     def over_nothing(self) -> float:
-        """Its log Bayes factor where the question is whether there is anything: what not knowing its size costs too."""
-        return self.log_bayes_factor - _WIDTH
+        """Its log Bayes factor where the question is whether there is anything: none of the sizes is known."""
+        return self.log_bayes_factor - ANY_SIZE
 
 
 def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
-    """The likeliest beside a model; None where poses have no prior of errors, or a session is too short for any."""
-    if linear.pose_errors is None:
+    """The likeliest beside a model; None where poses have no prior of errors, or a session is too short for any.
+
+    Of each kind of courses one may be there, each kind and each of its courses as likely before: what counts is the
+    mean of their Bayes factors. All variances are sought anew for the likeliest few; for the others that is a bound.
+    """
+    courses = [] if linear.pose_errors is None else time_processes(linear)
+    if not courses:
         return None
-    courses = time_processes(linear)
     sized = [at_likeliest_size(linear, course.process) for course in courses]
-    likeliest = sorted(range(len(sized)), key=lambda k: -sized[k].gain)[:_FITTED]
-    found = [(courses[k], fitted(linear, sized[k], len(sized))) for k in likeliest]
-    laws = [TimeLaw(course, own.log_bayes_factor, own) for course, own in found]
-    return max(laws, key=lambda law: law.log_bayes_factor, default=None)
+    gains = np.array([own.gain for own in sized])
+    found = {k: fitted(linear, sized[k], tried=1) for k in np.argsort(-gains)[:_FITTED]}
+    for k, own in found.items():
+        gains[k] = max(gains[k], own.log_bayes_factor)
+    best = max(found, key=lambda k: gains[k])
+    kinds = {kind: gains[[course.kind == kind for course in courses]] for kind in {course.kind for course in courses}}
+    together = logsumexp([logsumexp(of_kind) - np.log(len(of_kind)) for of_kind in kinds.values()])
+    return TimeLaw(courses[best], float(together - np.log(len(kinds))), found[best])
 
 
 def log_posterior(linear: LinearModel) -> float:
-    """Of the likeliest, as those of effects in the same model (`Ranked`); −∞ where there is none."""
+    """Of such a law, as those of effects in the same model (`Ranked`); −∞ where there is none."""
     law = likeliest_time_law(linear)
-    return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(PRIOR_UNKNOWN))
+    return -np.inf if law is None else law.over_nothing + float(np.log(PRIOR_UNKNOWN))
 
 
 def clear_time_law(linear: LinearModel) -> TimeLaw | None:

@@ -25,15 +25,19 @@ _FULL_WIDTH = 2.355
 
 # Periods between those that are tried, where one of them is clear.
 _FINER = 17
+# Of a swing in which all that moves does so at once: one of these is within a sixteenth of a period of any phase.
+_PHASES = 8
 # Times (T,) in steps from view to view → shapes (T, R) of a process.
 _Course = Callable[[Array], Array]
-_Told = tuple[str, _Course, float | None]  # in words, and with its frequency if it is a swing
+_Told = tuple[str, str, _Course, float | None]  # its kind, in words, and with its frequency if it is a swing
+_SWING, _SWING_AT_ONCE, _STRETCH = "swing", "swing at once", "stretch"
 
 
 @dataclass(frozen=True)
 class TimeProcess:
     """A motion of the flange in one course of time."""
 
+    kind: str
     words: str  # what they do: "they …"
     process: SmoothProcess
     course: _Course
@@ -45,8 +49,9 @@ def time_processes(linear: LinearModel) -> list[TimeProcess]:
     time = in_steps(linear.measurement)
     span = _span(time)
     apart = max(_APART / span, _FASTEST / _MOST_FREQUENCIES)
-    swings = _swings(linear, np.arange(_LEAST_SWINGS / span, _FASTEST, apart))
-    return _processes(linear, time, [*swings, *_stretches(linear, time)])
+    frequencies = np.arange(_LEAST_SWINGS / span, _FASTEST, apart)
+    at_once = _swings_at_once(linear, frequencies)
+    return _processes(linear, time, [*_swings(linear, frequencies), *at_once, *_stretches(linear, time)])
 
 
 def with_nearly_its_period(linear: LinearModel, swing: TimeProcess) -> list[TimeProcess]:
@@ -65,21 +70,33 @@ def _span(time: Array) -> float:
 def _processes(linear: LinearModel, time: Array, courses: Iterable[_Told]) -> list[TimeProcess]:
     carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return [
-        TimeProcess(words, SmoothProcess(None, carried, course(time)), course, frequency)
-        for words, course, frequency in courses
+        TimeProcess(kind, words, SmoothProcess(None, carried, course(time)), course, frequency)
+        for kind, words, course, frequency in courses
     ]
 
 
 def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_Told]:
-    """Sines of any phase, in words."""
+    """Sines, of another phase in each motion, in words."""
     for f in map(float, frequencies):
-        yield f"swing to and fro about every {_lasting(linear, 1 / f)}", partial(_waves, f), f
+        yield _SWING, f"swing to and fro about every {_lasting(linear, 1 / f)}", partial(_waves, f), f
+
+
+def _swings_at_once(linear: LinearModel, frequencies: Array) -> Iterator[_Told]:
+    """The same with one phase for all motions, as where one temperature moves them: half as many numbers."""
+    for _, words, waves, f in _swings(linear, frequencies):
+        for phase in np.arange(_PHASES) * np.pi / _PHASES:
+            yield _SWING_AT_ONCE, words, partial(_wave, waves, phase), f
 
 
 def _waves(frequency: float, time: Array) -> Array:
     """(T, 2) of which all sines of a frequency (1/step) are made."""
     phase = 2 * np.pi * frequency * time
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
+
+
+def _wave(waves: _Course, phase: float, time: Array) -> Array:
+    """(T, 1) the one of them with a phase."""
+    return np.asarray(waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]]))
 
 
 def _stretches(linear: LinearModel, time: Array) -> Iterator[_Told]:
@@ -95,7 +112,7 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[_Told]:
             if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
                 name = views.names[views.number[away.argmin()]]
                 words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
-                yield words, partial(_bump, middle, width), None
+                yield _STRETCH, words, partial(_bump, middle, width), None
         width *= 2
 
 
