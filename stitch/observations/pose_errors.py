@@ -14,7 +14,6 @@ White scatter of every scan, and the sensor's noise, come with the observation.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
 
 import numpy as np
 
@@ -22,19 +21,14 @@ from stitch.effects.contract import EFFECTS, Effect
 from stitch.effects.in_session import lacking
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
-from stitch.measurement.torques import STILL, Torques
 from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
 from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
+from stitch.observations.joint_processes import joint_processes
 from stitch.statistics.kernels import (
     SmoothErrors,
-    alike_closely,
     alike_in_joints,
-    alike_in_two,
-    alike_in_waves,
-    alike_in_way,
-    alike_under_load,
     same_stop,
     spread_over,
 )
@@ -50,12 +44,6 @@ _MOST_VIEWS = 150
 _EVERY_ARM = ("joints", "torque")
 _FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 _CONSTANT = ("joint_offset", "link_geometry")
-# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
-# its own within a few degrees or in waves, the way it came, time, at each pose in another way, or what bends it.
-ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME = "all angles", "own angle", "the way it came", "time"
-ITS_LOAD, TWO_ANGLES, WAVES = "its load", "its angle and another", "waves of its angle"
-# Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
-_LEAST_WAVES, _APART, _SHORTEST, _MOST_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
 
 
 def usual_sizes() -> dict[str, float]:
@@ -144,17 +132,7 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         alike = alike_in_joints(joints)
         found["smooth"] = (spread_over(links, alike), SMOOTH)
         if constant[0].name == _CONSTANT[0]:
-            came = joints - np.concatenate([m.views.previous for m in measurements])
-            closely = np.array([alike_closely(q, q) for q in joints.T])
-            in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
-            with_time = (1 + alike) / 2 * near_in_time(measurements, WANDERING["slowly wandering"])
-            kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way, WITH_TIME: with_time}
-            offsets = links[:, : joints.shape[1]]
-            each = tuple(range(joints.shape[1]))
-            of_one_joint = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
-            of_one_joint |= _in_waves(joints, offsets)
-            of_one_joint |= {TWO_ANGLES: _by_two_angles(joints, offsets)} if len(each) > 1 else {}
-            of_one_joint |= _by_load([m.views.torques for m in measurements], offsets)
+            of_one_joint = joint_processes(measurements, joints, links[:, : joints.shape[1]], alike)
     flange = flange_twists(measurements, centres)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
@@ -176,59 +154,6 @@ def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
     ]
     per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
     return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
-
-
-def _by_two_angles(joints: Array, offsets: Array) -> SmoothErrors:
-    """What each joint does that follows its own angle and one other's alone, as joints do that drag each other: of the
-    many numbers that a function of all angles may have in few views it has a few.
-
-    Args:
-        joints: (V, n) rad.
-        offsets: (6V, n) twists of the views per unit of each joint.
-    """
-    pairs = list(permutations(range(joints.shape[1]), 2))
-    own, others = (tuple(of) for of in zip(*pairs, strict=True))
-    return SmoothErrors(offsets[:, own], np.array([alike_in_two(*joints.T[[*two]]) for two in pairs]), own, others)
-
-
-def _in_waves(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint does again and again as it turns, as teeth of a gear or of a belt do, by that kind of law; {}
-    where none turns.
-
-    Args:
-        joints: (V, n) rad.
-        offsets: (6V, n) twists of the views per unit of each joint.
-    """
-    found = [(k, period) for k, own in enumerate(np.ptp(joints, axis=0)) if own > 0 for period in _periods(own)]
-    if not found:
-        return {}
-    own, periods = (tuple(of) for of in zip(*found, strict=True))
-    alike = np.array([alike_in_waves(joints[:, k], joints[:, k], period) for k, period in found])
-    return {WAVES: SmoothErrors(offsets[:, own], alike, own, periods=periods)}
-
-
-def _periods(turned: float) -> list[float]:
-    """Of waves along a joint that turned so far in all, rad."""
-    most = min(_MOST_WAVES, turned / _SHORTEST)
-    return [turned / waves for waves in np.arange(_LEAST_WAVES, most, _APART)]
-
-
-def _by_load(torques: Sequence[Torques], offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint that is bent does under its load, by that kind of law; {} where not the same is known of all.
-
-    Args:
-        offsets: (6V, n) twists of the views per unit of each joint.
-    """
-    first = torques[0]
-    if any((own.names, own.measured) != (first.names, first.measured) for own in torques):
-        return {}
-    values, joint = np.concatenate([own.values for own in torques]), np.array(first.joint)
-    changes = np.ptp(values, axis=0) > STILL
-    bent = tuple(int(k) for k in np.unique(joint[changes]))
-    if not bent:
-        return {}
-    alike = np.array([alike_under_load(values[:, changes & (joint == k)]) for k in bent])
-    return {ITS_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
 
 
 def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:

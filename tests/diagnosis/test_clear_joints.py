@@ -17,7 +17,7 @@ from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_by, some_law
 from stitch.observations.flange_errors import usual_step
-from stitch.observations.pose_errors import ITS_LOAD, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.joint_processes import ITS_LOAD, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
 from tests.diagnosis.freed_blade import freed_blade
 
 

@@ -18,7 +18,7 @@ from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_by
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
-from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, WITH_TIME
+from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, WITH_TIME
 from stitch.statistics.variance_prior import NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 

@@ -13,7 +13,7 @@ from stitch.frames import Array
 from stitch.measurement.torques import STILL
 from stitch.model.term import term_of
 from stitch.observations.flange_errors import WANDERING, in_steps, usual_step
-from stitch.observations.pose_errors import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
 from stitch.statistics.kernels import (
     alike_closely,
     alike_in_joints,

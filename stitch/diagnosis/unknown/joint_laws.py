@@ -26,17 +26,9 @@ from stitch.diagnosis.unknown.process_size import at_likeliest_size
 from stitch.diagnosis.unknown.smooth_processes import with_covariance
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
+from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import (
-    ALL_ANGLES,
-    ITS_LOAD,
-    OWN_ANGLE,
-    SMOOTH,
-    THE_WAY,
-    TWO_ANGLES,
-    WAVES,
-    WITH_TIME,
-)
+from stitch.observations.pose_errors import SMOOTH
 from stitch.statistics.kernels import SmoothErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances

@@ -1,0 +1,101 @@
+"""What one joint may do by no law that anybody wrote down: processes by what it follows, in none of the components of
+the prior of pose errors."""
+
+from collections.abc import Sequence
+from itertools import permutations
+
+import numpy as np
+
+from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.torques import STILL, Torques
+from stitch.observations.flange_errors import WANDERING, near_in_time
+from stitch.statistics.kernels import (
+    SmoothErrors,
+    alike_closely,
+    alike_in_two,
+    alike_in_waves,
+    alike_in_way,
+    alike_under_load,
+)
+
+# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
+# its own within a few degrees or in waves, the way it came, time, at each pose in another way, or what bends it.
+ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME = "all angles", "own angle", "the way it came", "time"
+ITS_LOAD, TWO_ANGLES, WAVES = "its load", "its angle and another", "waves of its angle"
+# Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
+_LEAST_WAVES, _APART, _SHORTEST, _MOST_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
+
+
+def joint_processes(
+    measurements: Sequence[Measurement], joints: Array, offsets: Array, alike: Array
+) -> dict[str, SmoothErrors]:
+    """Of every joint, by what it follows, for the sessions of a rig.
+
+    Args:
+        joints: (V, n) rad of all views.
+        offsets: (6V, n) twists of the views per unit of each joint.
+        alike: (V, V) of a smooth function of all joints.
+    """
+    came = joints - np.concatenate([m.views.previous for m in measurements])
+    closely = np.array([alike_closely(q, q) for q in joints.T])
+    in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
+    with_time = (1 + alike) / 2 * near_in_time(measurements, WANDERING["slowly wandering"])
+    kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way, WITH_TIME: with_time}
+    each = tuple(range(joints.shape[1]))
+    found = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
+    found |= {TWO_ANGLES: _by_two_angles(joints, offsets)} if len(each) > 1 else {}
+    return found | _in_waves(joints, offsets) | _by_load([m.views.torques for m in measurements], offsets)
+
+
+def _by_two_angles(joints: Array, offsets: Array) -> SmoothErrors:
+    """What each joint does that follows its own angle and one other's alone, as joints do that drag each other: of the
+    many numbers that a function of all angles may have in few views it has a few.
+
+    Args:
+        joints: (V, n) rad.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    pairs = list(permutations(range(joints.shape[1]), 2))
+    own, others = (tuple(of) for of in zip(*pairs, strict=True))
+    return SmoothErrors(offsets[:, own], np.array([alike_in_two(*joints.T[[*two]]) for two in pairs]), own, others)
+
+
+def _in_waves(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint does again and again as it turns, as teeth of a gear or of a belt do, by that kind of law; {}
+    where none turns.
+
+    Args:
+        joints: (V, n) rad.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    found = [(k, period) for k, own in enumerate(np.ptp(joints, axis=0)) if own > 0 for period in _periods(own)]
+    if not found:
+        return {}
+    own, periods = (tuple(of) for of in zip(*found, strict=True))
+    alike = np.array([alike_in_waves(joints[:, k], joints[:, k], period) for k, period in found])
+    return {WAVES: SmoothErrors(offsets[:, own], alike, own, periods=periods)}
+
+
+def _periods(turned: float) -> list[float]:
+    """Of waves along a joint that turned so far in all, rad."""
+    most = min(_MOST_WAVES, turned / _SHORTEST)
+    return [turned / waves for waves in np.arange(_LEAST_WAVES, most, _APART)]
+
+
+def _by_load(torques: Sequence[Torques], offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint that is bent does under its load, by that kind of law; {} where not the same is known of all.
+
+    Args:
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    first = torques[0]
+    if any((own.names, own.measured) != (first.names, first.measured) for own in torques):
+        return {}
+    values, joint = np.concatenate([own.values for own in torques]), np.array(first.joint)
+    changes = np.ptp(values, axis=0) > STILL
+    bent = tuple(int(k) for k in np.unique(joint[changes]))
+    if not bent:
+        return {}
+    alike = np.array([alike_under_load(values[:, changes & (joint == k)]) for k in bent])
+    return {ITS_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
