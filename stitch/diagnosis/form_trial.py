@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.mean_factor import log_mean
 from stitch.statistics.tails import f_tail
 from stitch.statistics.variance_components import at_variances, fit_variances
 
@@ -77,7 +77,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     rank, square = _wald(theta, covariance, form.sizes)
     rest = max(mixed.size - a - rank, 1)
     p = f_tail(square / max(rank, 1), max(rank, 1), rest)
-    gained = 0.5 * linear.null.deviance + float(logsumexp(-0.5 * np.array(found)) - np.log(len(found)))
+    gained = 0.5 * linear.null.deviance + float(log_mean(-0.5 * np.array(found)))
     return FormTrial(gained, p, theta, covariance, integrated.variances, scales[best])
 
 
@@ -99,7 +99,7 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
     information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
     squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
     found = 0.5 * (squares - np.linalg.slogdet(information)[1])
-    return Gain(float(logsumexp(found) - np.log(len(scales))), float(scales[found.argmax()]))
+    return Gain(float(log_mean(found)), float(scales[found.argmax()]))
 
 
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from stitch.diagnosis.form_trial import SCALES
 from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
@@ -30,6 +29,7 @@ from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE,
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import SMOOTH
 from stitch.statistics.kernels import SmoothErrors
+from stitch.statistics.mean_factor import log_mean
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -94,8 +94,7 @@ def log_posterior(base: LinearModel) -> float:
 def some_law(log_bayes_factors: Array) -> Array:
     """(…) log posterior that one of the laws is there, from the log Bayes factors (L, …) of each: all kinds of laws of
     all joints share the prior alike, and none of their sizes is known."""
-    every = logsumexp(log_bayes_factors, axis=0) - np.log(len(log_bayes_factors))
-    return np.asarray(every + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
+    return np.asarray(log_mean(log_bayes_factors) + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
@@ -131,8 +130,7 @@ def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
 def _mean(laws: Sequence[JointLaw]) -> JointLaw:
     """The likeliest of a joint's laws of a kind; which of them it is, nobody knows."""
     likeliest = max(laws, key=lambda law: law.log_bayes_factor)
-    mean = logsumexp([law.log_bayes_factor for law in laws]) - np.log(len(laws))
-    return replace(likeliest, log_bayes_factor=float(mean))
+    return replace(likeliest, log_bayes_factor=float(log_mean([law.log_bayes_factor for law in laws])))
 
 
 def _at_the_null(base: LinearModel, follows: str, process: int) -> JointLaw:

@@ -9,13 +9,13 @@ adequate; or an effect that goes with time got its name from a part of a swing.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.diagnosis.unknown.joint_laws import ANY_SIZE
 from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
 from stitch.diagnosis.unknown.time_processes import TimeProcess, time_processes, with_nearly_its_period
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.mean_factor import log_mean
 
 # Of all courses those whose size is sought with all variances.
 _FITTED = 3
@@ -51,8 +51,8 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
         gains[k] = max(gains[k], own.log_bayes_factor)
     best = max(found, key=lambda k: gains[k])
     kinds = {kind: gains[[course.kind == kind for course in courses]] for kind in {course.kind for course in courses}}
-    together = logsumexp([logsumexp(of_kind) - np.log(len(of_kind)) for of_kind in kinds.values()])
-    return TimeLaw(courses[best], float(together - np.log(len(kinds))), found[best])
+    together = log_mean([float(log_mean(of_kind)) for of_kind in kinds.values()])
+    return TimeLaw(courses[best], float(together), found[best])
 
 
 def log_posterior(linear: LinearModel) -> float:
