@@ -1,10 +1,11 @@
-"""Figures of errors by no known law: where in the range of a joint, and when in the session."""
+"""Figures of errors by no known law: along what a joint follows, and when in the session."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
 from stitch.frames import Array
 from stitch.observations.flange_errors import in_steps
@@ -23,13 +24,23 @@ def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
     for ax, c in zip(axes, shown, strict=False):
         error, sigma = 1e3 * c.error, 1e3 * c.sigma
-        ax.fill_between(c.at, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
-        ax.plot(c.at, error, color=BLUE)
-        ax.plot(c.stood, np.zeros(len(c.stood)), "|", color="k", ms=8)
+        label, at, stood = _along(c)
+        ax.fill_between(at, error - 2 * sigma, error + 2 * sigma, color=BLUE, alpha=0.25, lw=0)
+        ax.plot(at, error, color=BLUE)
+        ax.plot(stood, np.zeros(len(stood)), "|", color="k", ms=8)
         ax.axhline(0, color="k", lw=0.6)
-        ax.set_title(f"{c.share:.0%} of it", fontsize=9)
-        ax.set(xlabel=covariate(c.covariate), ylabel=f"joint {c.joint} off by (mrad)")
+        ax.set_title(f"{c.share:.0%} of what it does", fontsize=9)
+        ax.set(xlabel=label, ylabel=f"joint {c.joint} off by (mrad)")
     return plain(figure)
+
+
+def _along(c: JointCurve) -> tuple[str, Array, Array]:
+    """The axis of a joint's course, where the course is told and where the views stood along it."""
+    if c.covariate != "time_s":
+        return covariate(c.covariate), c.at, c.stood
+    first = float(c.stood.min())
+    unit, of_second = _unit_of(float(np.ptp(c.stood)))
+    return unit, (c.at - first) * of_second, (c.stood - first) * of_second
 
 
 def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
@@ -52,8 +63,13 @@ def _times(curve: TimeCurve) -> tuple[str, float]:
     """What the time axis counts, and how much of it a step is."""
     if not curve.seconds:
         return "view", 1.0
-    whole = curve.seconds * float(np.ptp(curve.steps))
-    return ("hours", curve.seconds / 3600) if whole > _HOURS_FROM else ("minutes", curve.seconds / 60)
+    unit, of_second = _unit_of(curve.seconds * float(np.ptp(curve.steps)))
+    return unit, curve.seconds * of_second
+
+
+def _unit_of(whole: float) -> tuple[str, float]:
+    """What the time of a session of so many seconds is told in, and how much of it a second is."""
+    return ("hours", 1 / 3600) if whole > _HOURS_FROM else ("minutes", 1 / 60)
 
 
 def _banded(ax: Axes, time: Array, error: Array, sigma: Array) -> None:

@@ -68,7 +68,7 @@ def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     curves = joint_courses(found) if found.curves else None
     in_time = None if found.time_curve is None else time_course(found, found.time_curve, unit)
     return {
-        "joint_courses": _Picture("Where in its range a joint errs without a name", curves, captions.COURSES),
+        "joint_courses": _Picture("Where and when a joint errs without a name", curves, captions.COURSES),
         "time_course": _Picture("When in the session poses err without a name", in_time, captions.TIME_COURSE),
         "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
         "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),

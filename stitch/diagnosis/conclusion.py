@@ -7,7 +7,7 @@ from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.scanner_first import scanner_first
 from stitch.diagnosis.selection.pairs import both_missing
-from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis.selection.ranking import Ranked, certain
 from stitch.diagnosis.selection.upheld import hold_together, validated
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.thresholds import MANY_VIEWS
@@ -53,11 +53,14 @@ def upheld(
 
 
 def _held(linear: LinearModel, selection: Selection, left_out: Mapping[str, CrossValidation]) -> Selection:
-    """What holds on views left out and in halves. A second effect that is named without the first is asked alone."""
+    """What holds on views left out and in halves. A second effect that is named without the first is asked alone, and
+    is not named where alone it is not certain."""
     held = validated(selection, left_out, {r.name: halves(r.score) for r in _asked(selection)})
     if not held.named or held.named[0] is selection.named[0]:
         return held
     alone = next(r for r in selection.ranked if r.name == held.named[0].name)
+    if not certain(alone):
+        return replace(held, verdict="unknown_effect", named=())
     again = replace(held, named=(alone,))
     return validated(again, on_views_left_out(linear, again), {alone.name: halves(alone.score)})
 

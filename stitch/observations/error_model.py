@@ -99,12 +99,20 @@ class ErrorModel:
     @cached_property
     def arm_right(self) -> Self:
         """As if neither joints nor links erred again, from pose to pose."""
-        if self.pose_errors is None:
-            return self
-        errors = self.pose_errors.but_of_the_arm()
+        return self if self.pose_errors is None else self._with(self.pose_errors.but_of_the_arm())
+
+    @cached_property
+    def flange_steady(self) -> Self:
+        """As if the flange did not wander in time."""
+        return self if self.pose_errors is None else self._with(self.pose_errors.but_in_time())
+
+    def _with(self, errors: PoseErrors) -> Self:
+        """With some of the pose errors alone."""
+        assert self.pose_errors is not None
         mixed = with_errors(self.mixed, errors)
         few = np.append(self.scatter_only.null.variances, _ABSENT * errors.scales**2)
-        same = self.null.variances[np.append(np.ones(NOISE + 1, bool), ~self.pose_errors.of_arm)]
+        kept = np.array([name in errors.names for name in self.pose_errors.names], bool)
+        same = self.null.variances[np.append(np.ones(NOISE + 1, bool), kept)]
         null = min((fit_variances(mixed, start=start) for start in (few, same)), key=lambda fit: fit.deviance)
         return replace(self, mixed=mixed, null=null, pose_errors=errors, whole=None)
 

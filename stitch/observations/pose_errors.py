@@ -94,9 +94,15 @@ class PoseErrors:
 
     def but_of_the_arm(self) -> "PoseErrors":
         """What wanders in time and what scans of a stop share; neither joints nor links err again."""
-        kept = np.flatnonzero(~self.of_arm)
-        names = tuple(self.names[i] for i in kept)
-        return replace(self, names=names, components=self.components[kept], scales=self.scales[kept], effects={})
+        return replace(self._kept(~self.of_arm), effects={})
+
+    def but_in_time(self) -> "PoseErrors":
+        """What joints and links do and what scans of a stop share; nothing wanders."""
+        return self._kept(np.array([name not in WANDERING for name in self.names], bool))
+
+    def _kept(self, keep: Mask) -> "PoseErrors":
+        names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
+        return replace(self, names=names, components=self.components[keep], scales=self.scales[keep])
 
     def beside(self, name: str, component: Array, scale: float) -> "PoseErrors":
         """The same with a further component (n, n)."""

@@ -14,9 +14,11 @@ HELPS = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.1, ste
 USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, steadiness=0.9)
 
 
-def ranked(name, beside=None):
-    score = SimpleNamespace(name=name, beside=beside)
-    return Ranked(score, adjusted=1e-6, log_posterior=9.0, posterior=0.9)
+def ranked(name, beside=None, adjusted=1e-6):
+    of = SimpleNamespace(name=name, empirical=False)
+    seen = {"observable": True, "values": (), "form": SimpleNamespace(free=()), "log_bayes_factor": 12.0}
+    score = SimpleNamespace(name=name, beside=beside, candidate=of, **seen)
+    return Ranked(score, adjusted, log_posterior=9.0, posterior=0.9)
 
 
 FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
@@ -62,4 +64,14 @@ def test_a_second_effect_without_the_first_is_asked_alone(monkeypatch, alone):
     selection = Selection("missing_effect", (first,), (ranked("backlash"), by_itself), (), second=second)
     found, _ = upheld(monkeypatch, selection, together=None, refused=[])
     assert found.named == ((by_itself,) if alone is HELPS else ())
+    assert "backlash" in found.notes[0]
+
+
+def test_a_second_effect_that_alone_may_be_chance_gets_no_name(monkeypatch):
+    first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
+    by_itself = ranked("fixture_drift", adjusted=0.2)
+    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: USELESS if score is first.score else HELPS)
+    selection = Selection("missing_effect", (first,), (ranked("backlash"), by_itself), (), second=second)
+    found, _ = upheld(monkeypatch, selection, together=None, refused=[])
+    assert found.verdict == "unknown_effect" and not found.named
     assert "backlash" in found.notes[0]

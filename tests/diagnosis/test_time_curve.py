@@ -26,7 +26,7 @@ def shown(cell, course, direction):
     linear = cell.seen(cell.measured.T_base_flange @ frames.exp(errors))
     law = clear_time_law(linear)
     assert law is not None
-    curve = time_curve(linear, law)
+    curve = time_curve(law)
     at_views = slice(None, None, (len(curve.steps) - 1) // (VIEWS - 1))
     off = (curve.error[at_views] - errors) / np.maximum(curve.sigma[at_views], 1e-300)
     return curve, off[np.abs(course) > 0.2]

@@ -7,7 +7,6 @@ import numpy as np
 from stitch.diagnosis.unknown.time_laws import TimeLaw
 from stitch.frames import Array
 from stitch.observations.flange_errors import in_steps, usual_step, usual_twist
-from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import at_variances
 
 _PLACES = 6  # from one view to the next
@@ -34,8 +33,9 @@ class TimeCurve:
         return k, float(size[k]), float(np.linalg.norm(along * self.sigma[k, of]))
 
 
-def time_curve(linear: LinearModel, law: TimeLaw) -> TimeCurve:
+def time_curve(law: TimeLaw) -> TimeCurve:
     """The course of a law of the flange in time, and its sigma: a free fit at the fitted sizes of all other errors."""
+    linear = law.base
     time = np.sort(in_steps(linear.measurement))
     places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
     steps = np.interp(places, np.arange(len(time)), time)

@@ -28,11 +28,7 @@ class TimeLaw:
     course: TimeProcess
     log_bayes_factor: float  # of all courses that were tried, over everything else, each at its likeliest size
     fitted: FittedProcess
-
-    @property
-    def over_nothing(self) -> float:
-        """Its log Bayes factor where the question is whether there is anything: none of the sizes is known."""
-        return self.log_bayes_factor - ANY_SIZE
+    base: LinearModel  # without the law
 
 
 def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
@@ -52,28 +48,44 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     best = max(found, key=lambda k: gains[k])
     kinds = {kind: gains[[course.kind == kind for course in courses]] for kind in {course.kind for course in courses}}
     together = log_mean([float(log_mean(of_kind)) for of_kind in kinds.values()])
-    return TimeLaw(courses[best], float(together), found[best])
+    return TimeLaw(courses[best], float(together), found[best], linear)
 
 
 def log_posterior(linear: LinearModel) -> float:
-    """Of such a law, as those of effects in the same model (`Ranked`); −∞ where there is none."""
+    """Of such a law, as those of effects in the same model (`Ranked`); −∞ where there is none. None of the sizes is
+    known."""
     law = likeliest_time_law(linear)
-    return -np.inf if law is None else law.over_nothing + float(np.log(PRIOR_UNKNOWN))
+    return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(PRIOR_UNKNOWN))
 
 
 def clear_time_law(linear: LinearModel) -> TimeLaw | None:
-    """The likeliest, where it is 20 to 1 likelier than none; a swing with the likeliest of all periods near its own."""
+    """The likeliest, where it is 20 to 1 likelier than none, beside all else that poses may do or in place of what
+    wanders; a swing with the likeliest of all periods near its own.
+
+    As with a joint's law (`clear_joints.py`) the odds are those of the likeliest sizes.
+    """
     law = likeliest_time_law(linear)
-    if law is None or law.over_nothing <= ODDS:
+    if law is None or law.log_bayes_factor <= ODDS:
+        law = _in_place(linear)
+    return law if law is None or law.course.frequency is None else _of_period(law)
+
+
+def _in_place(linear: LinearModel) -> TimeLaw | None:
+    """That of a flange that does not wander but by it: 20 to 1 likelier than none, and no less likely than all that
+    wanders, which can do what a stretch does, so that beside it a stretch gains nothing."""
+    steady = linear.flange_steady
+    law = likeliest_time_law(steady)
+    wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
+    if law is None or law.log_bayes_factor <= max(ODDS, wandering):
         return None
-    return law if law.course.frequency is None else _of_period(linear, law)
+    return replace(law, log_bayes_factor=law.log_bayes_factor - wandering)
 
 
-def _of_period(linear: LinearModel, law: TimeLaw) -> TimeLaw:
+def _of_period(law: TimeLaw) -> TimeLaw:
     """What is known of it was asked for one of the periods that are tried, and stays as it is."""
-    beside = replace(linear, null=law.fitted.fit)
+    beside = replace(law.base, null=law.fitted.fit)
     near = [
-        (course, at_likeliest_size(beside, course.process)) for course in with_nearly_its_period(linear, law.course)
+        (course, at_likeliest_size(beside, course.process)) for course in with_nearly_its_period(law.base, law.course)
     ]
     course, sized = max(near, key=lambda own: own[1].gain)
-    return replace(law, course=course, fitted=fitted(linear, sized, tried=1))
+    return replace(law, course=course, fitted=fitted(law.base, sized, tried=1))

@@ -88,8 +88,8 @@ def _time_law(linear: LinearModel) -> Unnamed | None:
     law = clear_time_law(linear)
     if law is None:
         return None
-    curve = time_curve(linear, law)
-    return Unnamed(law.course.words, law.over_nothing, joints=False, of_one=True, curve=curve, process=law.fitted)
+    factor, curve = law.log_bayes_factor, time_curve(law)
+    return Unnamed(law.course.words, factor, joints=False, of_one=True, curve=curve, process=law.fitted)
 
 
 def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
