@@ -1,5 +1,7 @@
 """What errs by no known law in words: where in the range of a joint, when in the session."""
 
+from collections.abc import Sequence
+
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
@@ -11,7 +13,8 @@ _TOLD = 2
 
 def course_texts(found: Diagnosis, length_unit: str) -> list[str]:
     """A sentence for every course that is clear enough to be said, of joints and in time."""
-    told = [curve_text(curve) for curve in found.curves[:_TOLD]]
+    shown = found.curves[:_TOLD]
+    told = [*map(curve_text, shown), *_not_told(shown)]
     in_time = found.time_curve
     return told if in_time is None else [*told, time_curve_text(in_time, length_unit)]
 
@@ -24,6 +27,15 @@ def curve_text(curve: JointCurve) -> str:
     )
     of_it = f"{curve.share:.0%} of what it does without a name"
     return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
+
+
+def _not_told(curves: Sequence[JointCurve]) -> list[str]:
+    """What each joint may follow as well as what its course is drawn along."""
+    open_ones = {c.joint: c.may_follow for c in curves if len(c.may_follow) > 1}
+    return [
+        f"These views do not tell whether joint {joint} follows {', '.join(others[:-1])} or {others[-1]}."
+        for joint, others in open_ones.items()
+    ]
 
 
 def _where(curve: JointCurve, k: int) -> str:

@@ -86,7 +86,9 @@ def _diagnosed(state: State) -> Diagnosis:
         of_field=of_field,
         smooth=smooth or (scanner_error(linear) if unknown else None),
         doubts=state.doubts,
-        budget=variance_budget(linear, [r.score for r in selection.named[:1]], said[0].process if said else None),
+        budget=variance_budget(
+            _beside(linear, said), [r.score for r in selection.named[:1]], said[0].process if said else None
+        ),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
 
@@ -99,9 +101,15 @@ def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:
 def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:
     """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
     process = said[0].process if said else None
-    null = process.fit if process else linear.null if said else linear.scatter_only.null
+    null = process.fit if process else _beside(linear, said).null if said else linear.scatter_only.null
     rotation, translation = np.sqrt(null.variances[:2])
     return float(rotation), float(translation)
+
+
+def _beside(linear: LinearModel, said: Sequence[Unnamed]) -> LinearModel:
+    """The views where the joint that is said to err without a name may err so."""
+    laws = said[0].laws if said else ()
+    return laws[0].model if laws else linear
 
 
 def linear_model_of(state: State) -> LinearModel:

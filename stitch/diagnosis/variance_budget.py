@@ -75,10 +75,16 @@ def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) 
     mixed = replace(linear.mixed, A=U[None])
     sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
     for name, size, C in zip((*WHITE, *errors.names), sizes, mixed.components[:, 0], strict=True):
-        yield _CALLED.get(name, f"{name} of every joint"), float(size * (np.trace(C) - np.sum(U * (C @ U))))
+        yield _called(name), float(size * (np.trace(C) - np.sum(U * (C @ U))))
     if linear.mixed.fixed is not None:
         C = linear.mixed.fixed[0]
         yield "scanner field", float(np.trace(C) - np.sum(U * (C @ U)))
+
+
+def _called(component: str) -> str:
+    """What people call it; one joint by no known law keeps its name."""
+    own = component.startswith("joint ") or component in _CALLED
+    return _CALLED.get(component, component) if own else f"{component} of every joint"
 
 
 def _square(base: Array, numbers: Array) -> float:

@@ -20,9 +20,10 @@ from stitch.statistics.kernels import (
 )
 
 # What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
-# its own within a few degrees or in waves, the way it came, time, at each pose in another way, or what bends it.
+# its own within a few degrees or in waves, the way it came, time, at each pose in another way or in the same, or what
+# bends it.
 ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME = "all angles", "own angle", "the way it came", "time"
-ITS_LOAD, TWO_ANGLES, WAVES = "its load", "its angle and another", "waves of its angle"
+ITS_LOAD, TWO_ANGLES, WAVES, TIME_ALONE = "its load", "its angle and another", "waves of its angle", "time alone"
 # Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
 _LEAST_WAVES, _APART, _SHORTEST, _MOST_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
 
@@ -40,8 +41,9 @@ def joint_processes(
     came = joints - np.concatenate([m.views.previous for m in measurements])
     closely = np.array([alike_closely(q, q) for q in joints.T])
     in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
-    with_time = (1 + alike) / 2 * near_in_time(measurements, WANDERING["slowly wandering"])
-    kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way, WITH_TIME: with_time}
+    slowly = near_in_time(measurements, WANDERING["slowly wandering"])
+    kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way}
+    kinds |= {WITH_TIME: (1 + alike) / 2 * slowly, TIME_ALONE: slowly}
     each = tuple(range(joints.shape[1]))
     found = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
     found |= {TWO_ANGLES: _by_two_angles(joints, offsets)} if len(each) > 1 else {}

@@ -43,7 +43,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
 
 
 def _curve(curve: JointCurve) -> dict[str, Any]:
-    """Where in the range or by which move a joint errs by no known law; angles in degrees, errors in rad."""
+    """Along what a joint errs by no known law, in the unit of its covariate; errors in rad."""
     return {
         "joint": curve.joint,
         "covariate": curve.covariate,
@@ -51,6 +51,7 @@ def _curve(curve: JointCurve) -> dict[str, Any]:
         "at": curve.at.tolist(),
         "error": curve.error.tolist(),
         "sigma": curve.sigma.tolist(),
+        "may_follow": list(curve.may_follow),
     }
 
 

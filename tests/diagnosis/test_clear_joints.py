@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from numpy.polynomial import Polynomial
 from data_synth import kinematics
 from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch import frames
-from stitch.diagnosis.course_sentences import curve_text
+from stitch.diagnosis.course_sentences import course_texts, curve_text
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.clear_joints import clear_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_by, some_law
+from stitch.diagnosis.variance_budget import variance_budget
 from stitch.observations.flange_errors import usual_step
-from stitch.observations.joint_processes import ITS_LOAD, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.joint_processes import ITS_LOAD, THE_WAY, TIME_ALONE, TWO_ANGLES, WAVES, WITH_TIME
 from tests.diagnosis.freed_blade import freed_blade
 
 
@@ -132,7 +134,7 @@ def test_the_course_in_time_of_a_joint_that_warms_is_the_true_one_within_its_sig
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 8e-4 * (1 - np.exp(-steps / 4.0))
     (law,) = clear_laws(with_joints_off(cell, off))
-    assert (law.joint, law.follows) == (5, WITH_TIME)
+    assert (law.joint, law.follows) == (5, TIME_ALONE)
     (course,) = joint_curves([law])
     assert course.covariate == "time_s"
     at = (course.at - course.at.min()) / usual_step(law.model.measurement)
@@ -140,6 +142,32 @@ def test_the_course_in_time_of_a_joint_that_warms_is_the_true_one_within_its_sig
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)
     assert np.corrcoef(course.error, true)[0, 1] > 0.9
     assert re.fullmatch(r"Joint 5 is off by -\S+ ± \S+ mrad 0 s into the session, and by .*", curve_text(course))
+
+
+def test_a_joint_that_swings_in_time_does_so_at_every_pose_and_its_share_is_no_scatter(cell):
+    """Half a milliradian: all of what the joint does goes with time, and the budget holds it in place of scatter."""
+    off = np.zeros_like(cell.measured.plan.joints)
+    off[:, 4] = 5e-4 * np.sin(0.7 * np.arange(14.0))
+    linear = with_joints_off(cell, off)
+    law = next(law for law in joint_laws(linear) if law.follows == TIME_ALONE)
+    (course,) = joint_curves([law])
+    assert law.joint == 5 and course.covariate == "time_s" and course.share > 0.9
+    assert np.ptp(course.error) == pytest.approx(np.ptp(off[:, 4]), rel=0.2)
+    budget = {line.source: line.variance_share for line in variance_budget(law.model)}
+    assert max(budget, key=budget.get) == "joint 5 by no known law"
+    assert law.model.null.variances[0] < 0.1 * linear.scatter_only.null.variances[0]
+
+
+def test_what_a_joint_may_follow_as_well_is_said(cell):
+    """With a slower swing the poses of these views go as time does."""
+    off = np.zeros_like(cell.measured.plan.joints)
+    off[:, 4] = 5e-4 * np.sin(0.5 * np.arange(14.0))
+    linear = with_joints_off(cell, off)
+    factors = {law.follows: law.log_bayes_factor for law in joint_laws(linear) if law.joint == 5}
+    (law,) = clear_laws(linear)
+    assert (factors[WITH_TIME] > max(factors.values()) - ODDS) and law.may_follow == ("the joint angles", "time")
+    found = SimpleNamespace(curves=joint_curves([law]), time_curve=None)
+    assert "These views do not tell whether joint 5 follows the joint angles or time." in course_texts(found, "mm")
 
 
 def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_its_sigma(cell):

@@ -8,15 +8,17 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
+from data_synth.ordinary_arm import with_memory
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.conclusion import concluded
 from stitch.diagnosis.plausible_scatter import ScatterLimit
-from stitch.diagnosis.thresholds import IMPLAUSIBLE
+from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_law
 from stitch.diagnosis.unknown.time_processes import time_processes
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
+from stitch.observations.flange_errors import WANDERING
 from stitch.statistics.variance_prior import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -63,6 +65,24 @@ def test_a_stretch_of_views_that_stands_off_is_said_to(cell):
     assert found.verdict == "unknown_effect" and not found.named
     words = unnamed_errors(linear)[0].words
     assert words.startswith("are off for a stretch of 3.5 views") and words.endswith(("v009", "v010", "v011"))
+
+
+def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
+    """What wanders can do what a long stretch does: beside it the stretch gains little, alone it explains more."""
+    stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 3.5) ** 2)
+    linear = linear_of(cell, 1.5 * stretch[:, None] * DIRECTION)
+    assert likeliest_time_law(linear).log_bayes_factor < ODDS
+    law = clear_time_law(linear)
+    assert law.course.words.startswith("are off for a stretch")
+    assert not set(WANDERING) & set(law.base.pose_errors.names)
+    found = verdict_of(linear)
+    assert found.verdict == "unknown_effect" and unnamed_errors(linear)[0].curve is not None
+
+
+def test_no_course_is_told_where_poses_wander(cell):
+    for seed in range(4):
+        wander = with_memory(VIEWS, 0.9, np.random.default_rng(seed)) * np.repeat([4e-5, 0.04], 3)
+        assert clear_time_law(linear_of(cell, wander)) is None
 
 
 def test_scatter_follows_no_course_of_time(cell):

@@ -13,7 +13,16 @@ from stitch.frames import Array
 from stitch.measurement.torques import STILL
 from stitch.model.term import term_of
 from stitch.observations.flange_errors import WANDERING, in_steps, usual_step
-from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.joint_processes import (
+    ALL_ANGLES,
+    ITS_LOAD,
+    OWN_ANGLE,
+    THE_WAY,
+    TIME_ALONE,
+    TWO_ANGLES,
+    WAVES,
+    WITH_TIME,
+)
 from stitch.statistics.kernels import (
     alike_closely,
     alike_in_joints,
@@ -41,6 +50,7 @@ class JointCurve:
     error: Array  # (G,) of the joint that errs, rad
     sigma: Array  # (G,) of `error`, rad
     stood: Array  # (V,) the covariate in the views
+    may_follow: tuple[str, ...] = ()  # what these views do not tell apart, the likeliest first
 
     @property
     def extremes(self) -> tuple[int, int]:
@@ -92,6 +102,7 @@ def _course(law: JointLaw, along: _Along, whole: float) -> JointCurve:
         error=mean[:_PLACES],
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),
         stood=along.unit * at,
+        may_follow=law.may_follow,
     )
 
 
@@ -139,11 +150,18 @@ def _the_way(law: JointLaw) -> list[_Along]:
 
 
 def _with_time(law: JointLaw) -> list[_Along]:
+    return [_in_time(law, (1 + alike_in_joints(law.base.measurement.views.joints)) / 2)]
+
+
+def _time_alone(law: JointLaw) -> list[_Along]:
+    return [_in_time(law, 1.0)]
+
+
+def _in_time(law: JointLaw, rest: Array | float) -> _Along:
     measurement = law.base.measurement
-    joints, seconds = measurement.views.joints, usual_step(measurement)
+    seconds = usual_step(measurement)
     name, unit = ("time_s", seconds) if seconds else ("view", 1.0)
-    in_time = partial(alike_within, reach=WANDERING["slowly wandering"])
-    return [_Along(name, in_steps(measurement), in_time, (1 + alike_in_joints(joints)) / 2, unit)]
+    return _Along(name, in_steps(measurement), partial(alike_within, reach=WANDERING["slowly wandering"]), rest, unit)
 
 
 def _its_load(law: JointLaw) -> list[_Along]:
@@ -169,6 +187,7 @@ _FOLLOWED = {
     WAVES: _waves,
     THE_WAY: _the_way,
     WITH_TIME: _with_time,
+    TIME_ALONE: _time_alone,
     ITS_LOAD: _its_load,
 }
 

@@ -8,9 +8,10 @@ that is off by a function of its own angle that changes within a few degrees, as
 by any function of the way it came, as by friction, which is neither play nor settling; or that changes as time passes,
 as where its motor warms, which is no drift of mount or part; or by a law of its load that is not that of a spring.
 
-Where nothing has a name, two more are asked for. A function of all angles holds them, and so does one that changes
-within a few degrees, but with a number of its own in nearly every view: a joint that follows its own angle and one
-other's, as two do that drag each other, and one that errs in waves along its angle, as teeth of gears and belts do.
+Where nothing has a name, three more are asked for. A function of all angles holds them, or one that changes within a
+few degrees or in time at each pose in another way, but with a number of its own in nearly every view: a joint that
+follows its own angle and one other's, as two do that drag each other, one that errs in waves along its angle, as teeth
+of gears and belts do, and one that errs in time alone, whatever the pose.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,16 @@ from stitch.diagnosis.unknown.process_size import at_likeliest_size
 from stitch.diagnosis.unknown.smooth_processes import with_covariance
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
-from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, THE_WAY, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.joint_processes import (
+    ALL_ANGLES,
+    ITS_LOAD,
+    OWN_ANGLE,
+    THE_WAY,
+    TIME_ALONE,
+    TWO_ANGLES,
+    WAVES,
+    WITH_TIME,
+)
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import SMOOTH
 from stitch.statistics.kernels import SmoothErrors
@@ -37,7 +47,15 @@ from stitch.statistics.variance_components import VarianceFit, at_variances, fit
 _FITTED = 12
 # Kinds of laws that stand against names, and all that are told where nothing has one.
 RIVALS = (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD)
-KINDS = (*RIVALS, TWO_ANGLES, WAVES)
+KINDS = (*RIVALS, TWO_ANGLES, WAVES, TIME_ALONE)
+# What they follow, as people say it.
+JOINT_ANGLES = "the joint angles"
+FOLLOWED = {
+    **dict.fromkeys((ALL_ANGLES, OWN_ANGLE, TWO_ANGLES, WAVES), JOINT_ANGLES),
+    THE_WAY: "the way it came",
+    **dict.fromkeys((WITH_TIME, TIME_ALONE), "time"),
+    ITS_LOAD: "its load",
+}
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
@@ -53,6 +71,7 @@ class JointLaw:
     process: int  # of that kind; the likeliest, where a joint has several
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size; their mean, of several
     base: LinearModel  # without the law
+    may_follow: tuple[str, ...] = ()  # in words, the likeliest first: what 20 to 1 does not tell apart
 
     @property
     def errors(self) -> SmoothErrors:
@@ -66,7 +85,7 @@ class JointLaw:
         errors = self.base.pose_errors
         assert errors is not None
         own = self.base.reduce(self.base.reduce(self.errors.of(self.process)).T)
-        every = errors.beside(f"joint {self.joint}", own, SMOOTH)
+        every = errors.beside(f"joint {self.joint} by no known law", own, SMOOTH)
         mixed = with_errors(self.base.mixed, every)
         return replace(self.base, mixed=mixed, pose_errors=every, null=_fit(self.base, mixed), whole=None)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.clear_joints import clear_laws
-from stitch.diagnosis.unknown.joint_laws import JointLaw
+from stitch.diagnosis.unknown.joint_laws import JOINT_ANGLES, JointLaw
 from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
 from stitch.diagnosis.unknown.time_laws import clear_time_law
@@ -80,7 +80,11 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
     if not laws:
         return None
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
-    return Unnamed(f"{_JOINTS}, {which} above all", laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
+    followed = dict.fromkeys(number for law in laws for number in law.may_follow)
+    words = f"come from {which} above all and follow {' or '.join(followed)}"
+    if JOINT_ANGLES in followed:
+        words = f"{_JOINTS}, {which} above all"
+    return Unnamed(words, laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
 
 
 def _time_law(linear: LinearModel) -> Unnamed | None:
