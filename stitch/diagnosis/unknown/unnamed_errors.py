@@ -81,7 +81,8 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
         return None
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
     followed = dict.fromkeys(number for law in laws for number in law.may_follow)
-    words = f"come from {which} above all and follow {' or '.join(followed)}"
+    # Of laws that nobody knows none is certain to be of the kind that explains most.
+    words = f"come from {which} above all, likeliest by {' or '.join(followed)}"
     if JOINT_ANGLES in followed:
         words = f"{_JOINTS}, {which} above all"
     return Unnamed(words, laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
