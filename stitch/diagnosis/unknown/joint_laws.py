@@ -8,10 +8,9 @@ that is off by a function of its own angle that changes within a few degrees, as
 by any function of the way it came, as by friction, which is neither play nor settling; or that changes as time passes,
 as where its motor warms, which is no drift of mount or part; or by a law of its load that is not that of a spring.
 
-Where nothing has a name, three more are asked for. A function of all angles holds them, or one that changes within a
-few degrees or in time at each pose in another way, but with a number of its own in nearly every view: a joint that
-follows its own angle and one other's, as two do that drag each other, one that errs in waves along its angle, as teeth
-of gears and belts do, and one that errs in time alone, whatever the pose.
+Three more laws such functions hold too, but with a number of their own in nearly every view: a joint that follows its
+own angle and one other's, as two do that drag each other, one that errs in waves along its angle, as teeth of gears and
+belts do, and one that errs in time alone, whatever the pose.
 """
 
 from collections.abc import Sequence
@@ -45,10 +44,7 @@ from stitch.statistics.variance_components import VarianceFit, at_variances, fit
 
 # Of all laws those whose size is sought with all variances.
 _FITTED = 12
-# Kinds of laws that stand against names, and all that are told where nothing has one.
-RIVALS = (ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME, ITS_LOAD)
-KINDS = (*RIVALS, TWO_ANGLES, WAVES, TIME_ALONE)
-# What they follow, as people say it.
+# Kinds of laws, which stand against names and are told where nothing has one, and what each follows, as people say it.
 JOINT_ANGLES = "the joint angles"
 FOLLOWED = {
     **dict.fromkeys((ALL_ANGLES, OWN_ANGLE, TWO_ANGLES, WAVES), JOINT_ANGLES),
@@ -56,6 +52,7 @@ FOLLOWED = {
     **dict.fromkeys((WITH_TIME, TIME_ALONE), "time"),
     ITS_LOAD: "its load",
 }
+KINDS = tuple(FOLLOWED)
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
@@ -106,7 +103,7 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 def log_posterior(base: LinearModel) -> float:
     """That some joint follows such a law, of any kind, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
-    laws = laws_by(base, RIVALS)
+    laws = laws_by(base, KINDS)
     return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
@@ -117,10 +114,10 @@ def some_law(log_bayes_factors: Array) -> Array:
 
 
 def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints that stand against names; usual size."""
+    """(n, n) in the channel of the laws of all joints, usual size; of the kinds that have one for each joint."""
     errors = base.pose_errors
     of_one_joint = {} if errors is None else errors.of_one_joint
-    rivals = [of_one_joint[kind] for kind in RIVALS if kind in of_one_joint]
+    rivals = [smooth for smooth in of_one_joint.values() if not smooth.others and not smooth.periods]
     return [
         SMOOTH**2 * base.reduce(base.reduce(smooth.of(p)).T) for smooth in rivals for p in range(len(smooth.joints))
     ]
