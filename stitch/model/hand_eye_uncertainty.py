@@ -59,4 +59,4 @@ def stands_for(verdict: str | None) -> str:
         None: "; whether an effect is missing has not been asked",
         "adequate": "; no effect is found missing",
     }
-    return f"U of the hand-eye holds for a complete model{told.get(verdict, ', and something is missing in this one')}."
+    return f"U of the hand-eye holds for a complete model{told.get(verdict, ', and this one seems to lack something')}."

@@ -170,8 +170,8 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
     [
         (None, "whether an effect is missing has not been asked"),
         ("adequate", "no effect is found missing"),
-        ("missing_effect", "something is missing in this one"),
-        ("unknown_effect", "something is missing in this one"),
+        ("missing_effect", "this one seems to lack something"),
+        ("unknown_effect", "this one seems to lack something"),
     ],
 )
 def test_an_uncertainty_says_of_which_model_it_is(verdict, said, tmp_path):
