@@ -83,8 +83,9 @@ def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) 
 
 def _called(component: str) -> str:
     """What people call it; one joint by no known law keeps its name."""
-    own = component.startswith("joint ") or component in _CALLED
-    return _CALLED.get(component, component) if own else f"{component} of every joint"
+    if component in _CALLED:
+        return _CALLED[component]
+    return component if component.startswith("joint ") else f"{component} of every joint"
 
 
 def _square(base: Array, numbers: Array) -> float:
