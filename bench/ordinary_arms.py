@@ -8,7 +8,7 @@ over draws. χ²/6 is 1 on the average where sigmas are right; medians are put o
 --alone fits as if poses scattered independently. Seeds are of two kinds: those of development, and held-out ones, to be
 run once for each version of the statistics. Used up: 700 and 701 (one size for quick and slow wandering, sizes by a
 chain that follows the slope), 710 to 712 (sizes drawn in turn, one slow wandering), 720 to 725 (each size by itself),
-726 to 729 (one factor on all sizes of an arm).
+726 to 737 (one factor on all sizes of an arm).
 """
 
 import argparse

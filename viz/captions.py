@@ -37,8 +37,8 @@ ADDED_VARIABLE = (
 SHAPE = "Mean displacement in bins with two sigmas. Bars that all reach zero follow nothing."
 COURSES = (
     "How far a joint is off along what its error follows, an angle, its last move, time or a load, beside its mean and "
-    "with two sigmas. The percentage is the share of all that the joint does without a name. Dashes: where views stood. "
-    "Beyond them nothing is known."
+    "with two sigmas. The percentage is the share of all that the joint does without a name. Dashes: where views "
+    "stood. Beyond them nothing is known."
 )
 TIME_COURSE = (
     "As if the flange were off by so much in time, along its own axes, with two sigmas. Dashes: when "
