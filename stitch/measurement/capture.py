@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 
 from stitch import frames
+from stitch.errors import InputError
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, prepare_view
+from stitch.measurement.scan import GRAZING_COSINE, Scan, prepare_view
 from stitch.measurement.session import Scanner, Session, View
 from stitch.measurement.sightings import Sightings, sightings_of
 from stitch.system.threads import parallel
@@ -75,12 +76,18 @@ def capture(session: Session) -> Capture:
     """Prepare the scans and labelled points of a session and place them on the chain of frames.
 
     Raises:
+        InputError: every cloud is one profile.
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     prepared = partial(_prepared, scanner=session.scanner)
-    scans = parallel(prepared, session.views, "preparing scans") if session.has_clouds else ()
-    return place(session.name, tuple(scans), T_base_flange, session.mount, sightings_of(session))
+    scans = tuple(parallel(prepared, session.views, "preparing scans")) if session.has_clouds else ()
+    if scans and not any((scan.confidence > GRAZING_COSINE).any() for scan in scans):
+        raise InputError(
+            f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
+            "surface; to fix: clouds swept over the part, or, of profiles of one sphere, stitch calibrate sphere"
+        )
+    return place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
 
 
 def _prepared(view: View, scanner: Scanner) -> Scan:

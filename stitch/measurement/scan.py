@@ -146,7 +146,8 @@ def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
     n = normals[centre]
     helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     a = np.cross(n, helper)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    # A point that is seen edge-on has no normal.
+    a /= np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
     b = np.cross(n, a)
     x, y, z = (np.einsum("nki,ni->nk", local, axis) for axis in (a, b, n))
     scale = np.maximum(np.abs(x).max(axis=1, keepdims=True), 1e-300)

@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.effects.in_session import lacking
+from stitch.errors import InputError
+from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.scan import prepare_view
 from stitch.measurement.session import Scanner
@@ -63,3 +66,14 @@ def test_an_intensity_that_is_not_finite_counts_as_none(blade_capture, wrong):
     session.views[1].cloud.scalars["intensity"][3] = wrong
     measurement = measurement_of(session, capture)
     assert not measurement.has_intensity and lacking(measurement, EFFECTS["intensity_bias"]) == ("intensity",)
+
+
+def test_profiles_show_no_surface(recwarn):
+    """All points in a plane through the scanner: said in one line, and no arithmetic warns on the way."""
+    measured = measured_blade(3, views=3, pixels=40)
+    along = np.linspace(-30, 30, 400)
+    profile = np.column_stack([along, np.zeros(400), 300 - 0.01 * along**2])
+    clouds = [replace(c, points=profile, intensity=np.ones(400), incidence=np.ones(400)) for c in measured.clouds]
+    with pytest.raises(InputError, match="every cloud is one profile.*to fix.*stitch calibrate sphere"):
+        capture(session_of(replace(measured, clouds=clouds)))
+    assert not recwarn
