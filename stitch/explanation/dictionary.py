@@ -94,8 +94,8 @@ def _for_joint(i: int, found: Sequence[Quantity]) -> list[Quantity]:
     own = [q for q in found if q.joint == i and q.kind in ("angle", "direction")]
     others = [q for q in found if q.joint != i and q.kind == "angle"]
     slow = [q for q in found if q.kind in ("time", "covariate")]
-    # In a course of time the whole flange errs; teeth are of a joint's own drive.
-    plain = [q for q in found if q.kind != "course" and (q.kind != "teeth" or q.joint == i)]
+    # Teeth are of a joint's own drive.
+    plain = [q for q in found if q.kind != "teeth" or q.joint == i]
     return [*plain, *(a.times(b) for a in own for b in (*others, *slow))]
 
 

@@ -1,4 +1,4 @@
-"""Formulas of scans: a flange that swings, and a gear whose friction remembers where the joint turned."""
+"""Formulas of scans: a flange that swings, a joint that does, and a gear whose friction remembers where the joint turned."""
 
 import re
 
@@ -32,6 +32,17 @@ def test_a_flange_that_swings_gets_the_formula_of_a_swing(cell, tmp_path):
     assert found.heldout_share < 0.6
     (tmp_path / "mine.py").write_text(found.source)
     assert load(tmp_path / "mine.py") == ["explained"]
+
+
+def test_a_joint_that_swings_in_time_gets_the_formula_of_a_swing(cell):
+    joints, seconds = cell.measured.plan.joints, cell.measurement.views.time
+    period = seconds[-1] / 1.3
+    error = np.zeros_like(joints)
+    error[:, 4] = 5e-4 * np.cos(2 * np.pi * seconds / period - 0.6)
+    found = explain(cell.seen(kinematics.flange(cell.measured.plan.arm, joints + error)))
+    assert found.found and found.formula.startswith("q*5 = q5")
+    assert float(re.search(r"([-+0-9.]+) rad · cos\(2π t/", found.formula)[1]) == pytest.approx(5e-4, rel=0.2)
+    assert float(re.search(r"t/([0-9.]+) h", found.formula)[1]) == pytest.approx(period / 3600, rel=0.1)
 
 
 def test_a_gear_with_friction_gets_the_formula_of_what_stays_behind(cell):
