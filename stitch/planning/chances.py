@@ -19,6 +19,7 @@ from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, some_law
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.planning.candidate_tests import CandidateTest, candidate_test, covariance_tests
+from stitch.statistics.mean_factor import log_mean
 
 DRAWS = 100
 
@@ -43,7 +44,8 @@ class ExpectedDiagnosis:
         self._half = np.linalg.cholesky(linear.covariance[0])
         self._of_arm = set({} if linear.pose_errors is None else linear.pose_errors.effects)
         self._tests: dict[tuple[frozenset[str], str], CandidateTest] = {}
-        self._laws: dict[int, tuple[tuple[CandidateTest, ...], ...]] = {}  # by law its tests at several sizes
+        # By candidate the tests of all laws beside it, of each kind of each joint together, at several sizes.
+        self._laws: dict[int, list[list[tuple[CandidateTest, ...]]]] = {}
 
     def seen(self, shift: Array, rng: np.random.Generator) -> Array:
         """(n, D) numbers of the channel: shifts (n, D) under all other errors."""
@@ -90,18 +92,23 @@ class ExpectedDiagnosis:
         """(D,) whether a candidate is ahead of joints that follow by no law (`joint_laws.py`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
-            found = law_covariances(own.linear)
-            self._laws[k] = tuple(tuple(covariance_tests(own.linear, C, np.sqrt(TIMES))) for C in found)
-        laws = self._laws[k]
-        if not laws:
+            found, sizes = law_covariances(own.linear), np.sqrt(TIMES)
+            self._laws[k] = [[covariance_tests(own.linear, C, sizes) for C in kind] for kind in found]
+        kinds = self._laws[k]
+        if not kinds:
             return np.ones(numbers.shape[1], bool)
-        rival = some_law(np.array([np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in laws]))
+        rival = some_law(np.array([log_mean(np.array([_at_best(law, numbers) for law in kind])) for kind in kinds]))
         return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
         pair = [self.candidates[k], self.candidates[other]]
         own, rival = (self._test({c.name for c in pair}, c).evaluate(numbers)[0] for c in pair)
         return np.asarray(own > rival + ODDS)
+
+
+def _at_best(law: Sequence[CandidateTest], numbers: Array) -> Array:
+    """(D,) log Bayes factor at the likeliest of its sizes."""
+    return np.asarray(np.max([size.evaluate(numbers)[0] for size in law], axis=0))
 
 
 def _visible(linear: LinearModel, candidate: Candidate) -> bool:

@@ -113,13 +113,13 @@ def some_law(log_bayes_factors: Array) -> Array:
     return np.asarray(log_mean(log_bayes_factors) + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
 
 
-def law_covariances(base: LinearModel) -> list[Array]:
-    """(n, n) in the channel of the laws of all joints, usual size; of the kinds that have one for each joint."""
-    errors = base.pose_errors
-    of_one_joint = {} if errors is None else errors.of_one_joint
-    rivals = [smooth for smooth in of_one_joint.values() if not smooth.others and not smooth.periods]
+def law_covariances(base: LinearModel) -> list[list[Array]]:
+    """(n, n) in the channel of the laws of usual size, those of one kind of one joint together."""
+    of_one_joint = {} if base.pose_errors is None else base.pose_errors.of_one_joint
     return [
-        SMOOTH**2 * base.reduce(base.reduce(smooth.of(p)).T) for smooth in rivals for p in range(len(smooth.joints))
+        [SMOOTH**2 * base.reduce(base.reduce(smooth.of(p)).T) for p in smooth.of_joint(joint)]
+        for smooth in of_one_joint.values()
+        for joint in dict.fromkeys(smooth.joints)
     ]
 
 
