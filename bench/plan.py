@@ -5,7 +5,7 @@ Usage: python -m bench.plan [--cells N] [--rows FILE] [--write]
 A cell with one hidden effect of the size that nature draws, times 0.2 to 2. Before any scan the plan says how likely an
 effect of that size and shape is detected, named, misnamed; then every scan is simulated, and the verdict of a diagnosis
 taken. The simulator shares no code with the plan. Rows are added to FILE, where one stands already it is not run again;
---write puts the table into docs/plan.md. Some 15 s a cell.
+--write puts the table into docs/plan.md. Some 4 s a cell.
 """
 
 import argparse
@@ -57,7 +57,7 @@ LAWS = (
     "lens_distortion",
     "settling",
 )
-_VIEWS, _PIXELS = 12, 60
+_VIEWS, _PIXELS = 12, 150
 _SIZES = (0.2, 2.0)  # of nature's own, log-uniform
 _FIRST_SEED, _ENOUGH = 700, 20
 _BINS = (0.0, 0.25, 0.75, 1.0)
