@@ -22,7 +22,7 @@ from stitch.diagnosis.thresholds import MANY_POSES, PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
-from stitch.diagnosis.variance_budget import variance_budget
+from stitch.diagnosis.variance_budget import BudgetLine, variance_budget
 from stitch.diagnosis.within_overlaps import left_within, scanner_error
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
@@ -86,9 +86,7 @@ def _diagnosed(state: State) -> Diagnosis:
         of_field=of_field,
         smooth=smooth or (scanner_error(linear) if unknown else None),
         doubts=state.doubts,
-        budget=variance_budget(
-            _beside(linear, said), [r.score for r in selection.named[:1]], said[0].process if said else None
-        ),
+        budget=_budget(linear, selection, said),
     )
     return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
 
@@ -104,6 +102,12 @@ def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float
     null = process.fit if process else _beside(linear, said).null if said else linear.scatter_only.null
     rotation, translation = np.sqrt(null.variances[:2])
     return float(rotation), float(translation)
+
+
+def _budget(linear: LinearModel, selection: Selection, said: Sequence[Unnamed]) -> tuple[BudgetLine, ...]:
+    """Of what the poses leave, with what is named first and what is said to err without a name."""
+    process = said[0].process if said else None
+    return variance_budget(_beside(linear, said), [r.score for r in selection.named[:1]], process)
 
 
 def _beside(linear: LinearModel, said: Sequence[Unnamed]) -> LinearModel:
