@@ -51,7 +51,9 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     assert page.count(unbroken(finding["plain"])) == 2  # on top, and where the evidence stands
     holds = "U of the hand-eye holds for a complete model"
     assert f"{holds}; whether an effect is missing has not been asked" in (before / "report.html").read_text()
-    assert all(f"{holds}, and this one seems to lack" in said for said in (diagnosed, (run / "report.html").read_text()))
+    assert all(
+        f"{holds}, and this one seems to lack" in said for said in (diagnosed, (run / "report.html").read_text())
+    )
     added = told(capsys, "add", run, "joint_offset", "--no-recording")
     result, ledger = (json.loads((run / f"{name}.json").read_text()) for name in ("result", "ledger"))
     rms = [f"{1e3 * step['residual_rms']:.3g} µm" for step in ledger]
