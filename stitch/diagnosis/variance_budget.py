@@ -74,18 +74,13 @@ def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) 
     U = column_space(np.hstack([linear.reduce(linear.design), *named]))
     mixed = replace(linear.mixed, A=U[None])
     sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
+    of_every_joint = {component for component, _ in errors.effects.values()}
+    called = _CALLED | {component: f"{component} of every joint" for component in of_every_joint}
     for name, size, C in zip((*WHITE, *errors.names), sizes, mixed.components[:, 0], strict=True):
-        yield _called(name), float(size * (np.trace(C) - np.sum(U * (C @ U))))
+        yield called.get(name, name), float(size * (np.trace(C) - np.sum(U * (C @ U))))
     if linear.mixed.fixed is not None:
         C = linear.mixed.fixed[0]
         yield "scanner field", float(np.trace(C) - np.sum(U * (C @ U)))
-
-
-def _called(component: str) -> str:
-    """What people call it; one joint by no known law keeps its name."""
-    if component in _CALLED:
-        return _CALLED[component]
-    return component if component.startswith("joint ") else f"{component} of every joint"
 
 
 def _square(base: Array, numbers: Array) -> float:

@@ -16,8 +16,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.joint_laws import FOLLOWED, JointLaw, joint_laws
+from stitch.diagnosis.unknown.joint_laws import JointLaw, joint_laws
+from stitch.diagnosis.unknown.law_covariates import followed_in_words
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.mean_factor import log_mean
 
 
 def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
@@ -49,11 +51,11 @@ def _likely(laws: Sequence[JointLaw]) -> tuple[JointLaw, ...]:
     Args:
         laws: of all kinds and joints, likeliest first.
     """
+    if not laws or log_mean([law.log_bayes_factor for law in laws]) <= ODDS:
+        return ()
     of_joint = {k: [law for law in laws if law.joint == k] for k in dict.fromkeys(law.joint for law in laws)}
     factors = {k: [law.log_bayes_factor for law in own] for k, own in of_joint.items()}
     together = {k: float(logsumexp(own) - np.log(len(laws))) for k, own in factors.items()}
-    if not laws or logsumexp(list(together.values())) <= ODDS:
-        return ()
     near = [k for k in together if together[k] > max(together.values()) - ODDS]
     return tuple(_told(of_joint[k], together[k]) for k in sorted(near, key=lambda k: -together[k]))
 
@@ -65,6 +67,5 @@ def _told(laws: Sequence[JointLaw], together: float) -> JointLaw:
         laws: of all kinds, likeliest first.
         together: log Bayes factor of them.
     """
-    near = [law.follows for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS]
-    may_follow = tuple(dict.fromkeys(FOLLOWED[kind] for kind in near))
-    return replace(laws[0], log_bayes_factor=together, may_follow=may_follow)
+    near = [law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS]
+    return replace(laws[0], log_bayes_factor=together, may_follow=tuple(dict.fromkeys(map(followed_in_words, near))))

@@ -25,16 +25,6 @@ from stitch.diagnosis.unknown.process_size import at_likeliest_size
 from stitch.diagnosis.unknown.smooth_processes import with_covariance
 from stitch.frames import Array
 from stitch.observations.error_model import with_errors
-from stitch.observations.joint_processes import (
-    ALL_ANGLES,
-    ITS_LOAD,
-    OWN_ANGLE,
-    THE_WAY,
-    TIME_ALONE,
-    TWO_ANGLES,
-    WAVES,
-    WITH_TIME,
-)
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import SMOOTH
 from stitch.statistics.kernels import SmoothErrors
@@ -44,15 +34,6 @@ from stitch.statistics.variance_components import VarianceFit, at_variances, fit
 
 # Of all laws those whose size is sought with all variances.
 _FITTED = 12
-# Kinds of laws, which stand against names and are told where nothing has one, and what each follows, as people say it.
-JOINT_ANGLES = "the joint angles"
-FOLLOWED = {
-    **dict.fromkeys((ALL_ANGLES, OWN_ANGLE, TWO_ANGLES, WAVES), JOINT_ANGLES),
-    THE_WAY: "the way it came",
-    **dict.fromkeys((WITH_TIME, TIME_ALONE), "time"),
-    ITS_LOAD: "its load",
-}
-KINDS = tuple(FOLLOWED)
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
@@ -97,13 +78,13 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `some_law` charges it for that.
     """
-    return tuple(sorted(laws_by(base, KINDS), key=lambda law: -law.log_bayes_factor))
+    return tuple(sorted(laws_by(base, _kinds(base)), key=lambda law: -law.log_bayes_factor))
 
 
 def log_posterior(base: LinearModel) -> float:
     """That some joint follows such a law, of any kind, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
-    laws = laws_by(base, KINDS)
+    laws = joint_laws(base)
     return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
@@ -121,6 +102,11 @@ def law_covariances(base: LinearModel) -> list[list[Array]]:
         for smooth in of_one_joint.values()
         for joint in dict.fromkeys(smooth.joints)
     ]
+
+
+def _kinds(base: LinearModel) -> Sequence[str]:
+    """All that the views tell of."""
+    return () if base.pose_errors is None else tuple(base.pose_errors.of_one_joint)
 
 
 def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:

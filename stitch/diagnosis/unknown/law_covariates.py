@@ -29,6 +29,7 @@ from stitch.statistics.kernels import (
     reach_of_way,
 )
 
+JOINT_ANGLES = "the joint angles"
 _DEGREES = float(np.degrees(1.0))
 
 
@@ -45,7 +46,12 @@ class Along:
 
 def followed_by(law: JointLaw) -> list[Along]:
     """All of them, by the kind of the law."""
-    return _FOLLOWED[law.follows](law)
+    return _FOLLOWED[law.follows][1](law)
+
+
+def followed_in_words(law: JointLaw) -> str:
+    """The same as people say it: the joint angles, the way it came, time, its load."""
+    return _FOLLOWED[law.follows][0]
 
 
 def _angle(joint: int, stood: Array, of_it: Callable[[Array, Array], Array], rest: Array | float = 1.0) -> Along:
@@ -122,15 +128,16 @@ def _load_name(torque: str) -> str:
     return f"j{torque}_torque_nm" + ("_per_kg" if "_" in torque else "")
 
 
-_FOLLOWED = {
-    ALL_ANGLES: _all_angles,
-    TWO_ANGLES: _two_angles,
-    OWN_ANGLE: _own_angle,
-    WAVES: _waves,
-    THE_WAY: _the_way,
-    WITH_TIME: _with_time,
-    TIME_ALONE: _time_alone,
-    ITS_LOAD: _its_load,
+# By kind of law what it follows, in words and along what its course is told.
+_FOLLOWED: dict[str, tuple[str, Callable[[JointLaw], list[Along]]]] = {
+    ALL_ANGLES: (JOINT_ANGLES, _all_angles),
+    TWO_ANGLES: (JOINT_ANGLES, _two_angles),
+    OWN_ANGLE: (JOINT_ANGLES, _own_angle),
+    WAVES: (JOINT_ANGLES, _waves),
+    THE_WAY: ("the way it came", _the_way),
+    WITH_TIME: ("time", _with_time),
+    TIME_ALONE: ("time", _time_alone),
+    ITS_LOAD: ("its load", _its_load),
 }
 
 

@@ -46,8 +46,8 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
     for k, own in found.items():
         gains[k] = max(gains[k], own.log_bayes_factor)
     best = max(found, key=lambda k: gains[k])
-    kinds = {kind: gains[[course.kind == kind for course in courses]] for kind in {course.kind for course in courses}}
-    together = log_mean([float(log_mean(of_kind)) for of_kind in kinds.values()])
+    kinds = np.array([course.kind for course in courses])
+    together = log_mean([float(log_mean(gains[kinds == kind])) for kind in np.unique(kinds)])
     return TimeLaw(courses[best], float(together), found[best], linear)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.clear_joints import clear_laws
-from stitch.diagnosis.unknown.joint_laws import JOINT_ANGLES, JointLaw
+from stitch.diagnosis.unknown.joint_laws import JointLaw
+from stitch.diagnosis.unknown.law_covariates import JOINT_ANGLES
 from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
 from stitch.diagnosis.unknown.time_laws import clear_time_law
