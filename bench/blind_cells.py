@@ -106,7 +106,6 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
     if candidate is None:
         return None
     linear = linear.without([effect])
-    e, tests = linear.mixed, len(EFFECTS)
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])
     found = []
@@ -119,8 +118,7 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
             least = least_noncentrality(
                 white * form.sizes,
                 float(weight),
-                tests,
-                e.size - e.A.shape[2],
+                len(EFFECTS),
                 degrees_of_freedom,
                 scales_of(linear),
             )

@@ -139,9 +139,8 @@ def _least(a: Asked, world: World) -> float:
     """Factor on the errors of a world at which one test for them, of as many as there are effects, finds them."""
     plain = white(a.linear)
     seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
-    free = plain.mixed.size - plain.mixed.A.shape[2]
     scatter = plain.satterthwaite.of(plain.in_blocks(seen))
-    return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), free, scatter)) / np.linalg.norm(seen))
+    return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter)) / np.linalg.norm(seen))
 
 
 def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:

@@ -11,6 +11,7 @@ from stitch.integrity.admitted_fit import Admitted, admitted_fit
 from stitch.integrity.arm_here import ArmHere, arm_here
 from stitch.integrity.model_here import held_against_own
 from stitch.integrity.refusals import mistakes_named
+from stitch.integrity.rig_apart import sessions_apart
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import about_part, measurement_of
 from stitch.measurement.session import Session
@@ -20,6 +21,7 @@ from stitch.model.model_toml import ModelFile
 from stitch.runs.recorder import Recorder, Silent
 from stitch.runs.run import Run, StageResult
 from stitch.runs.state import State, state_of
+from stitch.stages.coarse import Coarse
 from stitch.stages.course import End, collected, course_of
 from stitch.stages.fitted import BeginAt, Course, Fitted
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
@@ -89,6 +91,10 @@ def run_rig(
         end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
         if model and not sessions[0].has_clouds:
             found = held_against_own(found, partial(_fitted_here, course, found, with_arm(arm_in(model))))
+        if len(sessions) > 1 and effects:
+            alone = partial(_alone, course, found, begun, with_arm(arm))
+            apart = sessions_apart([s.name for s in found.sessions], found.fitted, alone)
+            end = replace(end, doubts=tuple(own.doubt(sessions[0].length_unit) for own in apart))
         if arm:
             again = partial(course.fit, found.sessions, found.measurements, begun, recorder=Silent())
             here = arm_here(lambda other: again(begin_at=with_arm(other)), arm, found.fitted)
@@ -99,7 +105,12 @@ def run_rig(
 def _with_arm_told(end: End, here: ArmHere, length_unit: str) -> End:
     """A note that the arm of another run holds here, or the doubt that it does not."""
     told = (here.sentence(length_unit),)
-    return replace(end, notes=told) if here.holds else replace(end, doubts=told)
+    return replace(end, notes=told) if here.holds else replace(end, doubts=(*end.doubts, *told))
+
+
+def _alone(course: Course, found: Admitted, begun: Sequence[Coarse], begin_at: BeginAt | None, i: int) -> Fitted:
+    """One session of a rig by itself."""
+    return course.fit([found.sessions[i]], [found.measurements[i]], [begun[i]], begin_at, Silent())
 
 
 def _fitted_here(course: Course, found: Admitted, begin_at: BeginAt | None) -> Fitted:

@@ -13,12 +13,14 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import implausible, scatter_limit
 from stitch.diagnosis.score import Score
+from stitch.diagnosis.selection.pairs import beside_each_other
+from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
 from stitch.diagnosis.sensitivity.detectable import smallest_detectable
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
 from stitch.diagnosis.sentences import sentence_of
-from stitch.diagnosis.thresholds import MANY_POSES, PREDICTED
+from stitch.diagnosis.thresholds import MANY_POSES, MANY_VIEWS, PREDICTED
 from stitch.diagnosis.unknown.joint_curves import joint_curves
 from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
@@ -67,6 +69,7 @@ def _diagnosed(state: State) -> Diagnosis:
         effects=tuple(r.name for r in selection.named),
         sentence="",
         residual_rms=state.residual_rms,
+        heldout_rms=state.heldout_rms,
         noise_floor=state.noise_floor,
         rotation=rotation,
         translation=translation,
@@ -88,7 +91,17 @@ def _diagnosed(state: State) -> Diagnosis:
         doubts=state.doubts,
         budget=_budget(linear, selection, said),
     )
-    return replace(found, sentence=sentence_of(found, state.session.length_unit, selection.second))
+    return replace(found, sentence=sentence_of(found, state.session.length_unit, _pair(linear, selection)))
+
+
+def _pair(linear: LinearModel, selection: Selection) -> tuple[Ranked, Ranked] | None:
+    """Two effects that are missing; of many views they were chosen beside each other."""
+    if selection.second is None:
+        return None
+    first, second = selection.named[0], selection.second
+    if linear.measurement.views.count >= MANY_VIEWS:
+        return first, second
+    return beside_each_other(linear, first, second, len(selection.ranked))
 
 
 def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:

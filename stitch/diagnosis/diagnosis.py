@@ -44,6 +44,7 @@ class Diagnosis:
     effects: tuple[str, ...]
     sentence: str
     residual_rms: float
+    heldout_rms: float  # the same on views left out
     noise_floor: float
     rotation: float  # repeatability under the present model, rad
     translation: float  # length_unit

@@ -7,7 +7,9 @@ import numpy as np
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, IMPLAUSIBLE
 from stitch.measurement.session import Session
 from stitch.observations.linear_model import LinearModel
+from stitch.statistics.satterthwaite import satterthwaite
 from stitch.statistics.tails import chi2_limit
+from stitch.statistics.variance_components import at_variances
 from stitch.units import METRES
 
 
@@ -42,7 +44,8 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
     """True if the poses scatter as no arm does, or by more than is stated and chance explains.
 
     All of it counts, what repeats too: the views may not tell which it is. An estimated variance of ν degrees of
-    freedom exceeds a stated one by χ²(ν)/ν at most.
+    freedom exceeds a stated one by χ²(ν)/ν at most; ν where the scatter is as stated, since what is large by chance
+    looks well known.
     """
     linear = linear.scatter_only
     for i, (allowed, stated) in enumerate(
@@ -50,8 +53,16 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
     ):
         chance = 1.0
         if stated:
-            known = 2 / max(float(linear.satterthwaite.spread[i, i]), 1e-9)
-            chance = float(np.sqrt(chi2_limit(ALPHA_UNKNOWN, known) / known))
+            known = _degrees_of_freedom(linear, i, allowed)
+            chance = float(np.sqrt(chi2_limit(ALPHA_UNKNOWN / 2, known) / known))
         if np.sqrt(linear.null.variances[i]) > chance * allowed:
             return True
     return False
+
+
+def _degrees_of_freedom(linear: LinearModel, component: int, sigma: float) -> float:
+    """To which the variance of a component would be known if its standard deviation were that."""
+    variances = linear.null.variances.copy()
+    variances[component] = sigma**2
+    known = satterthwaite(linear.mixed, at_variances(linear.mixed, variances))
+    return 2 / max(float(known.spread[component, component]), 1e-9)

@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.form_trial import LONG, FormTrial, Gain, gain_at_null, residuals, try_form
+from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
@@ -51,6 +52,11 @@ class Score:
         return self.candidate.name
 
     @property
+    def sizes(self) -> Array:
+        """(p,) of its parameters, as believed beside others: plausible ones, unless larger are likelier."""
+        return np.asarray(max(self.scale, 1.0) * self.form.sizes)
+
+    @property
     def sigmas(self) -> Array:
         """(p,) standard deviations of the values."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0))
@@ -72,6 +78,8 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     gained, shown = zip(*(_quick(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
     likely = quick.max(axis=1)
+    # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
+    seen = seen or bool(likely.max() > LOG_BAYES_FACTOR)
     least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
     worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
     tried = [

@@ -10,8 +10,12 @@ from stitch.diagnosis.variance_budget import NOT_REPEATING
 from stitch.units import amount, angle_text, length_text
 
 
-def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
-    """One sentence for each verdict."""
+def sentence_of(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
+    """One sentence for each verdict.
+
+    Args:
+        pair: two effects that are missing, each beside the other; the first is the one that is named.
+    """
     now, floor = (length_text(x, length_unit) for x in (d.residual_rms, d.noise_floor))
     scatter = f"{length_text(d.translation, length_unit)} and {angle_text(d.rotation)}"
     if d.verdict == "adequate":
@@ -22,7 +26,7 @@ def sentence_of(d: Diagnosis, length_unit: str, second: Ranked | None) -> str:
             f"{rest if _scatters(d) else ''}{beside_adequate(d.smooth, length_unit)}{_notes(d)}."
         )
     if d.verdict == "missing_effect":
-        return _missing(d, length_unit, now, floor, second)
+        return _missing(d, length_unit, now, floor, pair)
     if d.verdict == "cannot_tell":
         return _not_told_apart(d, now, floor)
     return _unknown(d, length_unit, now, floor, scatter)
@@ -35,19 +39,20 @@ def _not_told_apart(d: Diagnosis, now: str, floor: str) -> str:
     return f"{start}, but these views cannot tell {' or '.join(d.effects)} apart{then}"
 
 
-def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, second: Ranked | None) -> str:
+def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, pair: tuple[Ranked, Ranked] | None) -> str:
     name = d.effects[0]
     candidate = next(s for s in d.candidates if s.name == name)
-    amounts = amounts_of(candidate.ranked)
+    ranked = pair[0] if pair else candidate.ranked
     gain = ""
     if candidate.cross_validation is not None:
         inside, heldout = candidate.cross_validation.inside, candidate.cross_validation.heldout
-        left, out = (length_text(d.residual_rms * np.sqrt(share), length_unit) for share in (inside, heldout))
+        left, out = (length_text(x, length_unit) for x in (d.residual_rms * inside**0.5, d.heldout_rms * heldout**0.5))
         gain = f"; adding it should leave about {left}, {out} on views left out"
-    more = f" {second.name} seems to be there too." if second else ""
+    too = f"{pair[1].name} seems to be there too ({amounts_of(pair[1])})" if pair else ""
+    more = f" {too}; each is sized beside the other." if pair else ""
     missing = "is missing" if d.certain else "may be missing"
     return (
-        f"{name} {missing} ({amounts}; p = {candidate.ranked.adjusted:.1g}{_chance(d)}): {now} remain where noise "
+        f"{name} {missing} ({amounts_of(ranked)}; p = {ranked.adjusted:.1g}{_chance(d)}): {now} remain where noise "
         f"would leave {floor}{gain}.{more}"
     )
 

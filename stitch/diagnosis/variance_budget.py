@@ -12,6 +12,8 @@ from stitch.observations.error_model import WHITE
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.statistics.identifiability import project_out
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.variance_components import fit_variances
@@ -50,8 +52,9 @@ def variance_budget(
         named: candidates that are said to be missing: what they explain is theirs.
         course: of the flange in time, where one is said to be there.
     """
-    if linear.pose_errors is None:
+    if (errors := linear.pose_errors) is None:
         return ()
+    linear = _with_field_as_shown(linear)
     hand_eye = linear.reduce(linear.design[:, :6])
     squares: dict[str, float] = {}
     for term, response in zip(linear.model.terms, linear.responses(linear.model.terms), strict=True):
@@ -62,11 +65,20 @@ def variance_budget(
     if course is not None:
         squares["one course of time"] = _square(hand_eye, course.numbers)
         explained.append(course.columns)
-    for name, square in _remaining(linear, linear.pose_errors, explained):
+    for name, square in _remaining(linear, errors, explained):
         squares[name] = squares.get(name, 0.0) + square
     total, unit, n = sum(squares.values()), linear.measurement.length_unit, linear.mixed.size
     lines = [BudgetLine(s, x / max(total, 1e-300), float(np.sqrt(max(x, 0.0) / n)), unit) for s, x in squares.items()]
     return tuple(sorted(lines, key=lambda line: -line.variance_share))
+
+
+def _with_field_as_shown(linear: LinearModel) -> LinearModel:
+    """With smooth errors of the scanner as large as the overlaps show them; an alarm allows for larger ones."""
+    seen = linear.observation
+    if linear.mixed.fixed is None or not isinstance(seen, Surfaces):
+        return linear
+    field = linear.reduce(field_scatter(linear.measurement, seen.freed, share=None))
+    return replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
 
 
 def _remaining(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) -> Iterator[tuple[str, float]]:

@@ -59,12 +59,12 @@ def arm_here(fit: FitWith, arm: ModelFile, found: Fitted) -> ArmHere:
     Args:
         found: the fit with it.
     """
-    own, nominal = _squares(found), _squares(fit(None))
+    own, nominal = squares_of_views(found), squares_of_views(fit(None))
     here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), clearly_less(nominal, own, _CHANCE))
     if len(arm.effects) < 2:
         return here
     rest = {name: {e: p for e, p in arm.effects.items() if e != name} for name in arm.effects}
-    left = {name: _squares(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
+    left = {name: squares_of_views(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
     best = min(left, key=lambda name: _rms(left[name]))
     less = clearly_less(left[best], own, _CHANCE / len(left))
     return replace(here, better_without=best, without_rms=_rms(left[best])) if less else here
@@ -74,7 +74,7 @@ def _rms(squares: Array) -> float:
     return float(np.sqrt(np.nanmean(squares)))
 
 
-def _squares(fitted: Fitted) -> Array:
+def squares_of_views(fitted: Fitted) -> Array:
     """(ΣV,) mean square distance of the targets, or of the surfaces, in every view; NaN where nothing was seen."""
     if fitted.correction is not None:
         every = zip(fitted.captures, fitted.correction.overlaps, strict=True)

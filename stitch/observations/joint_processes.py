@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.torques import STILL, Torques
 from stitch.observations.flange_errors import WANDERING, near_in_time
@@ -24,6 +24,8 @@ from stitch.statistics.kernels import (
 # bends it.
 ALL_ANGLES, OWN_ANGLE, THE_WAY, WITH_TIME = "all angles", "own angle", "the way it came", "time"
 ITS_LOAD, TWO_ANGLES, WAVES, TIME_ALONE = "its load", "its angle and another", "waves of its angle", "time alone"
+# A joint that turns less stands still, rad: what follows its angle alone is the same in all views, and has a name.
+_STILL = 1e-3
 # Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
 _LEAST_WAVES, _APART, _SHORTEST, _MOST_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
 
@@ -39,28 +41,53 @@ def joint_processes(
         alike: (V, V) of a smooth function of all joints.
     """
     came = joints - np.concatenate([m.views.previous for m in measurements])
-    closely = np.array([alike_closely(q, q) for q in joints.T])
-    in_way = np.array(list(map(alike_in_way, joints.T, came.T)))
     slowly = near_in_time(measurements, WANDERING["slowly wandering"])
-    kinds = {ALL_ANGLES: alike, OWN_ANGLE: closely, THE_WAY: in_way}
-    kinds |= {WITH_TIME: (1 + alike) / 2 * slowly, TIME_ALONE: slowly}
     each = tuple(range(joints.shape[1]))
+    kinds = {ALL_ANGLES: alike, WITH_TIME: (1 + alike) / 2 * slowly, TIME_ALONE: slowly}
     found = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
-    found |= {TWO_ANGLES: _by_two_angles(joints, offsets)} if len(each) > 1 else {}
-    return found | _in_waves(joints, offsets) | _by_load([m.views.torques for m in measurements], offsets)
+    found |= _by_own_angle(joints, came, offsets) | _by_two_angles(joints, offsets) | _in_waves(joints, offsets)
+    return found | _by_load([m.views.torques for m in measurements], offsets)
 
 
-def _by_two_angles(joints: Array, offsets: Array) -> SmoothErrors:
+def _turns(joints: Array) -> Mask:
+    """(n,) joints that do not stand still in all views (V, n), rad."""
+    return np.asarray(np.ptp(joints, axis=0) > _STILL)
+
+
+def _by_own_angle(joints: Array, came: Array, offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint does that follows its own angle closely, or the way it came, by these kinds of law; {} where none
+    turns.
+
+    Args:
+        joints: (V, n) rad.
+        came: (V, n) rad from the view before.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    own = tuple(map(int, np.flatnonzero(_turns(joints))))
+    if not own:
+        return {}
+    closely = np.array([alike_closely(joints[:, k], joints[:, k]) for k in own])
+    in_way = np.array([alike_in_way(joints[:, k], came[:, k]) for k in own])
+    kinds = {OWN_ANGLE: closely, THE_WAY: in_way}
+    return {kind: SmoothErrors(offsets[:, own], alike, own) for kind, alike in kinds.items()}
+
+
+def _by_two_angles(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
     """What each joint does that follows its own angle and one other's alone, as joints do that drag each other: of the
-    many numbers that a function of all angles may have in few views it has a few.
+    many numbers that a function of all angles may have in few views it has a few. By that kind of law; {} where no
+    two are known of which one turns.
 
     Args:
         joints: (V, n) rad.
         offsets: (6V, n) twists of the views per unit of each joint.
     """
-    pairs = list(permutations(range(joints.shape[1]), 2))
+    turns = _turns(joints)
+    pairs = [two for two in permutations(range(joints.shape[1]), 2) if turns[[*two]].any()]
+    if not pairs:
+        return {}
     own, others = (tuple(of) for of in zip(*pairs, strict=True))
-    return SmoothErrors(offsets[:, own], np.array([alike_in_two(*joints.T[[*two]]) for two in pairs]), own, others)
+    alike = np.array([alike_in_two(*joints.T[[*two]]) for two in pairs])
+    return {TWO_ANGLES: SmoothErrors(offsets[:, own], alike, own, others)}
 
 
 def _in_waves(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
@@ -71,7 +98,7 @@ def _in_waves(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
         joints: (V, n) rad.
         offsets: (6V, n) twists of the views per unit of each joint.
     """
-    found = [(k, period) for k, own in enumerate(np.ptp(joints, axis=0)) if own > 0 for period in _periods(own)]
+    found = [(k, period) for k, own in enumerate(np.ptp(joints, axis=0)) if own > _STILL for period in _periods(own)]
     if not found:
         return {}
     own, periods = (tuple(of) for of in zip(*found, strict=True))

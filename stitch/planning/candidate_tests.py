@@ -58,9 +58,9 @@ def candidate_test(linear: LinearModel, candidate: Candidate, tests: int) -> Can
     """
     forms, scales = zip(candidate.forms, form_weights(candidate), strict=True), scales_of(linear)
     found = [
-        _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, len(scales))
+        _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, share)
         for form, weight in forms
-        for scale in scales
+        for scale, share in scales.items()
     ]
     return CandidateTest(linear, tuple(found))
 
@@ -71,18 +71,18 @@ def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> t
     return tuple(CandidateTest(linear, (_form_test(linear, sigma * half, 1.0, 1),)) for sigma in sigmas)
 
 
-def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, scales: int = 1) -> _FormTest:
-    """Of columns (n, p) at one of so many scales, equally likely; all of them are one test."""
-    rest = max(linear.mixed.size - linear.mixed.A.shape[2] - 1, 1)
+def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, share: float = 1.0) -> _FormTest:
+    """Of columns (n, p) at a scale that has such a share of belief; all scales are one test."""
     white = linear.residual(columns)
+    known = max(linear.satterthwaite.of(linear.in_blocks(white)), 1.0)
     information = white.T @ white
     values, vectors = np.linalg.eigh(information)
     keep = values > _TOLD
     solved = (vectors[:, keep] / np.sqrt(values[keep])).T
-    limit = keep.sum() * f_limit(ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), rest)
+    limit = keep.sum() * f_limit(ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), known)
     with_prior = np.eye(len(values)) + information
     return _FormTest(
-        weight / scales,
+        weight * share,
         against=white.T,
         inverse=np.asarray(np.linalg.inv(with_prior), float),
         occam=float(np.linalg.slogdet(with_prior)[1]) / 2,

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
@@ -25,6 +27,12 @@ class State:
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not count; session and measurement are without
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
+
+    @property
+    def heldout_rms(self) -> float:
+        """On views left out, length_unit; that of the fit where the history does not know it."""
+        known = self.ledger[-1].heldout_rms if self.ledger else np.nan
+        return known if np.isfinite(known) else self.residual_rms
 
     def __repr__(self) -> str:
         return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"

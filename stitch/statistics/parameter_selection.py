@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import expit
 
 from stitch.frames import Array, Mask
+from stitch.statistics.amplitude_scales import PLAUSIBLE, log_mixture
 from stitch.statistics.identifiability import project_out
 
 # Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
@@ -44,9 +45,8 @@ def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]],
 
     def gain(chosen: Sequence[int]) -> float:
         index = sorted({i for k in chosen for i in groups[k]})
-        information = np.eye(len(index)) + M[np.ix_(index, index)]
-        b = v[index]
-        return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
+        told, b = M[np.ix_(index, index)], v[index]
+        return log_mixture(np.array([_evidence(scale**2 * told, scale * b) for scale in PLAUSIBLE]), PLAUSIBLE)
 
     every = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
@@ -60,6 +60,12 @@ def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]],
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
     return out
+
+
+def _evidence(told: Array, b: Array) -> float:
+    """Log likelihood ratio integrated over standard normal amplitudes, from MᵀM and Mᵀy."""
+    information = np.eye(len(b)) + told
+    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
 
 def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask) -> Array:

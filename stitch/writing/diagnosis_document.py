@@ -99,7 +99,7 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
         "observable": s.observable,
         "parameters": parameters,
         "rms_if_added": None if left_out is None else d.residual_rms * float(np.sqrt(left_out.inside)),
-        "heldout_rms_if_added": None if left_out is None else d.residual_rms * float(np.sqrt(left_out.heldout)),
+        "heldout_rms_if_added": None if left_out is None else d.heldout_rms * float(np.sqrt(left_out.heldout)),
         # Of the parameter that these views know best against its plausible size; all below.
         "minimum_detectable": detectable.get(_clearest(candidate) or ""),
         "minimum_detectable_of": _clearest(candidate),

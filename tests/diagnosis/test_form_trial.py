@@ -8,9 +8,10 @@ from scipy.stats import multivariate_normal
 
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.form_trial import SCALES, try_form
+from stitch.diagnosis.form_trial import try_form
 from stitch.diagnosis.score import score
 from stitch.effects.contract import EFFECTS
+from stitch.statistics.amplitude_scales import ANY_SIZE
 from stitch.statistics.variance_prior import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -25,7 +26,7 @@ def linear():
     return cell.seen(frames.exp(drift) @ cell.measured.T_base_flange)
 
 
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("scale", ANY_SIZE)
 def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(linear, scale):
     candidate = candidate_of(linear, EFFECTS["mount_drift"])
     form = candidate.forms[0]
@@ -39,7 +40,7 @@ def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(line
         density = multivariate_normal(cov=covariance).logpdf(free @ linear.mixed.z[0])
         return density - 0.5 * log_prior(np.log(variances), linear.pose_errors.scales)[0]
 
-    with_it = logsumexp([likely(found.variances, s * form.sizes) for s in SCALES]) - np.log(len(SCALES))
+    with_it = logsumexp([likely(found.variances, s * form.sizes) + np.log(y) for s, y in ANY_SIZE.items()])
     without = likely(linear.null.variances, 0 * form.sizes)
     # The other scales count at the variances of the first search.
     assert found.log_bayes_factor == pytest.approx(with_it - without, abs=0.25)

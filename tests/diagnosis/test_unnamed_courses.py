@@ -55,10 +55,10 @@ def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle()
     session, *_ = labelled_cell(SEED, views=VIEWS, offset=offset, errors=errors, targets=TARGETS[:2])
     found = diagnose(run(session))
     assert found.effects == ("joint_offset",), found.sentence
-    form = found.candidates[0].ranked.score.form
-    assert found.candidates[0].name == "joint_offset" and least_wanted(found.linear, form) > 20
-    beside = found.linear.conditioned_on(form.columns, form.sizes)
-    idle = next(c.ranked.score.form for c in found.candidates if c.name == "gear_harmonic")
+    scored = found.candidates[0].ranked.score
+    assert found.candidates[0].name == "joint_offset" and least_wanted(found.linear, scored) > 20
+    beside = found.linear.conditioned_on(scored.form.columns, scored.sizes)
+    idle = next(c.ranked.score for c in found.candidates if c.name == "gear_harmonic")
     assert least_wanted(beside, idle) < 3
     # The law that is there is seen: a process explains it, with less scatter than the views seemed to have.
     likeliest = unnamed_courses(beside)[0]

@@ -134,8 +134,7 @@ def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
         return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
     if s.cross_validation is not None:
-        left = [
-            length_text(found.residual_rms * x**0.5, length_unit, zeros=True)
-            for x in (s.cross_validation.inside, s.cross_validation.heldout)
-        ]
+        inside, heldout = s.cross_validation.inside, s.cross_validation.heldout
+        rms = found.residual_rms * inside**0.5, found.heldout_rms * heldout**0.5
+        left = [length_text(x, length_unit, zeros=True) for x in rms]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

@@ -25,7 +25,7 @@ def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, 
             f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"
         )
     found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
-    heldout = state.residual_rms * found.heldout_share**0.5 if found.found else None
+    heldout = state.heldout_rms * found.heldout_share**0.5 if found.found else None
     if output is not None and found.found:
         with whole(output) as file:
             file.write_text(found.source, encoding="utf-8")

@@ -28,11 +28,10 @@ def contest(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ran
 def rescored(base: LinearModel, ranked: Ranked) -> Ranked:
     """The same candidate with its score in another model; it counts among as many as before."""
     own = score(base, ranked.score.candidate)
-    family = ranked.adjusted / max(ranked.score.p_value, 1e-300)
     return replace(
         ranked,
         score=own,
-        adjusted=min(1.0, own.p_value * family),
+        adjusted=min(1.0, own.p_value * ranked.tests),
         log_posterior=ranked.log_posterior + own.log_bayes_factor - ranked.score.log_bayes_factor,
     )
 

@@ -29,3 +29,13 @@ def both_missing(linear: LinearModel, candidates: Sequence[Candidate], best: Ran
         return None
     again = ranked_one(conditioned(linear, [first]), second.score.candidate, tests=len(others))
     return (first, again) if certain(again) else None
+
+
+def beside_each_other(linear: LinearModel, first: Ranked, second: Ranked, tests: int) -> tuple[Ranked, Ranked]:
+    """Two effects, each scored beside the other.
+
+    Args:
+        tests: candidates among which they were chosen.
+    """
+    of_first = ranked_one(conditioned(linear, [second]), first.score.candidate, tests)
+    return of_first, ranked_one(conditioned(linear, [first]), second.score.candidate, tests)

@@ -28,6 +28,7 @@ class Ranked:
     adjusted: float  # family-wise p
     log_posterior: float  # not yet normalised
     posterior: float
+    tests: int = 1  # among which it counts in the family-wise p
 
     @property
     def name(self) -> str:
@@ -60,7 +61,7 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
     logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
     total = float(logsumexp([*logs, np.log(PRIOR_NOTHING)]))
     out = [
-        Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)))
+        Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)), family)
         for (s, _, family), log in zip(weights, logs, strict=True)
     ]
     # Where there is nothing to tell them apart, by name, so that the order of a list decides nothing.
@@ -87,14 +88,13 @@ def ranked_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:
 
 
 def contends(r: Ranked) -> bool:
-    """Significant, more likely than nothing, seen, and of a size that somebody would believe.
+    """Significant, more likely than nothing, and seen.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
     does not know how many were tried.
     """
     s = r.score
-    believable = all(abs(v) < p.limit for v, p in zip(s.values, s.form.free, strict=True))
-    return r.physical and s.observable and r.adjusted < ALPHA_NAME and s.log_bayes_factor > 0 and believable
+    return r.physical and s.observable and r.adjusted < ALPHA_NAME and s.log_bayes_factor > 0
 
 
 def certain(r: Ranked) -> bool:
@@ -115,5 +115,5 @@ def conditioned(linear: LinearModel, chosen: Sequence[Ranked], near: LinearModel
     """The evidence beside some effects."""
     if not chosen:
         return linear
-    forms = [r.score.form for r in chosen]
-    return linear.conditioned_on(np.hstack([f.columns for f in forms]), np.concatenate([f.sizes for f in forms]), near)
+    columns = np.hstack([r.score.form.columns for r in chosen])
+    return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), near)

@@ -156,7 +156,7 @@ def _wanted(linear: LinearModel, best: Ranked, others: Sequence[Ranked]) -> bool
     """True if an effect is 20 to 1 wanted beside others and any course without a name; a prior of pose errors has
     asked already."""
     return linear.pose_errors is not None or (
-        unnamed_courses.least_wanted(conditioned(linear, others), best.score.form) > ODDS
+        unnamed_courses.least_wanted(conditioned(linear, others), best.score) > ODDS
     )
 
 

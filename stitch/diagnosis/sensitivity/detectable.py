@@ -6,8 +6,8 @@ is non-central F, and the log evidence ½ ν log(1 + q/ν) in place of ½ q. For
 p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import brentq
@@ -22,15 +22,16 @@ from stitch.statistics.tails import f_limit, noncentral_f_tail
 
 # Squares, in units of the scatter, beyond which an effect is of no plausible size: its prior holds back all of it.
 _BEYOND = 1e6
+# Of plausible size and nothing else.
+ALONE = {1.0: 1.0}
 
 
 def least_noncentrality(
     white: Array,
     weight: float,
     tests: int,
-    rest: int,
     degrees_of_freedom: float,
-    scales: Sequence[float] = (1.0,),
+    scales: Mapping[float, float] = ALONE,
 ) -> float:
     """θᵀIθ that a form needs to be detected.
 
@@ -38,17 +39,16 @@ def least_noncentrality(
         white: (n, p) whitened columns at their plausible sizes.
         weight: share of the candidate's prior that the form has.
         tests: number of candidates.
-        rest: numbers that are left beside the model.
         degrees_of_freedom: degrees of freedom of the scatter along the columns.
-        scales: of the plausible sizes, equally likely (`form_trial.py`).
+        scales: of the plausible sizes, with their shares (`amplitude_scales.py`).
     """
     information = np.linalg.eigvalsh(white.T @ white)
     rank = int((information > 1e-2).sum())
     if rank == 0:
         return float("inf")
-    by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(rest, 1))
-    factor = LOG_BAYES_FACTOR - float(np.log(weight)) + float(np.log(len(scales)))
-    by_factor = [_squares_for(factor, scale**2 * information.clip(0), degrees_of_freedom) for scale in scales]
+    by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(degrees_of_freedom, 1.0))
+    factor, told = LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
+    by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
     needed = max(by_p, min(by_factor))
     if needed > _BEYOND:
         return float("inf")
@@ -83,7 +83,7 @@ class Shown:
     sizes: Array  # (p,) plausible ones
     weight: float  # share of the candidate's prior
     degrees_of_freedom: float  # of the scatter along the columns
-    scales: tuple[float, ...] = (1.0,)  # of the plausible sizes, equally likely
+    scales: Mapping[float, float] = field(default_factory=lambda: ALONE)  # of the plausible sizes, with their shares
 
 
 def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
@@ -95,16 +95,15 @@ def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -
         known = linear.satterthwaite.of(linear.in_blocks(white))
         names = tuple(p.name for p in form.free)
         shown.append(Shown(names, white, form.sizes, float(weight), known, scales_of(linear)))
-    mixed = linear.mixed
-    return smallest_sizes(shown, tests, mixed.size - mixed.A.shape[2] - int(candidate.forms[0].keep.sum()))
+    return smallest_sizes(shown, tests)
 
 
-def smallest_sizes(forms: Sequence[Shown], tests: int, rest: int) -> dict[str, float]:
+def smallest_sizes(forms: Sequence[Shown], tests: int) -> dict[str, float]:
     """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
     for form in forms:
         white, known = form.white * form.sizes, form.degrees_of_freedom
-        least = least_noncentrality(white, form.weight, tests, rest, known, form.scales)
+        least = least_noncentrality(white, form.weight, tests, known, form.scales)
         for name, length in zip(form.names, np.linalg.norm(form.white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
             found.setdefault(name, {}).setdefault(form.names, []).append(size)

@@ -19,7 +19,6 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.diagnosis.form_trial import SCALES
 from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
 from stitch.diagnosis.unknown.process_size import at_likeliest_size
 from stitch.diagnosis.unknown.smooth_processes import with_covariance
@@ -27,6 +26,7 @@ from stitch.frames import Array
 from stitch.observations.error_model import with_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import SMOOTH
+from stitch.statistics import amplitude_scales
 from stitch.statistics.kernels import SmoothErrors
 from stitch.statistics.mean_factor import log_mean
 from stitch.statistics.restricted_likelihood import MixedModel
@@ -37,7 +37,7 @@ _FITTED = 12
 # Of how many usual variances such a law may be where the search for its size begins.
 TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
-ANY_SIZE = float(np.log(len(SCALES)))
+ANY_SIZE = -float(np.log(amplitude_scales.ANY_SIZE[1.0]))
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class JointLaw:
     process: int  # of that kind; the likeliest, where a joint has several
     log_bayes_factor: float  # over everything else that may be there, at the likeliest size; their mean, of several
     base: LinearModel  # without the law
+    fit: VarianceFit | None = None  # of the views with it; None where it was only sized at the null's variances
     may_follow: tuple[str, ...] = ()  # in words, the likeliest first: what 20 to 1 does not tell apart
 
     @property
@@ -65,11 +66,13 @@ class JointLaw:
         own = self.base.reduce(self.base.reduce(self.errors.of(self.process)).T)
         every = errors.beside(f"joint {self.joint} by no known law", own, SMOOTH)
         mixed = with_errors(self.base.mixed, every)
-        return replace(self.base, mixed=mixed, pose_errors=every, null=_fit(self.base, mixed), whole=None)
+        null = self.fit or _fit(self.base, mixed)
+        return replace(self.base, mixed=mixed, pose_errors=every, null=null, whole=None)
 
     def fitted(self) -> "JointLaw":
         """With all variances sought anew: what a law explains is no scatter."""
-        return replace(self, log_bayes_factor=0.5 * (self.base.null.deviance - self.model.null.deviance))
+        null = self.model.null
+        return replace(self, log_bayes_factor=0.5 * (self.base.null.deviance - null.deviance), fit=null)
 
 
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:

@@ -9,7 +9,7 @@ covariance) and of a size that the views tell.
 
 import numpy as np
 
-from stitch.diagnosis.candidates import Form
+from stitch.diagnosis.score import Score
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.process_size import FittedProcess, at_likeliest_size, fitted
 from stitch.diagnosis.unknown.smooth_processes import alone, in_pairs, of_joints, wandering
@@ -45,16 +45,16 @@ def clear_course(linear: LinearModel) -> FittedProcess | None:
     return next((course for course in unnamed_courses(linear) if course.log_bayes_factor > ODDS), None)
 
 
-def least_wanted(linear: LinearModel, form: Form) -> float:
+def least_wanted(linear: LinearModel, scored: Score) -> float:
     """Log Bayes factor of an effect beside that process which leaves least of it; ∞ where pose errors have a prior."""
-    wanted = parallel(lambda course: _wanted_beside(linear, course, form), unnamed_courses(linear))
+    wanted = parallel(lambda course: _wanted_beside(linear, course, scored), unnamed_courses(linear))
     return min(wanted, default=np.inf)
 
 
-def _wanted_beside(linear: LinearModel, course: FittedProcess, form: Form) -> float:
-    both = linear.in_blocks(np.hstack([course.columns, form.columns]))
+def _wanted_beside(linear: LinearModel, course: FittedProcess, scored: Score) -> float:
+    both = linear.in_blocks(np.hstack([course.columns, scored.form.columns]))
     tried = [
-        _deviance(linear, both, np.append(np.full(course.columns.shape[1], times * course.size), form.sizes))
+        _deviance(linear, both, np.append(np.full(course.columns.shape[1], times * course.size), scored.sizes))
         for times in _SMALLER
     ]
     return 0.5 * (course.fit.deviance - min(tried))

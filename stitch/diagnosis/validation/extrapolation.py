@@ -76,7 +76,7 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     if not ends:
         return None
     a, X = linear.design.shape[1], np.hstack([linear.design, scored.form.response])
-    prior = _plausible(linear, X, np.append(linear.sizes, scored.form.sizes))
+    prior = _plausible(linear, X, np.append(linear.sizes, scored.sizes))
     trials = linear.trial(X, None, prior), linear.trial(X[:, :a], None, Prior(prior.precision[:a], prior.middle[:a]))
     squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]
     shares = [share_of(with_it, without) for with_it, without in squares]

@@ -30,6 +30,7 @@ class PoseChannel:
     """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
 
     reduction: Array  # (n, 6V) from twists of the views to visible directions
+    expansion: Array  # (6V, n) back to the shortest twists, a radian as long as what it moves at the part
     z: Array  # (n,) observed twists, reduction @ twists
     hand_eye: Array  # (n, 6) response to the hand-eye's ξ
     rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
@@ -67,7 +68,9 @@ def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
     response = left @ jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ T_reference_flange)
     rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
-    return PoseChannel(left, left @ twists.reshape(-1), response, rotation, translation, np.diag(g.variance / values))
+    expansion = scale[:, None] * vectors
+    z, noise = left @ twists.reshape(-1), np.diag(g.variance / values)
+    return PoseChannel(left, expansion, z, response, rotation, translation, noise)
 
 
 def _scatter(left: Array, carried: Array) -> Array:

@@ -58,8 +58,8 @@ class Surfaces:
         return np.asarray(self.channel.reduction @ response)
 
     def expand(self, columns: Array) -> Array:
-        """(6V, P): the pseudo-inverse carries numbers of the channel back to twists."""
-        return np.asarray(np.linalg.pinv(self.channel.reduction) @ columns)
+        """(6V, P) the shortest twists that make numbers (n, P) of the channel."""
+        return np.asarray(self.channel.expansion @ columns)
 
     def trial(
         self, linear: LinearModel, response: Array, points: PointSums | None = None, prior: Prior | None = None

@@ -1,0 +1,28 @@
+"""Sessions that do not share an arm are said not to; those that do are left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.pipeline import run_rig
+
+OFFSETS = np.array([0, 8e-4, -9e-4, 0, 1e-3, 0])
+
+
+def two_days(second):
+    """Two sessions, the joints of the second off by so much (6,), rad."""
+    found = [labelled_cell(50 + k, views=24, offset=off)[0] for k, off in enumerate((OFFSETS, second))]
+    return [replace(session, name=f"day {k}") for k, session in enumerate(found)]
+
+
+def test_two_arms_in_one_fit_are_doubted():
+    runs = run_rig(two_days(-OFFSETS), effects=["joint_offset"])
+    for k, r in enumerate(runs):
+        assert any(f"day {k} does not share the effects of this rig" in doubt for doubt in r.doubts)
+
+
+@pytest.mark.parametrize("effects", [["joint_offset"], ["joint_offset", "link_geometry"], []])
+def test_one_arm_is_not(effects):
+    assert not any("does not share" in doubt for r in run_rig(two_days(OFFSETS), effects=effects) for doubt in r.doubts)
