@@ -1,6 +1,6 @@
 """Kinematic calibration of a robot: the nominal arm with what a model found, and the poses that would tell more."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +20,11 @@ _PROPOSED, _TRIED = 6, 250
 
 @dataclass(frozen=True)
 class CalibratedRobot:
-    """The corrected arm, and the effects in use that no table of links can hold."""
+    """The corrected arm, and the effects in use that it holds and that no table of links can hold."""
 
     robot: Robot
     beyond: tuple[str, ...]
+    held: tuple[str, ...] = ()
 
 
 def calibrated(run: Run) -> CalibratedRobot:
@@ -41,14 +42,23 @@ def calibrated(run: Run) -> CalibratedRobot:
 def calibrated_arm(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
     """A robot with the joint offsets and link errors of a model."""
     of_the_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
-    return CalibratedRobot(with_geometry(robot, terms), tuple(name for name in of_the_arm if name not in GEOMETRY))
+    held = tuple(name for name in of_the_arm if name in GEOMETRY)
+    beyond = tuple(name for name in of_the_arm if name not in GEOMETRY)
+    return CalibratedRobot(with_geometry(robot, terms), beyond, held)
 
 
-def beyond_sentence(found: CalibratedRobot) -> str:
-    """What a table of links cannot hold."""
-    if not found.beyond:
-        return "No other error of the arm was found."
-    return f"Not in it, because no table of links can hold it: {', '.join(found.beyond)}; model.toml has it."
+def beyond_sentence(found: CalibratedRobot, in_table: Collection[str] = GEOMETRY) -> str:
+    """What a table of links cannot hold, and what it could but does not.
+
+    Args:
+        in_table: effects in the table that is written.
+    """
+    told = []
+    if unproved := [name for name in found.held if name not in in_table]:
+        told.append(f"Found, but not in it for want of proof: {', '.join(unproved)}; model.toml has it.")
+    if found.beyond:
+        told.append(f"Not in it, because no table of links can hold it: {', '.join(found.beyond)}; model.toml has it.")
+    return " ".join(told) or "No other error of the arm was found."
 
 
 def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:

@@ -7,6 +7,7 @@ import numpy as np
 import tomli_w
 
 from stitch.measurement.robot import Robot
+from stitch.measurement.session import StatedRepeatability
 
 
 def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
@@ -27,8 +28,12 @@ def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
     return rows
 
 
-def robot_toml(robot: Robot, told: Sequence[str] = ()) -> str | None:
-    """The [robot] table of session.toml below lines of comment; None for an arm that came as URDF."""
+def robot_toml(robot: Robot, told: Sequence[str] = (), stated: StatedRepeatability | None = None) -> str | None:
+    """The [robot] table of session.toml below lines of comment; None for an arm that came as URDF.
+
+    Args:
+        stated: repeatability that the nominal table has; a table that takes its place says the same.
+    """
     rows = dh_rows(robot)
     if rows is None:
         return None
@@ -38,6 +43,15 @@ def robot_toml(robot: Robot, told: Sequence[str] = ()) -> str | None:
         "gravity": robot.gravity.tolist(),
         "joints": rows,
     }
-    if robot.payload_mass:
+    # Without a mass the centre is that of the column payload_kg.
+    if robot.payload_mass or not robot.carries_at_flange:
         table["payload"] = {"mass": robot.payload_mass, "com": robot.payload_com.tolist()}
+    if stated is not None and (repeatability := _repeatability(stated)):
+        table["repeatability"] = repeatability
     return "".join(f"# {line}\n" for line in told) + tomli_w.dumps({"robot": table})
+
+
+def _repeatability(stated: StatedRepeatability) -> dict[str, float]:
+    """As session.toml writes it: length_unit, mrad."""
+    turn = None if stated.rotation is None else 1e3 * stated.rotation
+    return {key: x for key, x in (("position", stated.position), ("rotation_mrad", turn)) if x is not None}

@@ -53,8 +53,15 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, pair: tuple[R
     missing = "is missing" if d.certain else "may be missing"
     return (
         f"{name} {missing} ({amounts_of(ranked)}; p = {ranked.adjusted:.1g}{_chance(d)}): {now} remain where noise "
-        f"would leave {floor}{gain}.{more}"
+        f"would leave {floor}{gain}.{more}{_beyond(ranked)}"
     )
+
+
+def _beyond(ranked: Ranked) -> str:
+    """What is larger than anybody would expect."""
+    s = ranked.score
+    large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
+    return f" {' and '.join(large)} beyond what is plausible: is what session.toml states right?" if large else ""
 
 
 def _chance(d: Diagnosis) -> str:

@@ -42,7 +42,7 @@ class Parameter:
     name: str
     unit: str
     typical: float = float("nan")  # the size a real cell may well have; the prior's sigma
-    limit: float = float("inf")  # beyond this nobody would believe it
+    limit: float = float("inf")  # beyond this something that is stated is likelier to be wrong
     grid: tuple[float, ...] = ()  # values tried one by one: time constants, the view of an event
     argument: str = ""  # of the effect's function that it is, or is a part of
     value: float = 0.0

@@ -49,8 +49,13 @@ class Robot:
 
     @property
     def has_masses(self) -> bool:
-        """True if any link or payload mass is known, so that torques mean something."""
-        return bool(self.mass.any() or self.payload_mass)
+        """True if masses of links are known; what the flange carries is not what the arm itself weighs."""
+        return bool(self.mass.any())
+
+    @property
+    def carries_at_flange(self) -> bool:
+        """True if no centre of mass of a payload is known: it counts at the flange's origin."""
+        return not self.payload_com.any()
 
 
 def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.robot import Robot
+from stitch.measurement.session import Session
 
 PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
 # Joint angles that show which torques of an arm differ.
@@ -31,10 +32,13 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
     Args:
         payload: (V,) kg, in place of the mass in [robot] payload.
     """
-    if payload is None:
-        return _each_joint(kinematics.gravity_torques(robot, joints)) if robot.has_masses else _by_link(robot, joints)
+    if payload is None and robot.has_masses:
+        return _each_joint(kinematics.gravity_torques(robot, joints))
+    if payload is None and not robot.payload_mass:
+        return _by_link(robot, joints)
+    payload = np.full(len(joints), robot.payload_mass) if payload is None else payload
     carried = payload[:, None] * kinematics.payload_torques(robot, joints)
-    if robot.mass.any():
+    if robot.has_masses:
         return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
     # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
     links = _by_link(robot, joints)
@@ -53,6 +57,23 @@ def torque_columns(covariates: Mapping[str, Array], joints: int) -> Array | None
     names = [f"j{i + 1}_torque_nm" for i in range(joints)]
     whole = bool(names) and all(name in covariates for name in names)
     return np.column_stack([covariates[name] for name in names]) if whole else None
+
+
+def payload_note(session: Session) -> str:
+    """Where a payload counts whose centre of mass nobody states; empty where one is stated, or nothing is carried."""
+    robot = session.robot
+    if robot is None or not robot.carries_at_flange or any(view.joints is None for view in session.views):
+        return ""
+    columns = [view.covariates for view in session.views]
+    if all("j1_torque_nm" in column for column in columns):
+        return ""  # drives report what bends the joints
+    loads = [column.get(PAYLOAD, robot.payload_mass) for column in columns]
+    if not any(loads):
+        return ""
+    return (
+        f"The payload, up to {max(loads):g} kg, counts at the flange's origin: [robot] payload states no other centre "
+        "of mass (com)."
+    )
 
 
 def _each_joint(values: Array) -> Torques:

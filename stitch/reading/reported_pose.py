@@ -8,6 +8,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
+from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import number
 
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -17,6 +18,15 @@ _UNIT_TOLERANCE = 1e-3
 # degrees and percents of the reach are another convention.
 _ANGLE_TOLERANCE = np.radians(2.0)
 _REACH_TOLERANCE = 0.02
+
+
+def has_reported_poses(file: Path) -> bool:
+    """True if some row of a views.csv that was read before reports a pose; False where there is no such file."""
+    if not file.is_file():
+        return False
+    header, rows = read_lines(file)
+    columns = [k for k, name in enumerate(header) if name in POSE]
+    return any(cells[k].strip() for _, cells in rows for k in columns)
 
 
 def flange_pose(

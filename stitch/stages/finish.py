@@ -37,7 +37,7 @@ class Finished:
     stages: tuple[StageResult, ...]
     poses_model: Array  # (V, 4, 4) T_reference_scanner
     poses: Array  # (V, 4, 4) after register
-    view_rms: Array  # (V,)
+    view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
     residual_rms: float
     heldout_rms: float
     noise_floor: float
@@ -113,9 +113,8 @@ def finish_targets(
     own = rows.capture
     poses_model = own.poses(found.model.T_mount)
     distances = rows.distances(rows.residual)
-    count = np.isfinite(distances).sum(axis=1)
     poses, after = register_targets(rows, found.variances, poses_model)
-    total, history = int(count.sum()), len(found.history)
+    total, history = int(np.isfinite(distances).sum()), len(found.history)
     corrected = StageResult("correct", found.rms, total, history, seconds, "3D distance of targets from their place")
     registered = StageResult(
         "register", rms_of(after), total, 1, clock.lap(), "each view moved by its own most likely error"
@@ -128,7 +127,7 @@ def finish_targets(
         stages=(before, corrected, registered),
         poses_model=poses_model,
         poses=poses,
-        view_rms=np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(count, 1)),
+        view_rms=_rms_of_rows(distances),
         residual_rms=found.rms,
         heldout_rms=found.heldout_rms,
         noise_floor=found.noise_floor,
@@ -137,6 +136,12 @@ def finish_targets(
         verdict=target_sentence(found, rms_of(after), scatter, session.length_unit),
         convergence={"correct": list(found.history), "register": [rms_of(after)]},
     )
+
+
+def _rms_of_rows(distances: Array) -> Array:
+    """(V,) of distances (V, K); NaN where there is none: an unseen view is not a perfect one."""
+    count = np.isfinite(distances).sum(axis=1)
+    return np.where(count > 0, np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(count, 1)), np.nan)
 
 
 def _targets_as_cloud(found: TargetFit) -> FusedCloud:

@@ -11,6 +11,7 @@ from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut
 from stitch.stages.coarse import Coarse
+from stitch.stages.error_sources import SOURCES
 from stitch.units import angle_text, length_text
 
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
@@ -73,24 +74,6 @@ def correct_note(before: float, after: float) -> str:
     return ""
 
 
-# What may be wrong in a hand-eye, for people.
-_SOURCES = {
-    "white rotation": "poses that turn at random",
-    "white translation": "poses that scatter at random",
-    "sensor noise": "the sensor's noise",
-    "joint_offset": "joints that count from a wrong zero",
-    "link_geometry": "links of another length than stated",
-    "joint_compliance": "joints that give way under load",
-    "gears": "gears that do not turn evenly",
-    "play": "play in the joints",
-    "smooth": "errors that follow the joint angles by no law",
-    "quickly wandering": "poses that wander, and forget it within a few views",
-    "slowly wandering": "poses that wander slowly all session long",
-    "scanner field": "errors of the scanner that every view repeats",
-    "unseen": "directions that these views do not show",
-}
-
-
 def coarse_note(start: Coarse) -> str:
     """Where the hand-eye came from, and how far the second answer was."""
     if not start.candidates:
@@ -115,7 +98,7 @@ def warnings(start: Coarse, found: HandEye) -> tuple[str, ...]:
         source, share = max(found.shares.items(), key=lambda item: item[1])
         notes.append(
             f"The hand-eye is {np.sqrt(found.inflation):.1f} times less certain than independent pose errors would "
-            f"leave it; the largest part of its variance, {share:.0%}, may come from {_SOURCES.get(source, source)}."
+            f"leave it; the largest part of its variance, {share:.0%}, may come from {SOURCES.get(source, source)}."
         )
     return tuple(notes)
 

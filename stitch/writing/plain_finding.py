@@ -7,6 +7,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import FALL, WORTH
 from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation.group_validation import group_share
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.doubt_headline import doubt_headline
 from stitch.units import length_text
@@ -96,6 +97,8 @@ def next_step(found: Diagnosis, run: str) -> str:
     match found.verdict:
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
+        case "cannot_tell" if not _helps_as_one(found):
+            return f"Next, what would tell them apart: stitch next {run}"
         case "cannot_tell":
             return f"Fitted as one, if that helps: stitch add {run} --group"
         case "unknown_effect" if found.curves or found.time_curve is not None:
@@ -103,3 +106,9 @@ def next_step(found: Diagnosis, run: str) -> str:
         case "unknown_effect":
             return f"Next, to see where it fails: stitch review {run}"
     return f"Next: stitch export {run} --to ros"
+
+
+def _helps_as_one(found: Diagnosis) -> bool:
+    """False where `stitch add --group` would refuse, or has just refused: together they predict no view left out."""
+    share, sigma = group_share(found.linear, [c.ranked.score for c in found.candidates if c.name in found.effects])
+    return share <= 1 - sigma

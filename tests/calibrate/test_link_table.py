@@ -50,6 +50,16 @@ def test_too_few_views_prove_nothing():
     assert not found.effects and "too few" in found.sentence("mm")
 
 
+def test_rows_without_a_sighting_prove_nothing():
+    """They say from where the arm came, and are no perfect views: the rms is that of the views that show something."""
+    session, *_ = labelled_cell(13, views=32, offset=OFFSET)
+    rows = [(view, replace(view, name=f"{view.name}-moved", sighting=None)) for view in session.views]
+    found = link_table(replace(session, views=tuple(view for both in rows for view in both)))
+    alone = link_table(session)
+    assert found.effects == alone.effects
+    assert (found.heldout_rms, found.nominal_rms) == pytest.approx((alone.heldout_rms, alone.nominal_rms), rel=1e-3)
+
+
 def test_the_command_says_what_the_table_is_worth_and_writes_it(tmp_path, capsys, few_effects):
     session, *_ = labelled_cell(11, views=60, offset=OFFSET, sag=SAG)
     folder = write_labelled(tmp_path / "s", session)

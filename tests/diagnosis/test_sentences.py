@@ -34,9 +34,12 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
     assert silent.endswith("; a note.")
 
 
-def said_at(odds: float, verdict: str, *effects: str) -> str:
+NOT_FITTED = SimpleNamespace(fitted=False)
+
+
+def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
     """What is said of effects at such odds over nothing."""
-    ranked = SimpleNamespace(score=SimpleNamespace(fitted=False), adjusted=1e-3)
+    ranked = SimpleNamespace(score=score, adjusted=1e-3)
     found = SimpleNamespace(
         verdict=verdict,
         effects=effects,
@@ -56,6 +59,16 @@ def said_at(odds: float, verdict: str, *effects: str) -> str:
 def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     told = said_at(odds, "missing_effect", "settling")
     assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)
+
+
+def test_what_is_larger_than_anybody_would_expect_is_asked_about():
+    """No size forbids a name: a number in a table may be wrong."""
+    free = [SimpleNamespace(name=name, limit=5.0, unit="mm") for name in ("da1", "da2")]
+    form = SimpleNamespace(free=free, term=SimpleNamespace(parameters=[]))
+    score = SimpleNamespace(fitted=True, form=form, values=np.array([0.1, -8.0]), sigmas=np.array([0.02, 0.02]))
+    told = said_at(1e9, "missing_effect", "link_geometry", score=score)
+    assert "da2 = -8 ± 0.02 mm" in told
+    assert told.endswith(" da2 beyond what is plausible: is what session.toml states right?")
 
 
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
-from stitch.measurement.torques import torques_of
+from stitch.cli.actions.checked_sessions import summary
+from stitch.measurement.torques import payload_note, torques_of
 from stitch.measurement.views import views_of
 from stitch.pipeline import run
 
@@ -35,6 +36,25 @@ def test_masses_of_links_stay_where_the_column_takes_the_payloads_place():
     heavy = replace(robot(), mass=np.array([0, 9.0, 4.0, 2.0, 1.0, 0.5]), payload_mass=3.0)
     q = np.random.default_rng(4).uniform(-1.2, 1.2, (4, 6))
     np.testing.assert_allclose(torques_of(heavy, q, np.full(4, 3.0)).values, torques_of(heavy, q).values, atol=1e-9)
+
+
+def test_a_stated_payload_is_not_taken_for_all_that_hangs_on_the_arm():
+    """Without masses of links it is known beside what is not, as a column would say it."""
+    q = np.random.default_rng(5).uniform(-1.2, 1.2, (4, 6))
+    stated = torques_of(replace(robot(), payload_mass=4.0), q)
+    column = torques_of(robot(), q, np.full(4, 4.0))
+    assert stated.names == column.names and set(torques_of(robot(), q).names) < set(stated.names)
+    np.testing.assert_allclose(stated.values, column.values)
+
+
+def test_what_hangs_at_the_flange_for_want_of_a_centre_of_mass_is_said():
+    session, *_ = labelled_cell(6, views=12, payload=LOADS[10:22])
+    assert payload_note(session).startswith("The payload, up to 4 kg, counts at the flange's origin")
+    assert payload_note(session) in run(session).notes and summary(session)["notes"] == [payload_note(session)]
+    assert not payload_note(replace(session, robot=replace(session.robot, payload_com=np.array([0, 0, 80.0]))))
+    bare = replace(session, views=tuple(replace(view, covariates={}) for view in session.views))
+    assert not payload_note(bare) and summary(bare)["notes"] == []
+    assert payload_note(replace(bare, robot=replace(bare.robot, payload_mass=3.0)))
 
 
 def test_one_compliance_explains_all_loads():

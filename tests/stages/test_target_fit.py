@@ -1,5 +1,6 @@
 """Hand-eye and landmarks from labelled points or a probe, against the truth and scipy's least squares."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from data_synth.fixtures.labelled_arm import PROBE_TURN, TARGETS, Growth, flange
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
-from stitch.writing.result_document import model_of
+from stitch.writing.json_file import to_json
+from stitch.writing.result_document import model_of, result_document
 
 
 def off(T, true):
@@ -116,6 +118,16 @@ def test_a_view_that_shows_nothing_only_says_where_the_arm_was(mount):
                                          for k, v in enumerate(session.views)))  # fmt: skip
     angle, distance = off(run(blank).T_mount, T_mount)
     assert angle < 1e-3 and distance < 1.0
+
+
+def test_a_view_that_shows_nothing_has_no_rms():
+    """Null in result.json, as FORMAT.md has it; a zero would be a perfect view."""
+    session, *_ = labelled_cell(4, views=12)
+    session = replace(session, views=(*session.views[:-1], replace(session.views[-1], sighting=None)))
+    found = run(session)
+    assert np.isfinite(found.view_rms[:-1]).all() and np.isnan(found.view_rms[-1])
+    rows = json.loads(to_json(result_document(found)))["views"]
+    assert rows[-1]["rms"] is None and rows[-1]["points"] == 0 and rows[0]["rms"] > 0
 
 
 def test_real_tracker_on_even_poses_judges_the_odd_ones(shared_data):

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import stitch.stepwise as stepwise
+import stitch.writing.plain_finding as plain
 from bench.page_blocks import refused
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation.cross_validation import CrossValidation
@@ -24,11 +26,38 @@ def test_every_effect_of_the_library_has_words():
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 @pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
-def test_the_next_command_can_be_typed(verdict, curves, time_curve):
-    found = SimpleNamespace(verdict=verdict, curves=curves, time_curve=time_curve, doubts=())
+def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve):
+    monkeypatch.setattr("stitch.writing.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
+    found = SimpleNamespace(
+        verdict=verdict, curves=curves, time_curve=time_curve, doubts=(), linear=None, candidates=()
+    )
     command = next_step(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
     assert ("explain" in command) == (verdict == "unknown_effect" and bool(curves or time_curve))
+
+
+@pytest.mark.parametrize("share", [0.949, 0.951])
+def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
+    """Neither before it was asked for nor, again, right after: `stitch add --group` judges by the same number."""
+    for module in (plain, stepwise):
+        monkeypatch.setattr(module, "group_share", lambda linear, group: (share, 0.05))
+    cause = SimpleNamespace(name="play", ranked=SimpleNamespace(score=None))
+    found = SimpleNamespace(
+        verdict="cannot_tell",
+        effects=("play",),
+        candidates=(cause,),
+        doubts=(),
+        certain=True,
+        sentence="",
+        linear=SimpleNamespace(measurement=SimpleNamespace(length_unit="mm")),
+    )
+    monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
+    monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is added"))
+    command = next_step(found, "RUN").rsplit(": ", 1)[1]
+    assert refused(command) is None and ("--group" in command) == (share < 0.95)
+    if share > 0.95:
+        model = SimpleNamespace(effects=[])
+        assert stepwise.suggest_group(SimpleNamespace(model=model))[0] is None and command == "stitch next RUN"
 
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])

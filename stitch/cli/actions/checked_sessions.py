@@ -13,7 +13,9 @@ from rich.table import Table
 from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.integrity.deep_check import deep_check
+from stitch.measurement.gaps import gaps_note
 from stitch.measurement.session import Session
+from stitch.measurement.torques import payload_note
 from stitch.reading.session_folder import load_session
 from stitch.system.console import console
 from stitch.writing.json_file import to_json
@@ -82,6 +84,7 @@ def summary(session: Session) -> dict[str, object]:
         "robot": session.robot.name if session.robot else None,
         "hand_eye_given": session.scanner.T_mount is not None,
         "covariates": sorted({name for view in session.views for name in view.covariates}),
+        "notes": list(filter(None, [payload_note(session), gaps_note(session)])),
     }
 
 
@@ -108,3 +111,4 @@ def _rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"
     yield "hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: it is found from the scans"
     yield "beside the poses", ", ".join(fact["covariates"]) or "nothing"
+    yield from (("note", note) for note in fact["notes"])

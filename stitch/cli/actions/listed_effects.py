@@ -79,7 +79,7 @@ def _one(terminal: Console, name: str) -> None:
     }
     for key, spec in effect.specs.items():
         shift = f" and {spec.typical_shift:g} {spec.unit_shift}" if spec.kind == "twist" else ""
-        sizes = f"plausible {spec.typical:g}{shift}, not believed beyond {spec.limit:g}"
+        sizes = f"plausible {spec.typical:g}{shift}, doubtful beyond {spec.limit:g}"
         terminal.print(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}", soft_wrap=True)
     if effect.needs:
         terminal.print(f"  needs {', '.join(effect.needs)}")

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from stitch.calibrate.robot_calibration import beyond_sentence, calibrated
 from stitch.cli.terminal.ledger_summary import show_ledger
 from stitch.runs.run import Run
 from stitch.system.console import console
@@ -26,8 +25,8 @@ def show_robot(result: Run, document: dict[str, Any], lines: list[str], target: 
         table.add_row(str(i + 1), *(f"{row[key]:.5f}" for key in ("a", "alpha_deg", "d", "theta_deg")))
     if document["robot"]:
         terminal.print(table)
-    terminal.print(document["table"]["sentence"], soft_wrap=True)
-    terminal.print(beyond_sentence(calibrated(result)), soft_wrap=True)
+    for line in document["table"]["sentences"]:
+        terminal.print(line, soft_wrap=True)
     for pose in document["next"]:
         told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(pose))
         terminal.print(f"A pose that would tell most of the rest: {told}.", soft_wrap=True)

@@ -1,0 +1,23 @@
+"""What may be wrong in a hand-eye, in words.
+
+The keys are the sources of its variance: white scatter (`error_model.py`), what poses may err beside it
+(`pose_errors.py`), and what every view repeats or none shows (`hand_eye.py`).
+"""
+
+SOURCES = {
+    "white rotation": "poses that turn at random",
+    "white translation": "poses that scatter at random",
+    "sensor noise": "the sensor's noise",
+    "joint_offset": "joints that count from a wrong zero",
+    "link_geometry": "links of another length than stated",
+    "joint_compliance": "joints that give way under load",
+    "gears": "gears that do not turn evenly",
+    "play": "play in the joints",
+    "smooth": "errors that follow the joint angles by no law",
+    "quickly wandering": "poses that wander, and forget it within a few views",
+    "slowly wandering": "poses that wander slowly all session long",
+    "stop rotation": "turns of the flange that all scans from one pose share",
+    "stop translation": "shifts of the flange that all scans from one pose share",
+    "scanner field": "errors of the scanner that every view repeats",
+    "unseen": "directions that these views do not show",
+}

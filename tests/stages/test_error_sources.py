@@ -1,0 +1,24 @@
+"""Every source that a hand-eye's variance may have is said in words."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.measurement.capture import capture
+from stitch.measurement.measurement import measurement_of
+from stitch.model.model import Model
+from stitch.observations.error_model import WHITE
+from stitch.observations.pose_errors import STOPS, pose_errors, usual_sizes
+from stitch.stages.error_sources import SOURCES
+
+
+def test_every_component_has_words():
+    """Of an arm of which all is known, and that stands twice at one pose."""
+    session, T_mount, _ = labelled_cell(1, views=4)
+    twice = (*session.views, replace(session.views[-1], name="again"))
+    session = replace(session, robot=replace(session.robot, mass=np.ones(6)), views=twice)
+    prior = pose_errors([measurement_of(session, capture(session))], Model(T_mount), [np.zeros(3)])
+    assert set(STOPS) | set(usual_sizes()) <= set(prior.names)
+    assert {*WHITE, *prior.names} <= set(SOURCES)
+    assert len(set(SOURCES.values())) == len(SOURCES) and not set(SOURCES) & set(SOURCES.values())
