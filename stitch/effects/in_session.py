@@ -19,6 +19,11 @@ _WHERE_FROM = {
 }
 
 
+def where_from(need: str) -> str:
+    """What an effect needs, as somebody who writes a session knows it."""
+    return _WHERE_FROM.get(need, f"a column {need} in views.csv")
+
+
 def known(name: str) -> Effect:
     """An effect of the library or of a user's file.
 
@@ -70,8 +75,8 @@ def require(measurement: Measurement, effect: Effect) -> None:
     """
     missing = lacking(measurement, effect)
     if missing:
-        words = [_WHERE_FROM.get(need, f"a column {need} in views.csv") for need in missing]
+        words = " and ".join(map(where_from, missing))
         raise InputError(
-            f"effect {effect.name} needs {' and '.join(words)}, which session {measurement.capture.name} does not have"
+            f"effect {effect.name} needs {words}, which session {measurement.capture.name} does not have"
             "; to fix: state it, or leave the effect out"
         )

@@ -16,6 +16,7 @@ from stitch.model.term import Term, term_of
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.observations.targets.target_model import Targets
+from stitch.units import METRES
 
 
 @dataclass(frozen=True)
@@ -109,9 +110,10 @@ def scaled(quantity: Quantity) -> Array:
     return quantity.values / _scale(quantity)
 
 
-def coefficient(ingredient: Ingredient, of_scaled: float) -> float:
-    """In the ingredient's unit, of one for its scaled column."""
-    return of_scaled / _scale(ingredient.quantity)
+def coefficient(ingredient: Ingredient, of_scaled: float, length_unit: str) -> float:
+    """In the ingredient's unit, of one for its scaled column, whose lengths are in length_unit."""
+    to_mm = METRES[length_unit] / METRES["mm"] if ingredient.unit.startswith("mm") else 1.0
+    return to_mm * of_scaled / _scale(ingredient.quantity)
 
 
 def _everywhere(linear: LinearModel, place: str) -> Term:

@@ -4,15 +4,20 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from stitch.effects.contract import TWIST
 from stitch.explanation.dictionary import Ingredient
-from stitch.units import METRES
 
 _LIMIT = 10.0  # sizes: beyond that nobody would believe it
 
 
 def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
-    """The formula for people: what is displaced, and by what; joint by joint, or all axes of a body at once."""
+    """The formula for people: what is displaced, and by what; joint by joint, or all axes of a body at once.
+
+    Args:
+        coefficients: in each ingredient's unit.
+    """
     if any(i.place != "robot" for i in ingredients):
         return "; ".join(map(_of_body, _by_quantity(ingredients, coefficients)))
     own = list(zip(ingredients, coefficients, strict=True))
@@ -45,33 +50,34 @@ def _names(count: int) -> list[str]:
     return list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
 
 
-def effect_source(
-    name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], length_unit: str, origin: str
-) -> str:
+def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], origin: str) -> str:
     """The file; all ingredients stand at one place.
 
     Args:
-        coefficients: in each ingredient's unit, lengths in length_unit.
+        coefficients: in each ingredient's unit, as effects are written.
         origin: where the formula comes from, for the first line of the file.
     """
     place = ingredients[0].place
-    to_mm = METRES[length_unit] / METRES["mm"]
     letters = _names(len(ingredients))
     specs = "".join(
         f'    {a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g}),\n'
-        for a, i, size in (
-            (a, i, abs(c) * (to_mm if i.unit.startswith("mm") else 1.0))
-            for a, i, c in zip(letters, ingredients, coefficients, strict=True)
-        )
+        for a, i, size in zip(letters, ingredients, np.abs(coefficients), strict=True)
     )
-    needs = '("joints",)' if place == "robot" else "()"
     head = (
         f'"""{origin}"""\n\nimport numpy as np\n\nfrom stitch.effects import effect, number\n\n\n'
-        f'@effect(\n    "{place}",\n    needs={needs},\n{specs})\n'
+        f'@effect(\n    "{place}",\n    needs={_needs(ingredients)},\n{specs})\n'
     )
     body = _of_joints(ingredients, letters) if place == "robot" else _of_twist(ingredients, letters)
     first = "joints, views" if place == "robot" else "views"
     return head + "\n".join([f"def {name}({first}, {', '.join(letters)}):", *(f"    {line}" for line in body), ""])
+
+
+def _needs(ingredients: Sequence[Ingredient]) -> str:
+    """What the file's code reads of the views, as the tuple that the library asks for."""
+    own = ["joints"] if ingredients[0].place == "robot" else []
+    names = dict.fromkeys([*own, *(need for i in ingredients for need in i.quantity.needs)])
+    quoted = [f'"{name}"' for name in names]
+    return f"({quoted[0]},)" if len(quoted) == 1 else f"({', '.join(quoted)})"
 
 
 def _of_joints(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:

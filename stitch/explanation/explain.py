@@ -15,7 +15,8 @@ from stitch.explanation.dictionary import Dictionary, Ingredient, coefficient, d
 from stitch.explanation.effect_source import effect_source, formula_text
 from stitch.explanation.held_test import Chosen, fitted
 from stitch.explanation.quantities import quantities
-from stitch.explanation.search import search
+from stitch.explanation.search import enough_views, search
+from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
@@ -33,6 +34,7 @@ class Explanation:
     why: str  # in one sentence
     formula: str = ""
     place: str = ""  # robot | mount | part
+    tested: str = ""  # the formula that stood the test, of which p_value is; all views may want another in its place
     heldout_share: float = float("nan")  # mean square on views left out over that of the present model
     p_value: float = float("nan")
     source: str = ""  # a Python file of effects
@@ -46,6 +48,8 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
     """
     with library_threads_off():
         terms, first = dictionary(linear, quantities(linear.measurement.views)), None
+        if not enough_views(linear, terms):
+            return Explanation(False, _too_few(linear.measurement.views.count))
         for chosen in search(linear, terms):
             tried = _tried(linear, terms, chosen, origin)
             if tried.found:
@@ -60,14 +64,14 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
 def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) -> Explanation:
     """A sum that may hold, as an effect among all views."""
     own, scaled = chosen.ingredients, fitted(linear, terms, chosen.ingredients)
-    values = [coefficient(i, float(x)) for i, x in zip(own, scaled, strict=True)]
+    values = _coefficients(linear, own, scaled)
     text = formula_text(own, values)
     if not chosen.holds:
         return Explanation(False, _not_held(chosen, text))
     turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
     if own[0].place == "robot" and max(turns) > _MOST:
         return Explanation(False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that.")
-    source = effect_source(NAME, own, values, linear.measurement.length_unit, f"{origin} {text}")
+    source = effect_source(NAME, own, values, f"{origin} {text}")
     scored = _as_effect(linear, source)
     left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
     share = left_out.heldout
@@ -75,17 +79,33 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
         return Explanation(False, f"{text} explains much, but not in views that are left out with their neighbours.")
     if beyond is not None and not beyond.helps:
         return Explanation(False, f"{beyond.objection(text)}.")
-    why = f"{text}: {_how(linear, terms, chosen)} ({_chance(chosen.p_value)})."
-    return Explanation(True, why, text, own[0].place, share, chosen.p_value, source)
+    tested = _tested(linear, terms, chosen, text)
+    why = f"{text}: {_how(chosen.p_value, text, tested)}."
+    return Explanation(True, why, text, own[0].place, tested, share, chosen.p_value, source)
 
 
-def _how(linear: LinearModel, terms: Dictionary, chosen: Chosen) -> str:
-    """How a sum that is told stood the test."""
+def _coefficients(linear: LinearModel, ingredients: Sequence[Ingredient], scaled: Array) -> list[float]:
+    """In each ingredient's unit, of sizes (k,) of scaled columns."""
+    unit = linear.measurement.length_unit
+    return [coefficient(i, float(x), unit) for i, x in zip(ingredients, scaled, strict=True)]
+
+
+def _tested(linear: LinearModel, terms: Dictionary, chosen: Chosen, text: str) -> str:
+    """The formula that stood the test: the one that is told, or another in whose place all views want it."""
     other = chosen.instead_of
     if not other or _alike(other, chosen.ingredients):
-        return "found in some of the views, it holds in the others"
-    values = [coefficient(i, float(x)) for i, x in zip(other, fitted(linear, terms, other), strict=True)]
-    return f"likeliest in all views; {formula_text(other, values)}, found in some of them, holds in the others"
+        return text
+    return formula_text(other, _coefficients(linear, other, fitted(linear, terms, other)))
+
+
+def _how(p_value: float, text: str, tested: str) -> str:
+    """How a formula that is told stood the test, or which one did."""
+    if tested == text:
+        return f"found in some of the views, it holds in the others ({_chance(p_value)})"
+    return (
+        f"likeliest in all views, but not what was tested: {tested}, found in some of them, holds in the others "
+        f"({_chance(p_value)}, of this one alone)"
+    )
 
 
 def _alike(some: Sequence[Ingredient], others: Sequence[Ingredient]) -> bool:
@@ -105,6 +125,13 @@ def _chance(p_value: float) -> str:
 def _not_held(chosen: Chosen, text: str) -> str:
     return (
         f"No formula holds: {text}, found in some of the views, is not what the others show (p = {chosen.p_value:.2g})."
+    )
+
+
+def _too_few(views: int) -> str:
+    return (
+        f"Nothing can be said from {views} views: a formula is found in some of them and tested in the others, and "
+        "either are too few to tell one formula from another beside what is fitted anyway."
     )
 
 

@@ -12,6 +12,9 @@ from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.statistics.least_squares import column_space
 
+# Of a number a view two views show one difference: in that all that differ are alike, but for their size.
+_ALIKE = 2
+
 
 class Half:
     """Numbers (n,) of some views in units of their scatter, without what the model explains there."""
@@ -49,6 +52,15 @@ class Half:
     def free(self) -> int:
         """How many of the numbers are free."""
         return len(self.z) - int(self._explained.shape[1])
+
+    def has_room(self, numbers: int = 1) -> bool:
+        """True if these views can tell a sum of so many numbers from others, and leave numbers free beside it."""
+        return len(self._keep) > _ALIKE and self.free > numbers
+
+    @property
+    def views(self) -> Indices:
+        """Numbers of those kept."""
+        return self._keep
 
     def seen(self, response: Array) -> Array:
         """(n, k) whitened columns of a response (·, k), without what the model explains."""

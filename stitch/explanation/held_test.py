@@ -54,7 +54,7 @@ def beside_itself(
 
     Args:
         slow: the sum follows time or what moves with it.
-        ways: views in which the sum was chosen, and those in which it is tested.
+        ways: views in which the sum was chosen, and those in which it is tested; both leave numbers free beside it.
     """
     own = terms.columns(ingredients)
     other = Half(linear.scatter_only, terms, ways[0])

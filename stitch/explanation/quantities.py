@@ -31,10 +31,9 @@ _SPRING = "spring under"  # label of what comes together: its zero, its pull, an
 def quantities(views: Views) -> list[Quantity]:
     """All factors: what differs from view to view, and one that does not."""
     found = [*_of_joints(views), *_of_time(views)]
-    found += [
-        Quantity(name, f'views.since_first("{name}")', name, "covariate", None, views.since_first(name))
-        for name in views.covariates
-    ]
+    for name in views.covariates:
+        code, values = f'views.since_first("{name}")', views.since_first(name)
+        found.append(Quantity(name, code, name, "covariate", None, values, columns=(name,)))
     # Where the law of a joint has its zero nobody knows.
     told = [q for q in found if np.isfinite(q.values).all() and np.ptp(q.values) > _STILL]
     springs = tuple(label for q in told for label in q.together if label.startswith(_SPRING))

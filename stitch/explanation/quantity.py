@@ -8,6 +8,13 @@ import numpy as np
 from stitch.frames import Array
 
 _DIGITS = 4  # of a nonlinear parameter in a formula
+# What effects call that of which a quantity of a kind is made; a covariate goes by its own name.
+_MADE_OF = {
+    **dict.fromkeys(("angle", "gear", "teeth", "direction", "move"), "joints"),
+    **dict.fromkeys(("time", "course"), "time"),
+    "torque": "torque",
+    "speed": "velocity",
+}
 
 
 @dataclass(frozen=True)
@@ -41,8 +48,15 @@ class Quantity:
     joint: int | None  # that it belongs to, counted from 0
     values: Array  # (V,)
     together: tuple[str, ...] = ()  # addends that it is a part of, where it is not one alone
+    columns: tuple[str, ...] = ()  # covariates that its code reads
     nonlinear: tuple[Nonlinear, ...] = ()
     family: "Family | None" = None  # of the nonlinear parameters' values
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What its code reads of `views`, as effects call it."""
+        made_of = [_MADE_OF[kind] for kind in self.kind.split("·") if kind in _MADE_OF]
+        return tuple(dict.fromkeys([*made_of, *self.columns]))
 
     @property
     def slow(self) -> bool:
@@ -58,7 +72,8 @@ class Quantity:
         """The product; it belongs to no joint."""
         unit = " ".join(sorted(u for u in (self.unit, other.unit) if u))
         text, code = f"{self.text}·{other.text}", f"{self.code} * {other.code}"
-        return Quantity(text, code, unit, f"{self.kind}·{other.kind}", None, self.values * other.values)
+        kind, columns = f"{self.kind}·{other.kind}", self.columns + other.columns
+        return Quantity(text, code, unit, kind, None, self.values * other.values, columns=columns)
 
     def moved(self, steps: Array) -> "Quantity":
         """The same with its nonlinear parameters so many spreads off."""

@@ -11,7 +11,7 @@ same in views that are neighbours in time.
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,8 +37,8 @@ def search(linear: LinearModel, terms: Dictionary) -> list[Chosen]:
     widths and periods as all views want them, and sums that all views suggest where one of theirs holds."""
     found, ways, groups = list[Chosen](), 0, _groups(terms)
     for (_, slow), some in groups.items():
-        for way in _ways(linear, slow):
-            found += _one_way(linear, terms, some, way)
+        for chosen, other in _halved(linear, terms, slow):
+            found += _one_way(linear, terms, some, chosen, other)
             ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
     # Each was chosen in some views: what they and the others say of it counts.
@@ -49,6 +49,11 @@ def search(linear: LinearModel, terms: Dictionary) -> list[Chosen]:
     if not found or not found[0].holds:
         return told
     return [*_of_all_views(linear, terms, groups[_group_of(found[0].ingredients[0])], found[0], every), *told]
+
+
+def enough_views(linear: LinearModel, terms: Dictionary) -> bool:
+    """True if some of the views may choose a sum, and others test it."""
+    return next(_halved(linear, terms, slow=True), None) is not None
 
 
 def _group_of(ingredient: Ingredient) -> tuple[str, bool]:
@@ -63,6 +68,14 @@ def _groups(terms: Dictionary) -> dict[tuple[str, bool], list[Ingredient]]:
     return {own: found[own] for own in sorted(found)}
 
 
+def _halved(linear: LinearModel, terms: Dictionary, slow: bool) -> Iterator[tuple[Half, Half]]:
+    """Views in which a sum is chosen, and those in which it is tested, as long as either may say something of one."""
+    for views in _ways(linear, slow):
+        chosen, other = (Half(linear.scatter_only, terms, own) for own in views)
+        if chosen.has_room() and other.has_room():
+            yield chosen, other
+
+
 def _ways(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
     """Views in which a sum is chosen, and those in which it is tested."""
     parts = [_alternate(linear, parts) for parts in (2, 3)]
@@ -71,6 +84,7 @@ def _ways(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
         (_some(np.sort(np.concatenate([*own[:k], *own[k + 1 :]]))), _some(own[k]))
         for own in parts
         for k in range(len(own))
+        if len(own[k])
     ]
 
 
@@ -112,16 +126,17 @@ def _some(views: Indices, halves: int = 1) -> Indices:
 
 
 def _one_way(
-    linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], ways: Sequence[Indices]
+    linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], chosen: Half, other: Half
 ) -> list[Chosen]:
     """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
-    chosen, other = (Half(linear.scatter_only, terms, views) for views in ways)
-    suggested = _suggested(chosen, ingredients)
+    suggested = [
+        sum_ for sum_ in _suggested(chosen, ingredients) if chosen.has_room(len(sum_)) and other.has_room(len(sum_))
+    ]
     # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
     worth = [at_present(sum_, chosen, other).log_bayes_factor for sum_ in suggested]
     likely = [suggested[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
     slow = ingredients[0].quantity.slow
-    tested = [beside_itself(linear, terms, sum_, slow, ways) for sum_ in likely]
+    tested = [beside_itself(linear, terms, sum_, slow, (chosen.views, other.views)) for sum_ in likely]
     return [replace(c, p_value=min(1.0, len(suggested) * c.p_value)) for c in tested]
 
 

@@ -49,6 +49,9 @@ def test_all_views_say_which_formula_it_is(seed):
     assert "sin q3·sin 2q2" in found.formula
     suggested = {(i.what, i.quantity.text) for i in told.instead_of}
     assert ("likeliest in all views" in found.why) == (suggested != {("q*3", "sin q3·sin 2q2")})
+    # Of another formula than the one that is told p says how that one stood the test.
+    assert (found.tested != found.formula) == ("likeliest in all views" in found.why)
+    assert ("of this one alone" in found.why.split(found.tested)[-1]) == (found.tested != found.formula)
 
 
 def test_a_play_that_moved_a_little_is_the_same_and_another_wave_or_joint_is_not():
@@ -107,6 +110,7 @@ def test_the_file_that_is_written_can_be_added(tmp_path, stitch_command, monkeyp
     after = json.loads((tmp_path / "r" / "result.json").read_text())
     assert after["heldout_rms"] < 0.8 * before
     assert after["heldout_rms"] == pytest.approx(told["heldout_rms"], rel=0.15)
+    assert told["tested_formula"] == told["formula"]
     assert after["effects"]["explained"]["a"]["value"] == pytest.approx(SIZE, rel=0.1)
     # A second one by that name would take the first one's place unseen.
     with pytest.raises(SystemExit) as stop:

@@ -6,11 +6,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from stitch.cli.terminal.budget_table import budget_table
 from stitch.cli.terminal.live_line import doing
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.course_sentences import course_texts
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import amounts_of
+from stitch.effects.in_session import where_from
 from stitch.model.hand_eye_uncertainty import stands_for
 from stitch.pipeline import diagnose
 from stitch.runs.state import State
@@ -82,13 +84,15 @@ def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, obje
 
 
 def show(found: Diagnosis, length_unit: str) -> None:
-    """For everybody first, then the evidence, the candidate effects, what the poses follow, what to do next."""
+    """For everybody first, then the evidence, where the error comes from, the candidate effects, what to do next."""
     terminal = console()
     terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
     for line in (*found.doubts, found.sentence):
         terminal.print(line, soft_wrap=True)
     if found.verdict != "adequate":
         terminal.print(stands_for(found.verdict), soft_wrap=True)
+    if (sources := budget_table(found.budget, length_unit)) is not None:
+        terminal.print(sources)
     table = Table(title="Candidate effects", title_justify="left")
     for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
@@ -103,10 +107,9 @@ def show(found: Diagnosis, length_unit: str) -> None:
     unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
     if unseen:
         terminal.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True)
-    lacking = sorted({need for needs in found.missing.values() for need in needs})
-    for need in lacking:
-        names = ", ".join(name for name, needs in found.missing.items() if need in needs)
-        terminal.print(f"Not tested without {need}: {names}.", soft_wrap=True)
+    for needs in sorted(set(found.missing.values())):
+        names = ", ".join(name for name, own in found.missing.items() if own == needs)
+        terminal.print(f"Not tested without {' and '.join(map(where_from, needs))}: {names}.", soft_wrap=True)
     if found.verdict == "adequate":
         _show_missed(terminal, found, length_unit)
     for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:

@@ -47,6 +47,7 @@ def _document(found: Explanation, heldout: float | None) -> dict[str, object]:
         "place": found.place,
         "heldout_rms": heldout,
         "p_value": found.p_value if found.found else None,
+        "tested_formula": found.tested,  # of which p_value is
         "sentence": found.why,
     }
 

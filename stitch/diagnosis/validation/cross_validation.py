@@ -22,12 +22,12 @@ class CrossValidation:
     inside: float  # fitted on all views
     heldout: float  # each fold judged by a fit without it
     poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
-    poses_sigma: float  # standard error of `poses` over folds
+    poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
 
     @property
     def helps(self) -> bool:
-        """True if views left out are predicted better, by more than a standard error."""
+        """True if views left out are predicted better, by more than folds differ."""
         return self.poses <= 1 - self.poses_sigma
 
     def idle(self, name: str) -> str | None:
