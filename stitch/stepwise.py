@@ -22,7 +22,8 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
     The run is None where nothing is named.
 
     An effect stays unless the held-out residual rises: the diagnosis has asked already whether it predicts the poses
-    of views left out, and a small effect moves them by less than the sensor's noise shows in a residual. At the end
+    of views left out, and a small effect moves them by less than the sensor's noise shows in a residual. What is less
+    likely than nothing being missing is not added. At the end
     effects that came early go, if those that came later explain the same; what was in the model before stays.
     """
     lines: list[str] = []
@@ -33,6 +34,10 @@ def suggest(state: State, at_most: int) -> tuple[Run | None, list[str], Diagnosi
         found = diagnose(state)
         lines += [*_told(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
         if found.verdict != "missing_effect":
+            break
+        if not found.likelier_than_not:
+            name = found.effects[0]
+            lines.append(f"{name} was not added: that it is chance is likelier. All the same: stitch add RUN {name}.")
             break
         tried = change(state, [*state.model.effects, found.effects[0]])
         if not _earned(state, tried):

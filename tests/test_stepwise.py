@@ -45,3 +45,10 @@ def test_what_has_a_name_is_no_group(first):
     # For everybody first, then the evidence.
     assert lines[0].startswith("Missing in the model: joint_offset (a joint counts its angle from a wrong zero). Add")
     assert lines[1] == found.sentence
+
+
+def test_what_is_less_likely_than_chance_is_not_added(first, monkeypatch):
+    found = replace(diagnose(state_of(first)), over_nothing=-0.1)
+    monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
+    result, lines, _ = stepwise.suggest(state_of(first), at_most=3)
+    assert result is None and lines[-1].startswith("joint_offset was not added: that it is chance is likelier.")

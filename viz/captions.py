@@ -25,7 +25,20 @@ WATERFALL = (
     "An effect earns its place if the bar of the views left out falls too; the dashed line is what the sensor's "
     "noise alone would leave."
 )
-BUDGET = "Shares of the mean square: what noise explains, what the named effects explain, and the rest."
+BUDGET = (
+    "Of how far whole views lie from where the robot and one hand-eye put them: how large each source is (rms), and "
+    "its share of the variance; the shares add up to 100 %. White repeatability is the arm's scatter, new in every "
+    "view as the noise is. Noise and scanner field, what the scanner errs by over its field, count as far as they move "
+    "whole views: single points are off by more. What repeats can be corrected once it has a name."
+)
+MEAN_SQUARES = "Shares of the mean square: what noise explains, what the named effects explain, and the rest."
+SCANNER_FIELD = (
+    "How much too far (red) or too near (blue) the scanner sees a point, by the direction in which it sees it, the "
+    "same in every view: {size} rms, with a standard uncertainty of {sigma}. Grey: too few points. Found from where "
+    "views overlap. What moving the views does as well no overlap shows, so that a constant, a slope and a bowl over "
+    "the field are not in it; nor is what is finer than a sixth of the field. Before correcting by it, have it "
+    "confirmed by a calibration of the scanner, which shows those too."
+)
 CANDIDATES = (
     "Log Bayes factor: to the right of zero an effect explains more than its parameters cost; 3 is odds of 20 to 1. "
     "Orange: named."

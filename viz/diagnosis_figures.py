@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.units import MICROMETRES
-from viz.colours import BLUE, DARK, GREEN, ORANGE
+from viz.colours import BLUE, GREEN, ORANGE
 from viz.drawing import above, covariate, plain
 
 # More names of views than these cannot be read along an axis.
@@ -86,31 +86,6 @@ def shape(found: Diagnosis, length_unit: str, at_most: int = 3) -> Figure:
         ax.set_title(f"p = {d.p_value:.1g}" + ("" if d.p_value < 0.05 else ": chance"), fontsize=9)
         ax.set_xlabel(covariate(d.covariate))
     axes[0].set_ylabel("displaced (µm)")
-    return plain(figure)
-
-
-def budget(found: Diagnosis, length_unit: str) -> Figure:
-    """Mean squares between the views: sensor noise, what the named effects explain, the rest."""
-    um = MICROMETRES[length_unit]
-    total, noise = (found.residual_rms * um) ** 2, (found.noise_floor * um) ** 2
-    validations = [s.cross_validation for s in found.candidates if s.name in found.effects]
-    share = next((v.inside for v in validations if v is not None), 1.0)
-    explained = max(total * (1 - share), 0.0)
-    parts = [
-        ("sensor noise", min(noise, total), DARK),
-        (", ".join(found.effects) or "explained", explained, ORANGE),
-        ("scatter of the poses and the rest", max(total - noise - explained, 0.0), BLUE),
-    ]
-    figure = Figure(figsize=(7, 1.3), layout="constrained")
-    axes = figure.subplots()
-    start = 0.0
-    for name, size, colour in parts:
-        if size > 0:
-            axes.barh([0], [size / total * 100], left=[start], color=colour, label=name)
-            start += size / total * 100
-    axes.set_yticks([])
-    axes.set_xlabel(f"share of the mean square, {np.sqrt(total):.1f} µm rms (%)")
-    above(axes)
     return plain(figure)
 
 

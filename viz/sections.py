@@ -14,15 +14,18 @@ from stitch.diagnosis.sentences import amounts_of
 from stitch.model.hand_eye_uncertainty import stands_for
 from stitch.stored.load_state import State
 from stitch.system.whole_file import whole
-from stitch.units import MICROMETRES
+from stitch.units import MICROMETRES, length_text
+from stitch.writing.error_sources import error_sources
 from stitch.writing.plain_effects import what_it_is
 from stitch.writing.plain_finding import next_step, plain_finding
 from viz import captions
 from viz import diagnosis_figures as draw
+from viz.budget_figure import budget
 from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
 from viz.comparison_figures import comparison
 from viz.course_figures import joint_courses, time_course
 from viz.diagnosis_recording import add_diagnosis
+from viz.field_map_figure import scanner_field
 from viz.filled_templates import render, script_json
 from viz.page_parts import svg_address, svg_text
 from viz.unbroken import unbroken
@@ -70,13 +73,27 @@ def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
     return {
         "joint_courses": _Picture("Where and when a joint errs without a name", curves, captions.COURSES),
         "time_course": _Picture("When in the session poses err without a name", in_time, captions.TIME_COURSE),
-        "budget": _Picture("Where the error comes from", draw.budget(found, unit), captions.BUDGET),
+        "field_map": _field_map(found, unit),
+        "budget": _Picture("Where the error comes from", budget(found, unit), _of_budget(found)),
         "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
         "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),
         "shape": _Picture("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
         "aliases": _Picture("Aliases in these views", draw.alias_picture(found), captions.ALIASES),
         "views": _Picture("Displacement of every view from the model", draw.view_arrows(found, unit), captions.VIEWS),
     }
+
+
+def _field_map(found: Diagnosis, unit: str) -> _Picture:
+    """Where the scanner itself errs, where that is found."""
+    title, shown = "How the scanner errs over its field", None if found.smooth is None else found.smooth.map
+    if shown is None:
+        return _Picture(title, None, "")
+    size, sigma = (length_text(x, unit, 2) for x in (shown.rms, shown.uncertainty))
+    return _Picture(title, scanner_field(shown, unit), captions.SCANNER_FIELD.format(size=size, sigma=sigma))
+
+
+def _of_budget(found: Diagnosis) -> str:
+    return captions.BUDGET if error_sources(found.budget) else captions.MEAN_SQUARES
 
 
 def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[dict[str, str]]:
@@ -100,8 +117,8 @@ def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[d
 
 def _rms(found: Diagnosis, candidate: CandidateEffect, which: str, um: float) -> str:
     """Rms (µm) with the effect added, in the fit or on views left out; a dash where it was not validated."""
-    validation = candidate.cross_validation
-    return "–" if validation is None else f"{found.residual_rms * um * getattr(validation, which) ** 0.5:.1f}"
+    validation, now = candidate.cross_validation, found.residual_rms if which == "inside" else found.heldout_rms
+    return "–" if validation is None else f"{now * um * getattr(validation, which) ** 0.5:.1f}"
 
 
 def write_comparison(found: Comparison, state: State, folder: Path) -> None:

@@ -74,6 +74,11 @@ class Diagnosis:
         return self.over_nothing > ODDS
 
     @property
+    def likelier_than_not(self) -> bool:
+        """False where a name, or a group, is less likely than nothing being missing."""
+        return self.over_nothing > 0
+
+    @property
     def time_curve(self) -> TimeCurve | None:
         """What the flange does in a course of time that is said."""
         return next((u.curve for u in to_be_said(self.unnamed, self.implausible) if u.curve is not None), None)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR, numbers_covariance, stands_for
 from stitch.model.model_toml import ModelFile, read_model
-from stitch.stored.run_documents import read_result, verdict_of
-from stitch.units import METRES
+from stitch.stored.run_documents import read_diagnosis, read_result
+from stitch.units import METRES, length_text
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
 _WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
@@ -72,7 +73,7 @@ def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner")
     Raises:
         InputError: no run, a damaged one, or a name that a frame cannot have.
     """
-    result, model = read_result(folder), read_model(folder)
+    result, model, told = read_result(folder), read_model(folder), read_diagnosis(folder)
     if model.mount not in _PARENTS:
         raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
     metres = METRES[model.length_unit]
@@ -86,7 +87,12 @@ def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner")
         mount=model.mount,
         parent=_plain("--parent", parent or _PARENTS[model.mount]),
         child=_plain("--child", child),
-        notes=(stands_for(verdict_of(folder)).rstrip("."), *_hidden(result["unobservable"]), *_left_behind(model)),
+        notes=(
+            stands_for(told.get("verdict")).rstrip("."),
+            *_unseen(told.get("candidates", []), model.length_unit),
+            *_hidden(result["unobservable"]),
+            *_left_behind(model),
+        ),
     )
 
 
@@ -98,6 +104,16 @@ def _plain(flag: str, name: str) -> str:
 
 def _hidden(directions: Sequence[str]) -> list[str]:
     return [f"Not observable from these motions, left at the coarse value: {direction}" for direction in directions]
+
+
+def _unseen(candidates: Sequence[dict[str, Any]], length_unit: str) -> list[str]:
+    """How far an effect that the views do not show could push the hand-eye: U is that of the model."""
+    known = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
+    if not known:
+        return []
+    size, name = max(known)
+    pushed = length_text(size, length_unit, 2)
+    return [f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"]
 
 
 def _left_behind(model: ModelFile) -> list[str]:

@@ -54,7 +54,9 @@ RESULT = _table(
     left_out=_list(_table({"view": _TEXT, "why": _TEXT})),
     linkage=_table({}, components=_list(_list(_TEXT)), weak=_list(_table({"view": _TEXT}))),
 )
-_VERDICTS = ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]
+_CANDIDATES = _list(_table({"effect": _TEXT}, hand_eye_if_missed=_MAYBE))
+_VERDICT = {"enum": ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]}
+DIAGNOSIS = _table({"verdict": _VERDICT}, candidates=_CANDIDATES)
 _STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
 _VALUES = {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _NUMBER}}
 _NOTES = _list(_table({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
@@ -82,20 +84,17 @@ def read_result(folder: Path) -> dict[str, Any]:
         inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
         if inner:
             raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
-    document = _checked(folder / "result.json", RESULT)
-    assert isinstance(document, dict)
-    return document
+    return dict(_checked(folder / "result.json", RESULT))
 
 
-def verdict_of(folder: Path) -> str | None:
-    """Verdict of the diagnosis in a run folder; None where there is none.
+def read_diagnosis(folder: Path) -> dict[str, Any]:
+    """Verdict and candidates of the diagnosis in a run folder; {} where there is none.
 
     Raises:
         InputError: a damaged diagnosis.json.
     """
-    if not (folder / "diagnosis.json").is_file():
-        return None
-    return str(_checked(folder / "diagnosis.json", _table({"verdict": {"enum": _VERDICTS}}))["verdict"])
+    file = folder / "diagnosis.json"
+    return dict(_checked(file, DIAGNOSIS)) if file.is_file() else {}
 
 
 def covariance_of_effects(path: Path) -> EffectsCovariance:

@@ -7,6 +7,7 @@ import numpy as np
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import TimeCurve
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.writing.json_file import rows_of_fields
 from stitch.writing.plain_finding import plain_finding
 
@@ -37,6 +38,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "notes": list(d.notes),
         "doubts": list(d.doubts),
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),
+        "field_map": _field_map(d.smooth),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,
     }
@@ -63,6 +65,15 @@ def _time_curve(curve: TimeCurve) -> dict[str, Any]:
         "error": curve.error.tolist(),
         "sigma": curve.sigma.tolist(),
     }
+
+
+def _field_map(smooth: FieldError | None) -> dict[str, Any] | None:
+    """Where in its field the scanner errs along the ray, in length_unit; null where too few points were seen."""
+    if smooth is None or smooth.map is None:
+        return None
+    drawn = {"error": smooth.map.error, "sigma": smooth.map.sigma}
+    rows = {name: [[x if np.isfinite(x) else None for x in row] for row in at.tolist()] for name, at in drawn.items()}
+    return {"x_over_z": smooth.map.x.tolist(), "y_over_z": smooth.map.y.tolist()} | rows
 
 
 def _untested(name: str, needs: tuple[str, ...]) -> dict[str, Any]:

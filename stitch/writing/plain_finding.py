@@ -95,6 +95,8 @@ def next_step(found: Diagnosis, run: str) -> str:
     if found.doubts:
         return f"Next: put right what is doubted; it stands in full in: stitch review {run}"
     match found.verdict:
+        case "missing_effect" if not found.likelier_than_not:
+            return f"Next, what would tell it from chance: stitch next {run}"
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
         case "cannot_tell" if not _helps_as_one(found):

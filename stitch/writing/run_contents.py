@@ -38,6 +38,8 @@ _PICTURES = {
     "aliases",
     "views",
     "joint_courses",
+    "time_course",
+    "field_map",
     "compare",
 }
 

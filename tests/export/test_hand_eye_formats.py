@@ -183,6 +183,16 @@ def test_an_uncertainty_says_of_which_model_it_is(verdict, said, tmp_path):
         assert said in write(hand_eye_of(run))
 
 
+def test_what_an_unseen_effect_could_do_leaves_with_the_numbers(tmp_path):
+    """U counts no effect that the views do not show."""
+    run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
+    sizes = {"range_scale": 0.269, "part_growth": None, "joint_offset": 0.02}
+    candidates = [{"effect": name, "hand_eye_if_missed": size} for name, size in sizes.items()]
+    (run / "diagnosis.json").write_text(json.dumps({"verdict": "adequate", "candidates": candidates}))
+    for write in FORMATS.values():
+        assert "could displace it, at the part, by as much as 269 µm (range_scale)" in write(hand_eye_of(run))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -29,7 +29,13 @@ def test_every_effect_of_the_library_has_words():
 def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve):
     monkeypatch.setattr("stitch.writing.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
     found = SimpleNamespace(
-        verdict=verdict, curves=curves, time_curve=time_curve, doubts=(), linear=None, candidates=()
+        verdict=verdict,
+        curves=curves,
+        time_curve=time_curve,
+        doubts=(),
+        linear=None,
+        candidates=(),
+        likelier_than_not=True,
     )
     command = next_step(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None

@@ -25,6 +25,8 @@ from stitch.writing.plain_finding import next_step, plain_finding
 from stitch.writing.run_folder import extend, held, load_early
 
 _SHOWN = 6
+# Share of the posterior that must be said where no candidate has it.
+_LEFT = 0.05
 
 
 def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool, says_next: bool = True) -> None:
@@ -99,6 +101,8 @@ def show(found: Diagnosis, length_unit: str) -> None:
     for s in found.candidates[:_SHOWN]:
         table.add_row(*_row(found, s, length_unit))
     terminal.print(table)
+    if (left := 1 - sum(s.ranked.posterior for s in found.candidates)) > _LEFT:
+        terminal.print(f"{left:.2f} of the posterior: nothing is missing, or something without a name.", soft_wrap=True)
     for s in found.candidates[:3]:
         if s.ranked.score.observable:
             alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])

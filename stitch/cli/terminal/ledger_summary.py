@@ -2,6 +2,7 @@
 
 from rich.table import Table
 
+from stitch.cli.terminal.run_summary import hand_eye_lines
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL, RISE
@@ -28,6 +29,8 @@ def show_ledger(result: Run) -> None:
             terminal.print(f"  {name}.{p.name} = {p.told}{how}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
+    for line in hand_eye_lines(result.T_mount, result.mount_covariance, result.session.mount, unit):
+        terminal.print(line, soft_wrap=True)
 
 
 def remarks(result: Run) -> list[str]:
@@ -48,7 +51,8 @@ def remarks(result: Run) -> list[str]:
             out.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
         if _clearest(term) < FAINT:
             out.append(
-                f"{term.name}: views left out say that it is there; its sigmas count all that an arm may do beside it."
+                f"{term.name}: views left out are predicted better with it, though no parameter differs from zero by "
+                "two sigmas, which count all that an arm may do beside it."
                 if term.name in earned
                 else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
             )

@@ -1,7 +1,7 @@
 """Smooth errors larger than every scanner has, as the overlaps show them: the same in every view, or not."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from stitch.model.model import Model
 from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term
 from stitch.observations.surfaces.errors_by_view import CHANGING, SAME, by_view
+from stitch.observations.surfaces.field_map import FieldMap, field_map
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.point_gram import PointGram, seen_twists
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE, alike
@@ -31,6 +32,7 @@ class FieldError:
     over_noise: bool  # one of the two is more systematic than random
     by_view: bool = False  # the second is the clearer
     with_time: bool = False  # it follows the session
+    map: FieldMap | None = field(default=None, compare=False, repr=False)  # where the first is the clearer
 
     @property
     def unusual(self) -> bool:
@@ -57,13 +59,15 @@ def field_error(
     # like errors of single views.
     alone = changing.share > 0 and changing.gain > _gain_of_common(apart)
     same = _size(apart if alone else _coarse(sums, freed, noise, further), SAME, alpha / 2)
+    own = alone or (changing.share > 0 and not same.share)
     return FieldError(
         noise * same.share,
         noise * changing.share,
         max(same.gain, changing.gain),
         same.over_noise or changing.over_noise,
-        alone or (changing.share > 0 and not same.share),
+        own,
         changing.share > 0 and _with_time(apart.estimate(CHANGING, changing.shares), alpha),
+        field_map(measurement, sums, freed, noise, further) if same.share and not own else None,
     )
 
 

@@ -84,8 +84,19 @@ class ShownErrors:
 
     def estimate(self, cause: int, shares: Array) -> Array:
         """(K_c,) the likeliest errors of one cause in units of its size, where all causes have shares (C,)."""
-        spread = sum((s**2 * t @ t.T for s, t in zip(shares, self.told, strict=True)), np.diag(self.scatter))
-        return np.asarray(shares[cause] * self.told[cause].T @ np.linalg.solve(spread, self.seen))
+        return np.asarray(shares[cause] * self.told[cause].T @ np.linalg.solve(self._spread(shares), self.seen))
+
+    def left(self, cause: int, shares: Array) -> Array:
+        """(K_c, K_c) covariance of the errors of one cause about their estimate, in units of its size: one where the
+        overlaps tell nothing of them.
+        """
+        told = shares[cause] * self.told[cause]
+        return np.asarray(np.eye(told.shape[1]) - told.T @ np.linalg.solve(self._spread(shares), told))
+
+    def _spread(self, shares: Array) -> Array:
+        """(n, n) variance of `seen` where all causes have shares (C,)."""
+        parts = [share**2 * t @ t.T for share, t in zip(shares, self.told, strict=True)]
+        return np.asarray(sum(parts, np.diag(self.scatter)))
 
     def _deviance(self, log_shares: Array) -> tuple[float, Array]:
         """−2 log likelihood and its slopes (C,)."""

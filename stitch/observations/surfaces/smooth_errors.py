@@ -16,6 +16,8 @@ _REACH = 0.98
 _ORDERS = sorted(((i, j) for i in range(_FINER + 1) for j in range(_FINER + 1) if 0 < i + j <= _FINER), key=sum)
 # Along the ray over the field, coarse ones first; the slope with incidence follows them.
 COARSE = sum(sum(order) <= _DEGREE for order in _ORDERS)
+# With the finer ones, which come first of what all views may have in common besides.
+FINE = len(_ORDERS)
 
 
 def smooth_sums(
@@ -28,7 +30,7 @@ def smooth_sums(
     Args:
         apart: those of COARSE for either view of a pair its own; and after the one over incidence `shared_errors`.
     """
-    capture, half = measurement.capture, _half_field(measurement)
+    capture, half = measurement.capture, half_field(measurement)
     further = beside or PointSlopes(measurement, ())
     standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in capture.scans])))
 
@@ -55,8 +57,8 @@ def smooth_sums(
     return sums, float(np.nanmedian([scan.noise for scan in capture.scans]))
 
 
-def _half_field(measurement: Measurement) -> Array:
-    """(2,) x/z and y/z up to which the scanner sees."""
+def half_field(measurement: Measurement) -> Array:
+    """(2,) |x/z| and |y/z| in the scanner's frame up to which it sees, but for the corners."""
     away = np.concatenate([scan.points - scan.eye for scan in measurement.capture.scans])
     slopes = np.abs(away[:, :2] / away[:, 2:])
     return np.asarray(np.maximum(np.quantile(slopes, _REACH, axis=0), 1e-6))
@@ -67,7 +69,7 @@ def _undone(away: Array, cosine: Array, half: Array) -> Array:
 
     Legendre products over the field, of unit rms together, and the slope with incidence.
     """
-    along = [*_over_field(away, half, _DEGREE), 1 / cosine - 1]
+    along = [*over_field(away, half, _DEGREE), 1 / cosine - 1]
     return np.asarray(-np.array(along)[..., None] * _unit(away))
 
 
@@ -79,13 +81,17 @@ def _shared(away: Array, half: Array, standoff: float) -> Array:
     ray = _unit(away)
     far = np.linalg.norm(away, axis=1) / standoff - 1
     a, b = away[:, :2].T / away[:, 2] / half[:, None]
-    along = [*_over_field(away, half, _FINER)[COARSE:], far, far**2, far**3, far * a, far * b]
+    along = [*over_field(away, half)[COARSE:], far, far**2, far**3, far * a, far * b]
     across = [shape[:, None] * axis for shape in (a, b, a**2, a * b, b**2, far) for axis in np.eye(3)[:2]]
     return np.concatenate([np.array(along)[..., None] * ray, np.array(across)])
 
 
-def _over_field(away: Array, half: Array, degree: int) -> list[Array]:
-    """Legendre products (N,) over the field; those of _DEGREE have unit rms together."""
+def over_field(away: Array, half: Array, degree: int = _FINER) -> list[Array]:
+    """FINE Legendre products (N,) over the field for rays (N, 3); the first COARSE have unit rms together.
+
+    Args:
+        half: (2,) of `half_field`, where the products end.
+    """
     a, b = np.clip(away[:, :2] / away[:, 2:] / half, -1.2, 1.2).T
     powers = [legendre.legvander(x, degree) * np.sqrt(2 * np.arange(degree + 1) + 1) for x in (a, b)]
     unit = np.sqrt(sum(1.0 / sum(order) ** 2 for order in _ORDERS[:COARSE]))
