@@ -11,6 +11,8 @@ def compare_run(
 ) -> None:
     """Show the residual by view, pair, target, joint, range, incidence, field, time, covariate and place.
 
+    Views are the samples. What follows a property clearly is told with the chance of it over all bins that were asked.
+
     \b
     Examples:
       stitch compare runs/blade-17

@@ -6,10 +6,13 @@ sits off against the other end. Intervals count views: points of one view share 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from stitch.comparison.tables import PLACE, Comparison, Table, binned, values_of_views, view_properties
+from stitch.comparison.table import Table, table_of
+from stitch.comparison.tables import PLACE, Comparison, binned, changes, values_of_views, view_properties
+from stitch.comparison.view_scatter import Statistics, view_statistics
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.surfaces.gram import RMS_GATE
@@ -35,11 +38,11 @@ def compare(state: State) -> Comparison:
         overlaps = collect(own, poses, state.gate, [sample(s, FINE_SAMPLES) for s in own.scans])
     rows = _Rows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
-    tables = [_labelled(rows, "view", rows.view, names), _pairs(rows, names)]
+    tables = [_views(rows, names), _pairs(rows, names)]
     tables += [_binned(rows, name, unit, values) for name, unit, values in _properties(state, rows)]
     tables.append(_regions(rows))
     return Comparison(
-        tables=tuple(t for t in tables if len(t.count)),
+        tables=tuple(t for t in tables if len(t.count) > (0 if t.label else 1)),
         rms=overlaps.gram.rms,
         scale=overlaps.gram.scale,
         views=tuple(names),
@@ -75,33 +78,21 @@ class _Rows:
         )
 
 
-def _statistics(rows: _Rows, bins: Indices, size: int) -> tuple[Array, ...]:
-    """Mean, its sigma, rms, its sigma, count, views of every bin.
-
-    The sample is a view: its mean and rms in a bin. Their spread about the bin's is pooled over all bins,
-    because two or three views in one bin do not know it.
-    """
+def _statistics(rows: _Rows, bins: Indices, size: int) -> Statistics:
     n, s, q = (x.sum(axis=2) for x in rows.sums(bins, size))  # (B, V)
-    use = n >= _ENOUGH
-    views = use.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean, rms = s.sum(axis=1) / n.sum(axis=1), np.sqrt(q.sum(axis=1) / n.sum(axis=1))
-        sigmas = [_pooled(x, middle, use) for x, middle in ((s / n, mean), (np.sqrt(q / n), rms))]
-    return mean, sigmas[0], rms, sigmas[1], n.sum(axis=1), views
-
-
-def _pooled(values: Array, middle: Array, use: Array) -> Array:
-    count = use.sum(axis=1)
-    square = np.where(use, (values - middle[:, None]) ** 2, 0.0).sum()
-    freedom = int((count - 1)[count > 1].sum())
-    if freedom < 1:
-        return np.full(len(values), np.nan)
-    return np.asarray(np.sqrt(square / freedom / np.maximum(count, 1)))
+    return view_statistics(n, s, q, _ENOUGH)
 
 
 def _labelled(rows: _Rows, name: str, bins: Indices, labels: Sequence[str]) -> Table:
     number = np.arange(len(labels), dtype=float)
-    return Table(name, "", number, number, tuple(labels), *_statistics(rows, bins, len(labels)))
+    return table_of(name, "", (number, number), tuple(labels), _statistics(rows, bins, len(labels)))
+
+
+def _views(rows: _Rows, names: Sequence[str]) -> Table:
+    """One sample each: how well its own mean is known nothing says."""
+    table = _labelled(rows, "view", rows.view, names)
+    nothing = np.full(len(names), np.nan)
+    return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
 
 
 def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
@@ -121,6 +112,7 @@ def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
         rms_sigma=nothing,
         count=count,
         views=np.full(len(v), 2),
+        p_value=nothing,
     )
 
 
@@ -135,12 +127,12 @@ def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
         ("field b = y/z", "", y / z),
         ("field ρ", "", np.hypot(x, y) / z),
     ]
-    return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if np.ptp(values) > 1e-9]
+    return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if changes(name, values)]
 
 
 def _binned(rows: _Rows, name: str, unit: str, values: Array) -> Table:
     edges, bins = binned(values)
-    return Table(name, unit, edges[:-1], edges[1:], (), *_statistics(rows, bins, len(edges) - 1))
+    return table_of(name, unit, (edges[:-1], edges[1:]), (), _statistics(rows, bins, len(edges) - 1))
 
 
 def _regions(rows: _Rows) -> Table:

@@ -1,7 +1,8 @@
 """Where model and labelled points part: offsets of the targets against everything that is known of the views.
 
-A mean is that of the offset along the direction in which the bins of a property differ most; rms is that of the
-3D distance. Intervals count views: targets of one view share its error.
+A mean is that of the offset along the direction in which the bins of a property differ most, and its p-value knows
+that the direction was chosen; rms is that of the 3D distance. Intervals count views: targets of one view share its
+error.
 """
 
 from collections.abc import Sequence
@@ -9,13 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.tables import Comparison, Table, binned, view_properties
+from stitch.comparison.table import Table, table_of
+from stitch.comparison.tables import Comparison, binned, changes, view_properties
+from stitch.comparison.view_scatter import view_statistics
 from stitch.frames import Array, Indices
 from stitch.model.forward import corrected
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
 from stitch.observations.targets.rows import rows_of
 from stitch.runs.state import State
 from stitch.statistics.block_least_squares import Blocks
+
+# A direction is chosen for every table among so many dimensions.
+_DIRECTIONS = 3
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,8 @@ def compare_targets(state: State) -> Comparison:
     tables = [_table(rows, name, "", bins, _numbers(names), names) for name, (bins, names) in labels.items()]
     for name, unit, values in _properties(state, rows):
         edges, bins = binned(values)
-        tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
+        if len(edges) > 2:
+            tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
     of_views = {name: values for name, _, values in _of_views(state)}
     return Comparison(tuple(tables), rms, rms, tuple(state.session.names), of_views)
@@ -73,44 +80,20 @@ def _table(
 ) -> Table:
     size = len(edges[0])
     count = np.asarray(np.bincount(bins, minlength=size), float)
-    share = np.maximum(count, 1)
-    mean = np.stack([np.bincount(bins, rows.offset[:, i], size) for i in range(3)], axis=1) / share[:, None]
-    square = np.bincount(bins, np.sum(rows.offset**2, axis=1), size) / share
+    sums_3d = np.stack([np.bincount(bins, rows.offset[:, i], size) for i in range(3)], axis=1)
+    mean = sums_3d / np.maximum(count, 1)[:, None]
     direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
     along = rows.offset @ direction
-    views = np.array([len(np.unique(rows.view[bins == b])) for b in range(size)], float)
-    signed = np.bincount(bins, along, size) / share
-    # The sample is a view: the mean of its targets in the bin, spread about the bin's mean.
-    key = bins * rows.views + rows.view
-    n = np.bincount(key, minlength=size * rows.views).reshape(size, rows.views)
-    of_view = np.bincount(key, along, size * rows.views).reshape(n.shape) / np.maximum(n, 1)
-    lengths = np.linalg.norm(rows.offset, axis=1)
-    distance = np.bincount(key, lengths, size * rows.views).reshape(n.shape) / np.maximum(n, 1)
-    sigmas = [
-        np.sqrt(np.where(n > 0, (x - m[:, None]) ** 2, 0).sum(axis=1) / np.maximum(views - 1, 1) / np.maximum(views, 1))
-        for x, m in ((of_view, signed), (distance, np.sqrt(square)))
-    ]
-    unknown = np.where(views > 1, 1.0, np.nan)
-    low, high = edges
-    return Table(
-        name=name,
-        unit=unit,
-        low=low,
-        high=high,
-        label=tuple(labels),
-        mean=signed,
-        mean_sigma=sigmas[0] * unknown,
-        rms=np.sqrt(square),
-        rms_sigma=sigmas[1] * unknown,
-        count=count,
-        views=views,
-    )
+    key, shape = bins * rows.views + rows.view, (size, rows.views)
+    weights = np.ones(len(along)), along, np.sum(rows.offset**2, axis=1)
+    n, s, q = (np.asarray(np.bincount(key, w, size * rows.views), float).reshape(shape) for w in weights)
+    return table_of(name, unit, edges, tuple(labels), view_statistics(n, s, q, directions=_DIRECTIONS))
 
 
 def _properties(state: State, rows: _Offsets) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     out = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
-    return out + [(name, unit, values[rows.view]) for name, unit, values in _of_views(state) if np.ptp(values) > 1e-9]
+    return out + [(name, unit, values[rows.view]) for name, unit, values in _of_views(state) if changes(name, values)]
 
 
 def _of_views(state: State) -> list[tuple[str, str, Array]]:

@@ -1,45 +1,21 @@
 """Tables of a residual against everything that is known of it, and their document."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
+from stitch.comparison.same_bins import same_bins
+from stitch.comparison.table import Table as Table
 from stitch.frames import Array, Indices
 from stitch.measurement.views import Views
 
 PLACE = "place on the part"
+APPROACH = "approach of j"
+_SAME = 1e-9  # numbers closer than that are one
 _BINS = 6
 _ENDINGS = {"_c": "°C", "_percent": "%", "_s": "s", "_mm": "mm", "_deg": "°"}
-_FAIR = 50  # correspondences of a bin that may be called the worst
-
-
-@dataclass(frozen=True)
-class Table:
-    """One property in bins; lengths in length_unit, counts of correspondences and of views."""
-
-    name: str
-    unit: str
-    low: Array  # (B,) edges, or the number of the view or cell
-    high: Array  # (B,)
-    label: tuple[str, ...]  # (B,) names of views, pairs or cells; else empty
-    mean: Array  # (B,) signed
-    mean_sigma: Array
-    rms: Array  # (B,)
-    rms_sigma: Array
-    count: Array
-    views: Array
-
-    @property
-    def clearest(self) -> float:
-        """Largest |mean| over its standard error; 0 where nothing is known."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.abs(self.mean) / self.mean_sigma
-        return float(np.nanmax(np.where(np.isfinite(z), z, 0.0), initial=0.0))
-
-    def worst(self, at_most: int) -> list[int]:
-        """Numbers of the bins of largest rms, of those with a fair count."""
-        fair = self.count > np.minimum(_FAIR, np.median(self.count) / 4)
-        return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
+CLEAR = 0.05  # p over all means
 
 
 @dataclass(frozen=True)
@@ -61,17 +37,41 @@ class Comparison:
         """Tables by name: views, pairs, places, targets."""
         return tuple(t for t in self.tables if t.label)
 
+    @cached_property
+    def groups(self) -> tuple[tuple[Table, ...], ...]:
+        """Tables of properties, clearest dependence first; those whose bins hold the same rows together."""
+        own = same_bins([t for t in self.tables if not t.label])
+        return tuple(sorted(own, key=lambda g: (g[0].least_p, -g[0].clearest)))
+
     @property
     def places(self) -> tuple[Table, ...]:
-        """Tables of properties, clearest dependence first."""
-        own = [t for t in self.tables if not t.label]
-        return tuple(sorted(own, key=lambda t: -t.clearest))
+        """The first table of every group, clearest dependence first."""
+        return tuple(group[0] for group in self.groups)
+
+    @cached_property
+    def means(self) -> int:
+        """How many means of bins are asked whether they are zero.
+
+        Bins of the same rows count once in whichever table they stand, and so do a bin and all that lies outside it:
+        the sums of the two differ in their sign alone.
+        """
+        sums = [np.abs(t.mean * t.count)[np.isfinite(t.p_value)] for t in self.places]
+        ordered = np.sort(np.concatenate(sums)) if sums else np.zeros(0)
+        return len(ordered) and 1 + int((np.diff(ordered) > _SAME * ordered[-1]).sum())
+
+    def p_of_all(self, table: Table) -> float:
+        """That chance makes any of all the means as clear as the clearest of this table (Bonferroni)."""
+        return min(1.0, max(self.means, 1) * table.least_p)
+
+    def is_clear(self, table: Table) -> bool:
+        """True where chance does not explain its clearest mean (5 % over all means)."""
+        return self.p_of_all(table) <= CLEAR
 
 
 def view_properties(views: Views) -> list[tuple[str, str, Array]]:
     """Name, unit and value (V,) of everything that is known of the views."""
     out = [(f"j{i + 1}", "deg", np.degrees(views.joints[:, i])) for i in range(views.joints.shape[1])]
-    out += [(f"approach of j{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
+    out += [(f"{APPROACH}{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
     out += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
     if views.has("time"):
         out.append(("time", "s", views.time))
@@ -88,21 +88,37 @@ def values_of_views(views: Views) -> dict[str, Array]:
     return {name: values for name, _, values in view_properties(views)}
 
 
+def changes(name: str, values: Array) -> bool:
+    """True if a property (V,) has two values; that no view came before the first is no approach."""
+    told = values[values != 0] if name.startswith(APPROACH) else values
+    return bool(len(told) and np.ptp(told) > _SAME)
+
+
 def binned(values: Array) -> tuple[Array, Indices]:
-    """(B + 1,) edges of bins with about equal counts, and the bin of every value (N,); equal values stay together."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-    edges = edges if len(edges) > 1 else np.array([edges[0] - 0.5, edges[0] + 0.5])
+    """(B + 1,) edges of bins with about equal counts, and the bin of every value (N,); equal values stay together.
+
+    Of no more values than bins, each has its own.
+    """
+    own = np.unique(values)
+    if len(own) <= _BINS:
+        edges = np.concatenate([own[:1], (own[1:] + own[:-1]) / 2, own[-1:]])
+    else:
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+    edges = edges if len(own) > 1 else np.array([own[0] - 0.5, own[0] + 0.5])
     bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return edges, bins.astype(np.int64)
 
 
 def comparison_document(found: Comparison) -> dict[str, object]:
     """The tables as plain lists."""
-    floats, counts = "low high mean mean_sigma rms rms_sigma", "count views"
+    floats, counts = "low high mean mean_sigma rms rms_sigma p_value", "count views"
+    names = {t.name: [x.name for x in group if x is not t] for group in found.groups for t in group}
     return {
         "rms": found.rms,
+        "means": found.means,
         "tables": [
             {"name": t.name, "unit": t.unit, "label": list(t.label), "clearest": t.clearest}
+            | ({} if t.label else {"p_of_all": found.p_of_all(t), "same_bins": names[t.name]})
             | {key: getattr(t, key).tolist() for key in floats.split()}
             | {key: getattr(t, key).astype(int).tolist() for key in counts.split()}
             for t in found.tables

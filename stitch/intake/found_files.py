@@ -13,6 +13,7 @@ from stitch.intake.program_poses import PROGRAMS, is_program, read_by_its_progra
 from stitch.intake.raw_poses import STRUCTURED, TABLES, natural, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.reading.poses_in_scans import poses_in_scans
+from stitch.reading.rights import readable
 
 _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
@@ -33,6 +34,7 @@ class Found:
     aside: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
 
 
+@readable()
 def look_into(folder: Path, poses: Path | None = None) -> Found:
     """Find clouds and poses in a folder and below it.
 

@@ -5,12 +5,14 @@ import re
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+# A pose as Universal Robots writes it: p[0.1, 0.2, …].
+_POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
 _BRACKETS = str.maketrans("[](){}", " " * 6)
 
 
 def cells_of(line: str, separator: str) -> list[str]:
     """Cells of a line, trimmed."""
-    line = line.translate(_BRACKETS).strip()
+    line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
         return line.split()
     row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))

@@ -14,6 +14,7 @@ from stitch.reading.depth_image import DEPTH_SUFFIXES, read_depth_columns
 from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, read_mesh, read_ptx
 from stitch.reading.organised import grid_shape, measured
 from stitch.reading.pcd import read_pcd
+from stitch.reading.rights import readable
 from stitch.reading.text_file import reason_of, require_file
 from stitch.reading.zdf import read_zdf
 
@@ -23,6 +24,7 @@ _TEXT = (".xyz", ".csv", ".txt", ".asc")
 CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz", ".zdf", *DEPTH_SUFFIXES)
 
 
+@readable()
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     """Read one scan; `scale` turns the file's unit into the session's. Points at 0 0 0 are left out.
 
@@ -47,6 +49,8 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     reader = readers.get(kind)
     if reader is None:
         raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use PLY, PCD, XYZ or CSV")
+    if not path.stat().st_size:
+        raise InputError(f"{path}: the file is empty; export it again, or leave this view out of views.csv")
     try:
         columns = reader(path)
         if kind in (".ply", ".pcd") and grid_shape(path):
@@ -90,7 +94,9 @@ def read_ply(path: Path) -> dict[str, Array]:
     from plyfile import PlyData
 
     require_room(path)
-
+    with path.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
     data: NDArray[np.void] = PlyData.read(path)["vertex"].data
     # List properties have no column of numbers.
     return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}

@@ -5,20 +5,26 @@ from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.reading.names import require_name
-from stitch.reading.text_file import require_file
+from stitch.reading.separators import require_commas
+from stitch.reading.text_file import not_utf8, require_file
+
+_LONGEST_HEADER = 1 << 20
 
 
 def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Names of the columns, and line number and cells of every line that is not empty.
 
     Raises:
-        InputError: the file is not text, a quote stays open, or a row has more or fewer cells than the header.
+        InputError: the file is not text, is not separated by commas, a quote stays open, or a row has more or fewer
+            cells than the header.
     """
     require_file(file, "write the table")
     rows: list[tuple[int, list[str]]] = []
     first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
+            require_commas(file, stream.readline(_LONGEST_HEADER))
+            stream.seek(0)
             reader = csv.reader(stream, skipinitialspace=True)
             header = [require_name(f"{file} line 1", name.strip(), "column") for name in next(reader, [])]
             first = reader.line_num + 1
@@ -27,8 +33,8 @@ def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
                     _require_cells(file, reader.line_num, row, header)
                     rows.append((reader.line_num, row))
                 first = reader.line_num + 1
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not UTF-8 text ({error.reason}); save it as CSV") from None
+    except UnicodeDecodeError:
+        raise InputError(not_utf8(file, "CSV UTF-8")) from None
     except csv.Error as error:
         # A quote that stays open swallows lines until a cell is larger than the csv module allows.
         raise InputError(f"{file} line {first}: {error}; close the quote that opens there") from None

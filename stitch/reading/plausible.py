@@ -9,6 +9,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Session
+from stitch.reading.one_unit import possible, require_one_unit, shown_length
 from stitch.units import METRES
 
 # What one scan of a robot's scanner shows, in metres: from a borescope to a hull.
@@ -35,12 +36,14 @@ def check_scale(session: Session, cloud_unit: str) -> None:
     metres = METRES[session.length_unit]
     toml = session.path / "session.toml"
     own = session.length_unit
+    clouds = [(view.name, view.cloud) for view in session.views if view.cloud is not None]
+    away = {name: metres * _median_distance(cloud.points) for name, cloud in clouds}
+    over = {name: metres * _size(cloud.points) for name, cloud in clouds}
+    for sizes, limits, does, how in ((away, (0.0, _RANGE_M), "lie", "away"), (over, _SIZE_M, "extend over", "")):
+        require_one_unit(toml, sizes, limits, f"{does} {{}}{' ' * bool(how)}{how}", cloud_unit)
+        for name, size in sizes.items():
+            _refuse(size, limits, f"{toml}: the points of view {name} {does}", how, "cloud_unit", cloud_unit)
     for view in session.views:
-        if view.cloud is not None:
-            points = view.cloud.points * metres
-            what = f"{toml}: the points of view {view.name}"
-            _refuse(_median_distance(points), (0.0, _RANGE_M), f"{what} lie", "away", "cloud_unit", cloud_unit)
-            _refuse(_size(points), _SIZE_M, f"{what} extend over", "", "cloud_unit", cloud_unit)
         if view.sighting is not None:
             distance = _median_distance(view.sighting.points) * metres
             what = f"{toml}: the targets of view {view.name} lie"
@@ -73,9 +76,9 @@ def require_near(what: str, points: Array) -> None:
 
 
 def _refuse(size_m: float, limits: tuple[float, float], what: str, how: str, key: str, unit: str) -> None:
-    if limits[0] <= size_m <= limits[1] or size_m == 0:
+    if possible(size_m, limits):
         return
-    shown = f"{size_m * 1e3:.3g} mm" if size_m < 1 else f"{size_m:.3g} m"
+    shown = shown_length(size_m)
     hint = f'the scale looks off by 1000: set {key} = "{_OTHER[unit]}"'
     raise InputError(f'{what} {shown}{" " * bool(how)}{how} with {key} = "{unit}"; {hint}')
 

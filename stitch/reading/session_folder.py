@@ -16,6 +16,7 @@ from stitch.reading import scanner_toml, session_toml
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.plausible import check_scale
 from stitch.reading.points_csv import read_points, read_targets
+from stitch.reading.rights import readable
 from stitch.reading.session_scans import read_scans
 from stitch.reading.text_file import require_file
 from stitch.reading.toml_file import choice
@@ -23,6 +24,7 @@ from stitch.reading.views_csv import Row, read_views, row_at
 from stitch.units import METRES
 
 
+@readable()
 def load_session(
     path: Path | str,
     scans: bool = True,

@@ -38,6 +38,10 @@ def document(file: Path) -> dict[str, Any]:
     if file.parent.is_dir():
         # Whoever names the folder of the raw scans comes here first.
         hint += f"; to fix: `stitch init {shlex.quote(str(file.parent))}` makes one of scans and poses as they are"
+    elif file.parent.exists():
+        hint += f"; to fix: name a folder, {shlex.quote(str(file.parent))} is a file"
+    else:
+        hint += f"; to fix: name a folder that exists, {shlex.quote(str(file.parent))} does not"
     document = read_toml(file, hint)
     if document.get("format") != FORMAT:
         raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{FORMAT}"')

@@ -5,13 +5,17 @@ from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import InputError
+from stitch.reading.missing import reason_missing
+from stitch.reading.rights import readable
 
 # Tables and descriptions are far smaller; a larger one is another file.
 LARGEST_MB = 200
 # How the small file begins that Git LFS leaves in place of a large one.
 _POINTER = b"version https://git-lfs"
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
+@readable()
 def require_file(file: Path, hint: str) -> None:
     """Refuse what cannot be read to its end: a pipe, a device, a folder.
 
@@ -19,7 +23,7 @@ def require_file(file: Path, hint: str) -> None:
         hint: what to do where there is no such file.
 
     Raises:
-        InputError: no such file, none of this kind, or one that Git LFS has not fetched.
+        InputError: no such file, none of this kind, one that may not be read, or that Git LFS has not fetched.
     """
     if file.is_file():
         _require_no_pointer(file)
@@ -30,7 +34,7 @@ def require_file(file: Path, hint: str) -> None:
         raise InputError(f"{file}: is a pipe or a device; to fix: put a file there")
     if file.is_symlink():
         raise InputError(f"{file}: is a link to {file.readlink()}, which does not exist; to fix: {hint}")
-    raise InputError(f"{file}: not found; {hint}")
+    raise InputError(reason_missing(file) or f"{file}: not found; {hint}")
 
 
 def _require_no_pointer(file: Path) -> None:
@@ -48,8 +52,27 @@ def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
     _require_size(file, hint, largest_mb)
     try:
         return file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(not_utf8(file, "UTF-8")) from None
+
+
+def not_utf8(file: Path, save_as: str) -> str:
+    """What to say of a file that is not UTF-8: where its first byte stands that is none.
+
+    Args:
+        save_as: the kind to save it as.
+    """
+    told = file.read_bytes()
+    mend = f"to fix: save it as {save_as}"
+    if told.startswith(_UTF16):
+        return f"{file} line 1: is UTF-16 text, not UTF-8; {mend}"
+    try:
+        told.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not UTF-8 text ({error.reason}); to fix: save it as UTF-8") from None
+        start = error.start + len(codecs.BOM_UTF8) * told.startswith(codecs.BOM_UTF8)
+        line = told.count(b"\n", 0, start) + 1
+        return f"{file} line {line}: not UTF-8 text, byte 0x{told[start]:02x} is the first that is none; {mend}"
+    return f"{file}: not UTF-8 text; {mend}"
 
 
 def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
@@ -62,7 +85,7 @@ def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
     """
     _require_size(file, hint, largest_mb)
     told = file.read_bytes()
-    marked = told.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    marked = told.startswith(_UTF16)
     for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
         with suppress(UnicodeDecodeError):
             text = told.decode(encoding)

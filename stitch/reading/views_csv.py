@@ -13,11 +13,11 @@ from stitch.measurement.robot import Robot, forward
 from stitch.reading.arm_loads import require_loads
 from stitch.reading.csv_lines import read_lines
 from stitch.reading.csv_number import is_number, number
+from stitch.reading.joint_columns import JOINT, require_joint_columns, require_no_hidden_joints
 from stitch.reading.names import require_name
 from stitch.reading.reported_pose import POSE, flange_pose
 from stitch.reading.text_file import require_file
 
-_JOINT = re.compile(r"j([1-9]\d*)_deg$")
 _APPROACH = re.compile(r"j([1-9]\d*)_approach$")
 
 
@@ -52,7 +52,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
     cells = [(line, _row_cells(header, row)) for line, row in lines]
     covariates = covariate_names(header, cells)
     joints = [_joints(file, line, row, header) for line, row in cells]
-    require_loads(file, header, cells, sum(bool(_JOINT.match(name)) for name in header))
+    require_loads(file, header, cells, sum(bool(JOINT.match(name)) for name in header))
     rows: list[Row] = []
     seen: dict[str, int] = {}
     latest = -np.inf
@@ -71,6 +71,7 @@ def read_views(file: Path, robot: Robot | None) -> list[Row]:
         T_base_flange = flange_pose(file, line, name, row, joints[i], robot)
         approach = _approach(file, line, row, joints, i)
         rows.append(Row(line, name, cloud, T_base_flange, joints[i], approach, time_s=time_s, covariates=values))
+    require_no_hidden_joints(file, cells, [row.T_base_flange for row in rows], robot)
     return rows
 
 
@@ -107,7 +108,7 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
     double = sorted({name for name in header if header.count(name) > 1})
     if double:
         raise InputError(f"{file} line 1: column {double[0]!r} stands twice; rename one")
-    numbers = sorted(int(m.group(1)) for name in header if (m := _JOINT.match(name)))
+    numbers = require_joint_columns(file, header, robot)
     pose = [name for name in POSE if name in header]
     if pose and len(pose) < len(POSE):
         missing = ", ".join(name for name in POSE if name not in header)
@@ -115,12 +116,6 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> Non
     if not pose and not numbers:
         raise InputError(
             f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(POSE)}); one of them is needed"
-        )
-    if numbers and numbers != list(range(1, len(numbers) + 1)):
-        raise InputError(f"{file} line 1: joint columns must be j1_deg … jN_deg without a gap")
-    if numbers and robot and len(numbers) != robot.n_joints:
-        raise InputError(
-            f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints}; one a joint"
         )
     if numbers and not pose and not robot:
         raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
@@ -133,12 +128,12 @@ def _row_cells(header: Sequence[str], row: Sequence[str]) -> dict[str, str]:
 def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
     """Columns of numbers that are neither poses nor joints: what errors may follow."""
     known = {"view", "cloud", "time_s", *POSE}
-    rest = [n for n in header if n not in known and not _JOINT.match(n) and not _APPROACH.match(n)]
+    rest = [n for n in header if n not in known and not JOINT.match(n) and not _APPROACH.match(n)]
     return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
 
 
 def _joints(file: Path, line: int, row: dict[str, str], header: Sequence[str]) -> Array | None:
-    names = [f"j{i}_deg" for i in range(1, sum(bool(_JOINT.match(n)) for n in header) + 1)]
+    names = [f"j{i}_deg" for i in range(1, sum(bool(JOINT.match(n)) for n in header) + 1)]
     if not names or not any(row[name] for name in names):
         return None
     return np.radians([number(file, line, name, row[name]) for name in names])

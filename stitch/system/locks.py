@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stitch.errors import BusyError
+from stitch.system.named_errors import named
 
 try:
     import fcntl
@@ -44,7 +45,8 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
 
 def _locked(lock: Path, what: Path) -> int:
     while True:
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        with named(what, lock):
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
             if fcntl is not None:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

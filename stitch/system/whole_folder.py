@@ -16,6 +16,7 @@ from pathlib import Path
 
 from stitch.system.exchange import exchange
 from stitch.system.locks import only_writer
+from stitch.system.named_errors import named
 from stitch.system.whole_file import to_disk
 
 Ours = Callable[[Path], bool]  # True for a path, relative to the folder, that may go
@@ -30,10 +31,10 @@ def claimed(path: Path) -> Iterator[Path]:
     Raises:
         InputError: another process writes there.
     """
-    path = path.resolve()
+    asked, path = path, path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
-    with only_writer(beside / f".{path.name}.lock", path):
+    with only_writer(beside / f".{path.name}.lock", asked):
         home = _home(path, beside)
         _recover(home, path)
         yield home
@@ -48,9 +49,10 @@ def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
     Raises:
         InputError: another process writes there.
     """
-    path = path.resolve()
-    with claimed(path) as home:
-        scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
+    asked, path = path, path.resolve()
+    with claimed(asked) as home:
+        with named(asked):
+            scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
         try:
             yield scratch
             scratch.chmod(0o777 & ~_umask())

@@ -137,6 +137,19 @@ def test_times_since_1970_stand_before_poses_without_a_header(tmp_path):
         assert layout.position[0].tolist() == [0.5, -0.25, 0.75] and layout.rotation[0].tolist() == [0, 0.6, 0, 0.8]
 
 
+@pytest.mark.parametrize("brackets", ["p[{}]", "p [{}]", "[{}]", "({})"])
+def test_poses_as_universal_robots_writes_them(tmp_path, brackets):
+    raw = read(
+        tmp_path, "tcp_0.txt", brackets.format("0.7986999, -0.1417139, 0.7849780, -1.2629957, 0.69, -0.63") + "\n"
+    )
+    assert raw.numbers.tolist() == [[0.7986999, -0.1417139, 0.784978, -1.2629957, 0.69, -0.63]]
+
+
+def test_a_column_called_p_keeps_its_name(tmp_path):
+    raw = read(tmp_path, "poses.csv", "x,y,z,w[deg],p[deg],r[deg]\n" + "1,2,3,4,5,6\n" * 2)
+    assert raw.header is not None and raw.header[4].startswith("p")
+
+
 def test_reghec_says_by_its_sizes_that_angles_come_first_in_radians(tmp_path):
     (layout,) = layouts(read(tmp_path, "RobotPoses.dat", REGHEC))
     assert layout.position[0].tolist() == [111.227938, -331.951396, 317.520474]

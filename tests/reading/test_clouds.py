@@ -111,6 +111,7 @@ def test_points_at_the_scanner_itself_are_no_measurement(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [("c.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n", "cannot be read"),
+     ("c.ply", b"", "the file is empty; export it again"), ("c.ply", b"\x8f\xb7\x02\x9a" * 50, "is not a PLY file"),
      ("c.pcd", b"not a cloud", "no DATA line"), ("c.fls", b"", "unknown cloud format"), ("c.csv", b"a,b\n1,2\n", "no column"),
      ("c.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 9\nDATA binary_compressed\n" + struct.pack("<II", 50, 108), "cut short")],
 )  # fmt: skip

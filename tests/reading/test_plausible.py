@@ -50,6 +50,19 @@ def test_another_unit_is_refused(right, factor):
         check_scale(moved(right, lambda points: points * factor), "mm")
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_one_cloud_in_another_unit_is_told_from_a_session_in_another_unit(session, factor):
+    """Whichever unit the session states, its advice leads to the one odd cloud and not back."""
+    right = load_session(session)
+    first, *others = right.views
+    odd = replace(first, cloud=replace(first.cloud, points=first.cloud.points * factor))
+    mixed = replace(right, views=(*others, odd))
+    with pytest.raises(InputError, match=f"view {first.name} .* that cloud alone is in another unit .* in mm$"):
+        check_scale(mixed, "mm")
+    with pytest.raises(InputError, match='set cloud_unit = "mm"'):
+        check_scale(moved(mixed, lambda points: points * 1000), "m")
+
+
 def test_one_stray_point_is_named(session):
     file = sorted((session / "clouds").iterdir())[1]
     points = read_cloud(file).points

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.edits import edit
 from stitch.errors import InputError
@@ -55,6 +56,51 @@ def test_joint_columns_are_called_as_the_format_calls_them(session):
     joints_session(session, ["a,clouds/v000.ply,10,20,30"], "view,cloud,j01_deg,j02_deg,j03_deg")
     with pytest.raises(InputError, match="neither joints \\(j1_deg"):
         load_session(session)
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ("j1_deg,j3_deg", "line 1: no column j2_deg; .* without a gap; to fix: add it"),
+        ("j1_deg,j2_deg", "2 joint columns, but the robot has 3; to fix: add j3_deg"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg", "4 joint columns, but the robot has 3; to fix: leave out those beyond"),
+    ],
+)
+def test_a_joint_column_that_is_missing_is_named(session, columns, told):
+    numbers = ",".join("10" for _ in columns.split(","))
+    joints_session(session, [f"a,clouds/v000.ply,{numbers}"], f"view,cloud,{columns}")
+    with pytest.raises(InputError, match=told):
+        load_session(session)
+
+
+def with_pose_of(angles, unit):
+    """A row with a pose that the arm has at these angles (deg), and the angles in a unit."""
+    T = forward(robot_from_dh("r", "standard", JOINTS, None, np.zeros(3), "mm"), np.radians(angles))
+    pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    return ",".join(f"{x:.9f}" for x in [*pose, *(angles if unit == "deg" else np.radians(angles))])
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "told"),
+    [
+        ("J1,J2,J3", "deg", "columns J1, J2, J3 hold the joint angles .* call them j1_deg … j3_deg$"),
+        ("axis_1_rad,axis_2_rad,axis_3_rad", "rad", "call them j1_deg … j3_deg, in degrees$"),
+    ],
+)
+def test_joint_angles_under_other_names_are_no_covariates(session, names, unit, told):
+    rows = [f"{view},clouds/{view}.ply,{with_pose_of(angles, unit)}"
+            for view, angles in (("v000", [10, 20, 30]), ("v001", [5, -20, 40]))]  # fmt: skip
+    joints_session(session, rows, f"view,cloud,x,y,z,qx,qy,qz,qw,{names}")
+    with pytest.raises(InputError, match=told):
+        load_session(session)
+
+
+def test_columns_that_are_only_called_like_joints_are_covariates(session):
+    """Temperatures of the axes, say: they do not lead to the poses."""
+    rows = [f"{view},clouds/{view}.ply,{with_pose_of([10, 20, 30], 'deg').rsplit(',', 3)[0]},41,42,43"
+            for view in ("v000", "v001")]  # fmt: skip
+    joints_session(session, rows, "view,cloud,x,y,z,qx,qy,qz,qw,A1,A2,A3")
+    assert load_session(session).views[0].covariates == {"A1": 41.0, "A2": 42.0, "A3": 43.0}
 
 
 def test_robot_with_another_number_of_joints(session):

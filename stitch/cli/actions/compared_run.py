@@ -1,5 +1,7 @@
 """What `stitch compare` does: the residual against everything known of it, into the run folder and for people."""
 
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from rich.table import Table as Printed
 from stitch.cli.terminal.streams import emit
 from stitch.comparison.compare_surfaces import compare
 from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.tables import PLACE, Comparison, Table, comparison_document
+from stitch.comparison.tables import CLEAR, PLACE, Comparison, Table, comparison_document
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
@@ -44,13 +46,15 @@ def show_comparison(found: Comparison, state: State, run: Path) -> None:
     terminal.print(f"{length_text(found.rms, state.session.length_unit)} rms {what} under the model.")
     for table in found.labelled:
         _worst(terminal, table, _named(table, state), to_um)
-    for table in found.places[:_SHOWN]:
-        _one(terminal, table, to_um)
-    rest = ", ".join(f"{t.name} ({t.clearest:.1f})" for t in found.places[_SHOWN:])
-    terminal.print(f"Less clear (largest mean over its σ): {rest}.", soft_wrap=True)
+    terminal.print(_whether_clear(found), soft_wrap=True)
+    for group in found.groups[:_SHOWN]:
+        _one(terminal, group, found, to_um)
+    if rest := [_with_chance(found, group) for group in found.groups[_SHOWN:]]:
+        terminal.print(f"Less clear (p = 1 where none is given): {'; '.join(rest)}.", soft_wrap=True)
     for file in ("compare.json", "pictures/compare.png"):
         if (run / file).exists():
             terminal.print(f"  {run / file}")
+    terminal.print(_next_step(run), soft_wrap=True)
 
 
 def write_comparison(state: State, run: Path) -> Comparison:
@@ -59,6 +63,44 @@ def write_comparison(state: State, run: Path) -> Comparison:
     write_json(comparison_document(found), run / "compare.json")
     extend("stitch.comparison_reports", found, state, run)
     return found
+
+
+def _whether_clear(found: Comparison) -> str:
+    """What the means of all bins say together; views are the samples."""
+    if not found.groups:
+        return "Nothing that is known of the views changes from one to another."
+    if not found.means:
+        return "Nothing clear: the views are too few to say how well their means are known."
+    clear = [_with_chance(found, group) for group in found.groups if found.is_clear(group[0])]
+    if clear:
+        return f"Clear among {found.means} means of bins, p over all of them: {'; '.join(clear)}."
+    return (
+        f"Nothing clear: chance alone makes the clearest of {found.means} means of bins as clear as this one "
+        f"({_chance(found, found.groups[0][0])}; clear is p ≤ {CLEAR}). "
+        "Errors whose sign changes with the pose do not show in such means."
+    )
+
+
+def _with_chance(found: Comparison, group: Sequence[Table]) -> str:
+    return _names(group) + (f" ({_chance(found, group[0])})" if found.p_of_all(group[0]) < 1 else "")
+
+
+def _chance(found: Comparison, table: Table) -> str:
+    """How easily chance makes any of all means as clear as the clearest of a table."""
+    p = found.p_of_all(table)
+    return "p < 0.0001" if p < 1e-4 else f"p = {p:.2g}"
+
+
+def _names(group: Sequence[Table]) -> str:
+    """j2, torque 2_2 and torque 2_3: whose bins hold the same."""
+    *others, last = [table.name for table in group]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _next_step(run: Path) -> str:
+    """The command that most would type now."""
+    folder = shlex.quote(str(run))
+    return f"Next: stitch {'review' if (run / 'diagnosis.json').exists() else 'diagnose'} {folder}"
 
 
 def _named(table: Table, state: State) -> str:
@@ -78,10 +120,14 @@ def _worst(terminal: Console, table: Table, name: str, to_um: float) -> None:
     terminal.print(f"Worst by {name} (µm rms): {told}", soft_wrap=True)
 
 
-def _one(terminal: Console, table: Table, to_um: float) -> None:
+def _one(terminal: Console, group: Sequence[Table], found: Comparison, to_um: float) -> None:
+    """One table for all properties whose bins hold the same, with the edges of the first."""
+    table = group[0]
     unit = f" ({table.unit})" if table.unit else ""
+    others = f"; {_names(group[1:])} {'has' if len(group) == 2 else 'have'} the same bins" if len(group) > 1 else ""
+    clear = "" if found.is_clear(table) else ", not clear"
     printed = Printed(
-        title=f"By {table.name}{unit}: clearest mean {table.clearest:.1f} σ from zero", title_justify="left"
+        title=f"By {table.name}{unit}{others}: {_chance(found, table)} over all means{clear}", title_justify="left"
     )
     for heading in ("from", "to", "mean (µm)", "± 1 σ", "rms (µm)", "count", "views"):
         printed.add_column(heading, justify="right")
