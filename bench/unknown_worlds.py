@@ -34,6 +34,13 @@ def memory(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str
     return World(_laws(a, {}, rng), scatter=2 * with_memory(len(a.moments), 0.9, rng)), ("time",)
 
 
+def joint_scatter(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
+    """Every joint scatters by 15 µrad from view to view, and the flange by half of what it does elsewhere."""
+    views, joints = len(a.moments), a.cell.plan.joints.shape[1]
+    scatter = 0.5 * rng.standard_normal((views, 6))
+    return World(_laws(a, {}, rng), joint_errors=15e-6 * rng.standard_normal((views, joints)), scatter=scatter), ()
+
+
 def unnamed(a: Asked, rng: np.random.Generator, k: int) -> tuple[World, tuple[str, ...]]:
     """A law outside every dictionary; couplings as often as three others."""
     law = _in_turn(["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")], k)
@@ -114,6 +121,7 @@ PARTS: dict[str, tuple[Part, int]] = {
     "further_3x": (partial(at_multiple, make=SECOND_EIGHT, multiple=3.0), 64),
     "later": (THIRD_EIGHT, 64),
     "later_3x": (partial(at_multiple, make=THIRD_EIGHT, multiple=3.0), 64),
+    "joint_scatter": (joint_scatter, 100),
 }
 
 

@@ -61,7 +61,10 @@ def _beyond(ranked: Ranked) -> str:
     """What is larger than anybody would expect."""
     s = ranked.score
     large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
-    return f" {' and '.join(large)} beyond what is plausible: is what session.toml states right?" if large else ""
+    if not large:
+        return ""
+    are = "is" if len(large) == 1 else "are"
+    return f" {' and '.join(large)} {are} beyond what is plausible: is what the session states right?"
 
 
 def _chance(d: Diagnosis) -> str:

@@ -68,7 +68,7 @@ def test_what_is_larger_than_anybody_would_expect_is_asked_about():
     score = SimpleNamespace(fitted=True, form=form, values=np.array([0.1, -8.0]), sigmas=np.array([0.02, 0.02]))
     told = said_at(1e9, "missing_effect", "link_geometry", score=score)
     assert "da2 = -8 ± 0.02 mm" in told
-    assert told.endswith(" da2 beyond what is plausible: is what session.toml states right?")
+    assert told.endswith(" da2 is beyond what is plausible: is what the session states right?")
 
 
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])
