@@ -48,8 +48,10 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure | None:
 
 def _added(ax: Axes, found: Diagnosis, candidate: CandidateEffect) -> None:
     s = candidate.ranked.score
-    predicted = found.linear.residual(s.form.columns) @ s.values
-    ax.scatter(predicted, found.linear.white_residual, s=6, color=BLUE, alpha=0.7, lw=0)
+    # Among what every arm may do wrong the effect itself would count as scatter.
+    linear = s.beside or found.linear
+    predicted = linear.residual(s.form.columns) @ s.values
+    ax.scatter(predicted, linear.white_residual, s=6, color=BLUE, alpha=0.7, lw=0)
     ax.axline((0, 0), slope=1, color=ORANGE, lw=1)
     ax.set_title(f"{candidate.name}, p = {candidate.ranked.adjusted:.1g}", fontsize=9)
     ax.set_xlabel("predicted (sigma)")

@@ -1,20 +1,27 @@
 """Pictures of a diagnosis: where the error comes from, and how the scanner errs over its field."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from data_synth import kinematics
 from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.score import score
 from stitch.diagnosis.variance_budget import BudgetLine
+from stitch.effects.contract import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.observations.surfaces.field_map import FieldMap
 from stitch.pipeline import diagnose, run
 from stitch.writing.run_contents import ours
+from tests.diagnosis.freed_blade import freed_blade
 from viz import captions
 from viz.budget_figure import budget
 from viz.colours import BLUE, DARK, ORANGE
+from viz.diagnosis_figures import added_variable
 from viz.field_map_figure import scanner_field
 from viz.sections import _pictures
 
@@ -80,3 +87,16 @@ def test_every_picture_is_the_runs_own(found: Diagnosis, tmp_path):
     """Or a later run would not replace it."""
     is_own = ours(tmp_path)
     assert all(is_own((tmp_path / "pictures" / f"{name}.png").relative_to(tmp_path)) for name in _pictures(found, "mm"))
+
+
+def test_what_is_there_lies_along_the_line():
+    """Of an offset of one joint, which the prior of what arms do wrong could take for scatter."""
+    cell = freed_blade(4, 14)
+    joints = cell.measured.plan.joints.copy()
+    joints[:, 4] += 1e-3
+    linear = cell.seen(kinematics.flange(cell.measured.plan.arm, joints))
+    scored = score(linear, candidate_of(linear, EFFECTS["joint_offset"]))
+    shown = SimpleNamespace(name="joint_offset", ranked=SimpleNamespace(score=scored, adjusted=scored.p_value))
+    axes = added_variable(SimpleNamespace(linear=linear, candidates=[shown])).axes[0]
+    predicted, seen = axes.collections[0].get_offsets().T
+    assert np.corrcoef(predicted, seen)[0, 1] > 0.8 and np.polyfit(predicted, seen, 1)[0] == pytest.approx(1.0, abs=0.2)
