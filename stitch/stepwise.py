@@ -8,7 +8,7 @@ from dataclasses import replace
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.selection.backward_elimination import eliminated_effect
 from stitch.diagnosis.thresholds import MANY_VIEWS, RISE
-from stitch.diagnosis.validation.group_validation import group_share
+from stitch.diagnosis.validation.group_validation import group_share, helps
 from stitch.pipeline import diagnose
 from stitch.revision import change
 from stitch.runs.run import Run
@@ -68,7 +68,7 @@ def suggest_group(state: State) -> tuple[Run | None, list[str], Diagnosis]:
     asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
     share, sigma = group_share(found.linear, asked)
     judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
-    if share > 1 - sigma:
+    if not helps(share, sigma):
         return None, [*_told(found), f"{names} together do not help on views left out: {judged}."], found
     tried = change(state, [*state.model.effects, *found.effects])
     told = (

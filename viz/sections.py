@@ -106,8 +106,8 @@ def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[d
             "p": f"{s.ranked.adjusted:.1g}".replace("-", "−"),
             "posterior": f"{s.ranked.posterior:.2f}",
             "told": "; ".join(filter(None, [what_it_is(s.name), amounts_of(s.ranked).replace("-", "−")])),
-            "rms_if_added": _rms(found, s, "inside", um),
-            "heldout": _rms(found, s, "heldout", um),
+            "rms_if_added": _rms(found, s, 0, um),
+            "heldout": _rms(found, s, 1, um),
             "on_part": on_part.get(s.name, "–"),
             "aliases": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2]),
         }
@@ -115,10 +115,10 @@ def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[d
     ]
 
 
-def _rms(found: Diagnosis, candidate: CandidateEffect, which: str, um: float) -> str:
-    """Rms (µm) with the effect added, in the fit or on views left out; a dash where it was not validated."""
-    validation, now = candidate.cross_validation, found.residual_rms if which == "inside" else found.heldout_rms
-    return "–" if validation is None else f"{now * um * getattr(validation, which) ** 0.5:.1f}"
+def _rms(found: Diagnosis, candidate: CandidateEffect, which: int, um: float) -> str:
+    """Rms (µm) with the effect added, in the fit (0) or on views left out (1); a dash where it was not validated."""
+    validation = candidate.cross_validation
+    return "–" if validation is None else f"{um * found.rms_if_added(validation)[which]:.1f}"
 
 
 def write_comparison(found: Comparison, state: State, folder: Path) -> None:

@@ -73,6 +73,10 @@ class Diagnosis:
         """False where a name, or a group, is less than 20 to 1 likelier than nothing being missing."""
         return self.over_nothing > ODDS
 
+    def rms_if_added(self, validation: CrossValidation) -> tuple[float, float]:
+        """With an effect, in the fit and on views left out, length_unit: shares of what the model leaves there."""
+        return self.residual_rms * validation.inside**0.5, self.heldout_rms * validation.heldout**0.5
+
     @property
     def likelier_than_not(self) -> bool:
         """False where a name, or a group, is less likely than nothing being missing."""

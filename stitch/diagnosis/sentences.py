@@ -45,8 +45,7 @@ def _missing(d: Diagnosis, length_unit: str, now: str, floor: str, pair: tuple[R
     ranked = pair[0] if pair else candidate.ranked
     gain = ""
     if candidate.cross_validation is not None:
-        inside, heldout = candidate.cross_validation.inside, candidate.cross_validation.heldout
-        left, out = (length_text(x, length_unit) for x in (d.residual_rms * inside**0.5, d.heldout_rms * heldout**0.5))
+        left, out = (length_text(x, length_unit) for x in d.rms_if_added(candidate.cross_validation))
         gain = f"; adding it should leave about {left}, {out} on views left out"
     too = f"{pair[1].name} seems to be there too ({amounts_of(pair[1])})" if pair else ""
     more = f" {too}; each is sized beside the other." if pair else ""

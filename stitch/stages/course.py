@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from stitch.measurement.gaps import gaps_note
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.measurement.torques import payload_note
+from stitch.measurement.session_notes import session_notes
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
@@ -86,7 +85,7 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         notes=(
             *view_notes(end.left_out, end.kept, end.suspected),
             *course.notes(session, fitted, index, begun),
-            *filter(None, [payload_note(session), gaps_note(session)]),
+            *session_notes(session),
             *end.notes,
         ),
         doubts=end.doubts,

@@ -102,6 +102,7 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
             p.name: {"value": float(v), "sigma": float(x), "unit": p.unit}
             for p, v, x in zip(s.form.free, s.values, s.sigmas, strict=True)
         }
+    inside, heldout = (None, None) if left_out is None else d.rms_if_added(left_out)
     detectable = {name: x for name, x in candidate.detectable.items() if np.isfinite(x)}
     return {
         "effect": s.name,
@@ -109,8 +110,8 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
         "posterior": r.posterior if s.observable else 0.0,
         "observable": s.observable,
         "parameters": parameters,
-        "rms_if_added": None if left_out is None else d.residual_rms * float(np.sqrt(left_out.inside)),
-        "heldout_rms_if_added": None if left_out is None else d.heldout_rms * float(np.sqrt(left_out.heldout)),
+        "rms_if_added": inside,
+        "heldout_rms_if_added": heldout,
         # Of the parameter that these views know best against its plausible size; all below.
         "minimum_detectable": detectable.get(_clearest(candidate) or ""),
         "minimum_detectable_of": _clearest(candidate),

@@ -7,7 +7,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import FALL, WORTH
 from stitch.diagnosis.validation.cross_validation import CrossValidation
-from stitch.diagnosis.validation.group_validation import group_share
+from stitch.diagnosis.validation.group_validation import group_share, helps
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.runs.doubt_headline import doubt_headline
 from stitch.units import length_text
@@ -113,4 +113,4 @@ def next_step(found: Diagnosis, run: str) -> str:
 def _helps_as_one(found: Diagnosis) -> bool:
     """False where `stitch add --group` would refuse, or has just refused: together they predict no view left out."""
     share, sigma = group_share(found.linear, [c.ranked.score for c in found.candidates if c.name in found.effects])
-    return share <= 1 - sigma
+    return helps(share, sigma)

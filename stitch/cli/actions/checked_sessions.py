@@ -13,9 +13,8 @@ from rich.table import Table
 from stitch.cli.terminal.streams import emit
 from stitch.errors import InputError
 from stitch.integrity.deep_check import deep_check
-from stitch.measurement.gaps import gaps_note
 from stitch.measurement.session import Session
-from stitch.measurement.torques import payload_note
+from stitch.measurement.session_notes import session_notes
 from stitch.reading.session_folder import load_session
 from stitch.system.console import console
 from stitch.writing.json_file import to_json
@@ -84,7 +83,7 @@ def summary(session: Session) -> dict[str, object]:
         "robot": session.robot.name if session.robot else None,
         "hand_eye_given": session.scanner.T_mount is not None,
         "covariates": sorted({name for view in session.views for name in view.covariates}),
-        "notes": list(filter(None, [payload_note(session), gaps_note(session)])),
+        "notes": session_notes(session),
     }
 
 

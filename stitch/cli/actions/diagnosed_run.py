@@ -141,7 +141,5 @@ def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
         return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
     if s.cross_validation is not None:
-        inside, heldout = s.cross_validation.inside, s.cross_validation.heldout
-        rms = found.residual_rms * inside**0.5, found.heldout_rms * heldout**0.5
-        left = [length_text(x, length_unit, zeros=True) for x in rms]
+        left = [length_text(x, length_unit, zeros=True) for x in found.rms_if_added(s.cross_validation)]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

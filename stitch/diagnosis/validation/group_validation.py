@@ -11,6 +11,11 @@ from stitch.observations.response import Prior
 from stitch.statistics.shares import share_of
 
 
+def helps(share: float, sigma: float) -> bool:
+    """True if a group leaves less on views left out, by more than folds differ."""
+    return share <= 1 - sigma
+
+
 def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
     """How far left-out poses lie from what the group predicts over how far from the present model, mean square.
 
