@@ -43,13 +43,16 @@ _HIDDEN: tuple[dict[str, float], ...] = (
     {"backlash": 3.0},
     {"link_geometry": 2.0, "gear_eccentricity": 2.0},
 )
+_JOINT_SCATTER = 30e-6  # rad
 _START_GATE = 6.0  # mm: the hand-eye starts near its end
 
 
-def measured(part: str, mount: str, seed: int, hidden: dict[str, float] | None = None) -> Measured:
-    """One cell."""
+def measured(
+    part: str, mount: str, seed: int, hidden: dict[str, float] | None = None, joint_scatter: float = 0.0
+) -> Measured:
+    """One cell; its joints scatter by so many rad from view to view."""
     scene = load_scene(MOUNTS[mount])
-    scene = replace(scene, scanner=replace(scene.scanner, columns=RAYS, rows=RAYS))
+    scene = replace(scene, scanner=replace(scene.scanner, columns=RAYS, rows=RAYS), joint_repeatability=joint_scatter)
     if part != "blade":
         scene = with_part(scene, part, **PARTS[part])
     return simulated(scene, hidden or {}, seed, VIEWS)
@@ -64,10 +67,19 @@ def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray,
     return own, T_mount, judged_by_size(session, snoop(own, T_mount, overlaps[0].gate, freed, usual))
 
 
+def scattering(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
+    """A session without a mistake whose joints scatter."""
+    yield from _unfaulted(measured(part, mount, seed, joint_scatter=_JOINT_SCATTER), "joints scatter")
+
+
 def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
-    """A session without a mistake: what is left out wrongly."""
+    """A session without a mistake."""
     hidden = _HIDDEN[seed % len(_HIDDEN)]
-    m = measured(part, mount, seed, hidden)
+    yield from _unfaulted(measured(part, mount, seed, hidden), "+".join(hidden))
+
+
+def _unfaulted(m: Measured, kind: str) -> Iterator[dict[str, Any]]:
+    """What is left out wrongly."""
     start = time.perf_counter()
     session = session_of(m)
     _, _, found = snooped(session, m.T_mount)
@@ -75,7 +87,7 @@ def good(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
     # A step that an effect may be is left to the diagnosis: what a run leaves out is what costs anybody anything.
     out = [item.view for item in run(session).left_out] if found.left_out else []
     yield {
-        "case": f"good {'+'.join(hidden)}", "tested_out": list(found.left_out), "left_out": out, "steps": steps,
+        "case": f"good {kind}", "tested_out": list(found.left_out), "left_out": out, "steps": steps,
         "suspected": [m.view for m in found.suspected],
         "groups": len(found.disconnected), "seconds": time.perf_counter() - start,
     }  # fmt: skip

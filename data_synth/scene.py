@@ -78,6 +78,7 @@ class Scene:
     coarse_error: tuple[float, float] = (0.3, 2.0)  # of the hand-eye that the session states: degrees, mm
     mount_spread: tuple[float, float] = (0.003, 1.0)  # of the true hand-eye about the nominal one: rad, mm
     repeatability: tuple[float, float] = (20e-6, 0.02)  # of the flange: rad, mm
+    joint_repeatability: float = 0.0  # of every joint beside it: rad
     small: float = 1.0  # factor on the effects that are always there
     useful: tuple[int, ...] = (1, 2, 3, 4)  # joints, from 0, whose errors the cell can show
     rail: float = 0.0  # length of a rail along x that carries the base

@@ -55,6 +55,8 @@ def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator)
         return np.asarray((frames.inverse(T) if scene.mount == "eye_to_hand" else T) @ mount)
 
     q_true = laws.act("joints", moment, moment.joints)
+    if scene.joint_repeatability:
+        q_true = q_true + scene.joint_repeatability * rng.standard_normal(q_true.shape)
     T_reference_scanner = scanner_at(q_true)
     to_part = frames.inverse(T_reference_part)
     if scene.scanner.kind == "line":

@@ -112,8 +112,8 @@ def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:
 def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:
     """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
     process = said[0].process if said else None
-    null = process.fit if process else _beside(linear, said).null if said else linear.scatter_only.null
-    rotation, translation = np.sqrt(null.variances[:2])
+    beside = _beside(linear, said) if said else linear.scatter_only
+    rotation, translation = np.sqrt(process.flange_scatter if process else beside.flange_scatter(beside.null))
     return float(rotation), float(translation)
 
 

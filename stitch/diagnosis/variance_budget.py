@@ -11,7 +11,7 @@ from stitch.frames import Array
 from stitch.observations.error_model import WHITE
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.statistics.identifiability import project_out
@@ -26,6 +26,7 @@ _CALLED = {
     "sensor noise": "sensor noise",
     "white rotation": "white repeatability",
     "white translation": "white repeatability",
+    JOINT_SCATTER: "white repeatability",
     "smooth": "smooth, unnamed",
     **dict.fromkeys(WANDERING, "wandering in time"),
     "stop rotation": "shared by the scans of a stop",

@@ -62,7 +62,7 @@ class ViewModel:
         if self.errors is None:
             return MixedModel(self.z[None], A, components, usual)
         every = np.concatenate([components, self.errors.components[:, None]])
-        return MixedModel(self.z[None], A, every, usual, scales=self.errors.scales)
+        return MixedModel(self.z[None], A, every, usual, further=self.errors.prior)
 
     @cached_property
     def alone(self) -> Array:

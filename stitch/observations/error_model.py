@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from stitch.frames import Array, Indices
-from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances, whitener
@@ -25,7 +25,7 @@ _MANY = 250
 def with_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
     """The mixed model of one block with scatter, noise, and what the poses err beside."""
     components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, scales=errors.scales, kin=errors.of_arm)
+    return replace(mixed, components=components, further=errors.prior)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +41,14 @@ class ErrorModel:
     def satterthwaite(self) -> Satterthwaite:
         """How well the null's scatter is known."""
         return satterthwaite(self.mixed, self.null)
+
+    def flange_scatter(self, fit: VarianceFit) -> Array:
+        """(2,) variances along an axis by which the flange turns and moves anew in every view, by its joints too."""
+        own = fit.variances[:NOISE]
+        if self.pose_errors is None or JOINT_SCATTER not in self.pose_errors.names:
+            return own
+        size = fit.variances[NOISE + 1 + self.pose_errors.names.index(JOINT_SCATTER)]
+        return np.asarray(own + size * self.pose_errors.by_joints)
 
     def in_blocks(self, columns: Array) -> Array:
         """(B, m, P) columns (n, P) as the variance components take them."""
@@ -93,13 +101,18 @@ class ErrorModel:
         """As if poses erred independently from view to view."""
         if self.pose_errors is None:
             return self
-        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], scales=None, kin=None)
+        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
         return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
 
     @cached_property
     def arm_right(self) -> Self:
         """As if neither joints nor links erred again, from pose to pose."""
         return self if self.pose_errors is None else self._with(self.pose_errors.but_of_the_arm())
+
+    @cached_property
+    def nothing_again(self) -> Self:
+        """As if poses erred anew in every view, by their joints or as a whole."""
+        return self if self.pose_errors is None else self._with(self.pose_errors.but_anew())
 
     @cached_property
     def flange_steady(self) -> Self:

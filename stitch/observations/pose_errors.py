@@ -8,8 +8,9 @@ the views' poses are a sum of processes, each with a covariance of known shape a
     smooth    errors of joints and links that follow the joint angles smoothly, by no law that anybody wrote down
     wandering rotation and translation of the flange that views near in time share
     stop      rotation and translation that scans from the same pose share; only where poses repeat
+    scatter   every joint anew in every view; by its lever it is no scatter of the flange that is alike in all poses
 
-White scatter of every scan, and the sensor's noise, come with the observation.
+White scatter of the flange in every scan, and the sensor's noise, come with the observation.
 """
 
 from collections.abc import Collection, Sequence
@@ -17,38 +18,31 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stitch.effects.contract import EFFECTS, Effect
-from stitch.effects.in_session import lacking
+from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
-from stitch.model.jacobian import twists
 from stitch.model.model import Model
-from stitch.model.term import Term, term_of
-from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time
+from stitch.observations.arm_errors import FAMILY, arm_effects, columns_of, families
+from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time, usual_twist
 from stitch.observations.joint_processes import joint_processes
-from stitch.statistics.kernels import (
-    SmoothErrors,
-    alike_in_joints,
-    same_stop,
-    spread_over,
-)
+from stitch.statistics.kernels import SmoothErrors, alike_in_joints, same_stop, spread_over
+from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
 _ARM, SMOOTH = 0.1, 0.03
+# What every joint does anew in every view, and how much of it is usual: as much as the flange turns.
+JOINT_SCATTER, _ANEW = "joint scatter", 0.02
 # What the scans of a stop share.
 STOPS = ("stop rotation", "stop translation")
 # Dense matrices of more views take minutes; there the scatter alone must do.
 _MOST_VIEWS = 150
-# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
-_EVERY_ARM = ("joints", "torque")
-_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 _CONSTANT = ("joint_offset", "link_geometry")
 
 
 def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
-    arm = ("joint_offset", "link_geometry", "joint_compliance", *_FAMILY.values())
+    arm = ("joint_offset", "link_geometry", "joint_compliance", *FAMILY.values())
     return dict.fromkeys(arm, _ARM**2) | {"smooth": SMOOTH**2} | dict.fromkeys(WANDERING, 1 / len(WANDERING))
 
 
@@ -62,11 +56,19 @@ class PoseErrors:
     effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
     # What each joint alone may do without a name, by what it follows: in none of the components.
     of_one_joint: dict[str, SmoothErrors] = field(default_factory=dict)
+    # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
+    by_joints: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def of_arm(self) -> Mask:
-        """(c,) what joints and links do: on a good arm all of it is small."""
-        return np.array([name not in (*WANDERING, *STOPS) for name in self.names], bool)
+        """(c,) what joints and links do again: on a good arm all of it is small."""
+        return np.array([name not in (*WANDERING, *STOPS, JOINT_SCATTER) for name in self.names], bool)
+
+    @property
+    def prior(self) -> FurtherPrior:
+        """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
+        scatters = np.array([name == JOINT_SCATTER for name in self.names], bool)
+        return FurtherPrior(self.scales, np.where(scatters, THERE, MAY_BE_ABSENT), self.of_arm)
 
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
@@ -93,8 +95,12 @@ class PoseErrors:
         return replace(self, names=names, components=kept, scales=self.scales[keep], effects=left)
 
     def but_of_the_arm(self) -> "PoseErrors":
-        """What wanders in time and what scans of a stop share; neither joints nor links err again."""
+        """What wanders in time, what scans of a stop share and what scatters; neither joints nor links err again."""
         return replace(self._kept(~self.of_arm), effects={})
+
+    def but_anew(self) -> "PoseErrors":
+        """What scatters alone; nothing errs again."""
+        return replace(self._kept(np.array([name == JOINT_SCATTER for name in self.names], bool)), effects={})
 
     def but_in_time(self) -> "PoseErrors":
         """What joints and links do and what scans of a stop share; nothing wanders."""
@@ -125,21 +131,24 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white(sum(m.views.count for m in measurements))
     found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
-    of_one_joint = dict[str, SmoothErrors]()
+    of_one_joint, by_joints = dict[str, SmoothErrors](), np.zeros(2)
+    flange = flange_twists(measurements, centres)
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
-        for name, effects in _families(_arm_effects(measurements)).items():
-            own = [np.concatenate([_columns(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
+        for name, effects in families(arm_effects(measurements)).items():
+            own = [np.concatenate([columns_of(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
             members |= {e.name: (name, columns) for e, columns in zip(effects, own, strict=True)}
             found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM)
         constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
-        links = np.concatenate([_columns(m, model, centre, constant) for m, centre in sessions])
+        links = np.concatenate([columns_of(m, model, centre, constant) for m, centre in sessions])
         alike = alike_in_joints(joints)
         found["smooth"] = (spread_over(links, alike), SMOOTH)
         if constant[0].name == _CONSTANT[0]:
-            of_one_joint = joint_processes(measurements, joints, links[:, : joints.shape[1]], alike)
-    flange = flange_twists(measurements, centres)
+            offsets = links[:, : joints.shape[1]]
+            found[JOINT_SCATTER] = (spread_over(offsets, np.eye(len(joints))), _ANEW)
+            by_joints = _at_flange(offsets, flange, usual_twist(measurements[0].length_unit))
+            of_one_joint = joint_processes(measurements, joints, offsets, alike)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
@@ -148,31 +157,11 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
-    return PoseErrors(tuple(found), components, scales, members, of_one_joint)
+    return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints)
 
 
-def _arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
-    """What the library knows of every joint and link, as far as all sessions can have it."""
-    possible = [
-        e
-        for e in EFFECTS.values()
-        if e.tier == "physical" and e.place in ("robot", "links") and e.needs and set(e.needs) <= set(_EVERY_ARM)
-    ]
-    per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
-    return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
-
-
-def _families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
-    """Effects of one cause share a size."""
-    out: dict[str, list[Effect]] = {}
-    for e in effects:
-        out.setdefault(_FAMILY.get(e.name, e.name), []).append(e)
-    return out
-
-
-def _columns(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
-    """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
-    in_use: dict[str, Term] = {term.name: term for term in model.terms}
-    terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
-    found = zip(terms, twists(measurement, model, terms, centre), strict=True)
-    return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
+def _at_flange(offsets: Array, flange: Array, unit: Array) -> Array:
+    """(2,) mean squares along an axis of what columns (6V, n) of unit variance turn and move the flange by."""
+    own = unit[:, None] * np.linalg.solve(flange.reshape(-1, 6, 6), offsets.reshape(len(flange) // 6, 6, -1))
+    squares = (own**2).sum(axis=2).mean(axis=0)
+    return np.asarray(squares.reshape(2, 3).mean(axis=1))

@@ -13,6 +13,7 @@ SOURCES = {
     "joint_compliance": "joints that give way under load",
     "gears": "gears that do not turn evenly",
     "play": "play in the joints",
+    "joint scatter": "joints that scatter at random",
     "smooth": "errors that follow the joint angles by no law",
     "quickly wandering": "poses that wander, and forget it within a few views",
     "slowly wandering": "poses that wander slowly all session long",

@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stitch.frames import Array, Mask
+from stitch.frames import Array
 from stitch.statistics.inverse import Inverse, inverted
-from stitch.statistics.variance_prior import log_prior
+from stitch.statistics.variance_prior import FurtherPrior, log_prior
 
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
 _IN_CACHE = 256
@@ -33,8 +33,7 @@ class MixedModel:
     components: Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and further ones
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
-    scales: Array | None = None  # (c − 3,) that σ of the further components usually has; None: there are none
-    kin: Mask | None = None  # (c − 3,) those that are large or small together
+    further: FurtherPrior | None = None  # of the c − 3 further components; None: there are none
 
     @property
     def size(self) -> int:
@@ -104,7 +103,7 @@ class Likelihood:
             unwhitened = back @ taken.reshape(-1, m, taken.shape[1])
             against = self.inverse.matrix[at] - unwhitened @ unwhitened.transpose(0, 2, 1)
             own += mixed.components[:, at].reshape(len(own), -1) @ against.ravel()
-        return np.asarray(variances * own + log_prior(self.log_variances, mixed.scales)[1])
+        return np.asarray(variances * own + log_prior(self.log_variances, mixed.further)[1])
 
 
 def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
@@ -127,7 +126,7 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest @ rest) + float(mean @ (problem.precision * mean))
     logdet = inverse.logdet + float(of_information - 2 * np.log(scale).sum()) + problem.offset
-    value = logdet + square + log_prior(log_variances, mixed.scales)[0]
+    value = logdet + square + log_prior(log_variances, mixed.further)[0]
     return Likelihood(problem, log_variances, value, mean, half, inverse, white, rest)
 
 

@@ -49,5 +49,5 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
         - 2 * np.einsum("cbik,dbik->cd", KU, KU, optimize=True)
         + np.einsum("ckl,dkl->cd", within, within, optimize=True)
     )
-    information += np.diag(prior_information(null.variances, mixed.scales))
+    information += np.diag(prior_information(null.variances, mixed.further))
     return Satterthwaite(white, np.linalg.pinv(information, rcond=1e-9, hermitian=True))

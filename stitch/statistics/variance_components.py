@@ -58,7 +58,7 @@ def fit_variances(
     scattered = np.arange(len(first)) != NOISE
     begin = [first, first - 9.0 * scattered] if both_starts else [first]
     centre = np.log(usual_variances(mixed.z, mixed.components))
-    few = _FLAT if start is None or mixed.scales is None else _FLAT_BEGUN
+    few = _FLAT if start is None or mixed.further is None else _FLAT_BEGUN
     flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else few
     bounds = [(c - _SPAN[0], c + _SPAN[1]) if s else _FACTORS for c, s in zip(centre, scattered, strict=True)]
     present = np.einsum("cbii->c", mixed.components) > 0

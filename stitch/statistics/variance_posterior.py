@@ -21,7 +21,7 @@ from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.restricted_likelihood import MixedModel, rows_of_blocks
 from stitch.statistics.variance_components import VarianceFit
-from stitch.statistics.variance_prior import NOISE, log_density, usual_variances
+from stitch.statistics.variance_prior import NOISE, FurtherPrior, log_density, usual_variances
 
 # Rounds over all variances that count, and those before them.
 _ROUNDS, _BURNT = 32, 6
@@ -83,21 +83,21 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
 def _kin(mixed: MixedModel) -> Mask:
     """(c,) components that share a factor on their usual sizes."""
     shared = np.zeros(len(mixed.components), bool)
-    if mixed.kin is not None:
-        shared[NOISE + 1 :] = mixed.kin
+    if mixed.further is not None:
+        shared[NOISE + 1 :] = mixed.further.kin
     return shared
 
 
 def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
     """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
     return [
-        np.array([log_density(i, np.log(grid), _times(mixed.scales, f)) for f in (_FACTORS if shared else (1.0,))])
+        np.array([log_density(i, np.log(grid), _times(mixed.further, f)) for f in (_FACTORS if shared else (1.0,))])
         for i, (grid, shared) in enumerate(zip(grids, _kin(mixed), strict=True))
     ]
 
 
-def _times(scales: Array | None, factor: float) -> Array | None:
-    return None if scales is None else factor * scales
+def _times(further: FurtherPrior | None, factor: float) -> FurtherPrior | None:
+    return None if further is None else further.times(factor)
 
 
 def _factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:
@@ -126,8 +126,8 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
     """Per component the variances that it may have; the first of those that may be absent stands for all below."""
     usual = 1e-4 * usual_variances(mixed.z, mixed.components)
     usual[NOISE] = likeliest[NOISE]
-    if mixed.scales is not None:
-        usual[NOISE + 1 :] = mixed.scales**2
+    if mixed.further is not None:
+        usual[NOISE + 1 :] = mixed.further.scales**2
     step = min(_LONGEST, _SHARE * float(np.sqrt(2 / mixed.size)))
     return [np.maximum(size, 1e-300) * np.exp(np.arange(_BELOW, _ABOVE, step)) for size in usual]
 

@@ -23,7 +23,7 @@ def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likeliho
     numbers in small blocks three steps do what a search without curvature needs sixteen for.
     """
     mixed = problem.mixed
-    if mixed.scales is not None or len(mixed.z) < _MANY_BLOCKS:
+    if mixed.further is not None or len(mixed.z) < _MANY_BLOCKS:
         return None
     x, here = begin, likelihood(begin, problem)
     for _ in range(_SCORINGS):

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_synth import kinematics
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.write import write_session
-from stitch import pipeline
+from stitch import frames, pipeline
 from stitch.measurement.capture import capture
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
@@ -64,11 +65,26 @@ def test_true_poses_are_still_the_best_where_the_robot_scatters(still, tmp_path)
     scene = replace(clean("blade", rays=40), repeatability=(20e-6, 0.05))
     measured = simulated(scene, {}, 3, 16)
     reported = np.linalg.inv(measured.T_base_flange) @ measured.T_mount
-    from stitch import frames
-
     # T_reference_scanner = scatter⁻¹ · reported, and scatter acts on the flange: its twist is seen in the flange.
     twists = frames.log(reported @ frames.inverse(measured.T_reference_scanner))
     spread = np.sqrt((twists**2).mean(axis=0))
     # 48 numbers each: their rms is known to 1/√96.
     assert np.sqrt((spread[:3] ** 2).mean()) == pytest.approx(20e-6, rel=4 / np.sqrt(96))
     assert np.sqrt((spread[3:] ** 2).mean()) == pytest.approx(0.05, rel=4 / np.sqrt(96))
+
+
+def test_joints_that_scatter_put_the_flange_where_their_angles_say():
+    """To first order a view stands off by what its joints are off by, every view anew, and by nothing else."""
+    scene = replace(clean("blade", rays=40), joint_repeatability=30e-6)
+    measured = simulated(scene, {}, 3, 16)
+    arm, q = scene.arm, measured.plan.joints
+    T_flange = measured.T_mount @ frames.inverse(measured.T_reference_scanner)  # eye to hand: both of the scanner
+    off = frames.log(frames.inverse(kinematics.flange(arm, q)) @ T_flange)
+    per_rad = [
+        frames.log(frames.inverse(kinematics.flange(arm, q)) @ kinematics.flange(arm, q + 1e-6 * joint)) / 1e-6
+        for joint in np.eye(6)
+    ]
+    angles = np.linalg.solve(np.transpose(per_rad, (1, 2, 0)), off[:, :, None])[:, :, 0]
+    # 96 numbers: their rms is known to 1/√192.
+    assert np.sqrt((angles**2).mean()) == pytest.approx(30e-6, rel=4 / np.sqrt(192))
+    assert np.abs(np.corrcoef(angles.T) - np.eye(6)).max() < 4 / np.sqrt(16)

@@ -38,7 +38,7 @@ def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(line
     def likely(variances, sizes):
         covariance = np.tensordot(variances, every, axes=1) + fixed + (columns * sizes**2) @ columns.T
         density = multivariate_normal(cov=covariance).logpdf(free @ linear.mixed.z[0])
-        return density - 0.5 * log_prior(np.log(variances), linear.pose_errors.scales)[0]
+        return density - 0.5 * log_prior(np.log(variances), linear.mixed.further)[0]
 
     with_it = logsumexp([likely(found.variances, s * form.sizes) + np.log(y) for s, y in ANY_SIZE.items()])
     without = likely(linear.null.variances, 0 * form.sizes)

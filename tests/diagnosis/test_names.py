@@ -1,5 +1,7 @@
 """Names hold against what arms do that no library has; and what has no name is said to have none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import null_space
@@ -19,7 +21,7 @@ from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_by
 from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
 from stitch.effects.contract import EFFECTS
 from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, WITH_TIME
-from stitch.statistics.variance_prior import NOISE, log_prior
+from stitch.statistics.variance_prior import MAY_BE_ABSENT, NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 # Effects that move views as wholes; those of points take longer to ask for.
@@ -139,22 +141,42 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     free = null_space(linear.mixed.A[0].T).T
     R, usual = free @ linear.observation.channel.reduction, errors.scales[errors.names.index("smooth")]
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
-    own, scales = R @ law.errors.of(law.process) @ R.T, np.append(errors.scales, usual)
+    own = R @ law.errors.of(law.process) @ R.T
+    with_it = replace(
+        errors.prior,
+        scales=np.append(errors.scales, usual),
+        shapes=np.append(errors.prior.shapes, MAY_BE_ABSENT),
+        kin=np.append(errors.of_arm, True),
+    )
 
-    def likely(variances, components):
+    def likely(variances, components, further):
         covariance = np.tensordot(variances, components, axes=1)
-        prior = log_prior(np.log(variances), scales[: len(variances) - NOISE - 1])[0]
+        prior = log_prior(np.log(variances), further)[0]
         return multivariate_normal(cov=covariance).logpdf(free @ linear.mixed.z[0]) - 0.5 * prior
 
-    without = likely(linear.null.variances, every)
+    without = likely(linear.null.variances, every, errors.prior)
     scatter = linear.null.variances[: NOISE + 1]
     tried = [
         np.concatenate([scatter * share, 1e-3 * errors.scales**2, [times * usual**2]])
         for share in (0.3, 1.0)
         for times in np.geomspace(1e-2, 1e4, 100)
     ]
-    by_hand = max(likely(variances, [*every, own]) for variances in tried) - without
+    by_hand = max(likely(variances, [*every, own], with_it) for variances in tried) - without
     assert 5 < by_hand < law.log_bayes_factor + 0.02
+
+
+def test_joints_that_scatter_are_scatter(cell):
+    """Every joint anew in every view: no law of any joint, nothing that repeats, and the flange scatters as it did."""
+    arm, q = cell.measured.plan.arm, cell.measured.plan.joints
+    rng, sizes = np.random.default_rng(5), []
+    for _ in range(8):
+        off = 3e-5 * rng.standard_normal(q.shape)
+        found, linear = said_of(cell, kinematics.flange(arm, q + off))
+        assert found.verdict == "adequate" and not clear_laws(linear)
+        shown = frames.log(frames.inverse(kinematics.flange(arm, q)) @ kinematics.flange(arm, q + off))
+        sizes.append(np.sqrt(linear.flange_scatter(linear.null)) / shown.reshape(-1, 2, 3).std(axis=(0, 2)))
+    # Beside them the flange scatters for itself: what is shown is more, not less.
+    assert np.all(np.mean(sizes, axis=0) > 0.8)
 
 
 def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):

@@ -70,7 +70,7 @@ def test_a_stretch_of_views_that_stands_off_is_said_to(cell):
 def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
     """What wanders can do what a long stretch does: beside it the stretch gains little, alone it explains more."""
     stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 3.5) ** 2)
-    linear = linear_of(cell, 1.5 * stretch[:, None] * DIRECTION)
+    linear = linear_of(cell, 1.6 * stretch[:, None] * DIRECTION)
     assert likeliest_time_law(linear).log_bayes_factor < ODDS
     law = clear_time_law(linear)
     assert law.course.words.startswith("are off for a stretch")
@@ -103,7 +103,7 @@ def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
     def likely(log_variances, size):
         covariance = np.tensordot(np.exp(log_variances), every, axes=1) + fixed + size**2 * columns @ columns.T
         density = multivariate_normal(cov=covariance, allow_singular=True).logpdf(free @ linear.mixed.z[0])
-        return density - 0.5 * log_prior(log_variances, scales)[0]
+        return density - 0.5 * log_prior(log_variances, linear.mixed.further)[0]
 
     without = likely(np.log(linear.null.variances), 0.0)
     begun = np.log([*SCATTER**2, 1.0, *(1e-2 * scales**2), 3.0])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from data_synth import kinematics
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import with_part
@@ -13,6 +14,7 @@ from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.simulate import simulate
 from stitch import frames
 from stitch.diagnosis.variance_budget import variance_budget
+from stitch.effects import EFFECTS
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.pose_errors import pose_errors
@@ -66,6 +68,18 @@ def test_offsets_and_links_move_the_views_as_another_kinematics_says(cell):
             values, vectors = np.linalg.eigh(C)
             seen = vectors[:, values > 1e-12 * values[-1]]
             assert np.linalg.norm(x - seen @ (seen.T @ x)) < 2e-3 * np.linalg.norm(x)
+
+
+def test_joints_that_scatter_turn_and_move_the_flange_as_another_kinematics_says(cell):
+    """A joint at a time: independent errors of all add up in squares."""
+    measured, *_ = cell
+    arm, q, prior = measured.scene.arm, measured.plan.joints, prior_of(cell)
+    size = next(p.typical for p in EFFECTS["joint_offset"].specs.values())
+    flange = frames.inverse(kinematics.flange(arm, q))
+    turned = [frames.log(flange @ kinematics.flange(arm, q + 1e-6 * joint)) / 1e-6 for joint in np.eye(6)]
+    squares = (size * np.array(turned)) ** 2
+    by_hand = squares.sum(axis=0).mean(axis=0).reshape(2, 3).mean(axis=1)
+    np.testing.assert_allclose(prior.by_joints, by_hand, rtol=1e-4)
 
 
 def test_an_effect_that_is_asked_for_by_name_is_no_error_of_its_own_kind(cell):

@@ -8,11 +8,12 @@ from scipy.stats import multivariate_normal
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
+from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
 
 N, SCALE = 40, 0.5
 
 
-def shared_errors(size: float, seed: int = 3, kin: bool = False) -> MixedModel:
+def shared_errors(size: float, seed: int = 3, kin: bool = False, shape: float = MAY_BE_ABSENT) -> MixedModel:
     """Numbers of known noise with an error in common to fives of them, about one unknown mean.
 
     Args:
@@ -23,7 +24,8 @@ def shared_errors(size: float, seed: int = 3, kin: bool = False) -> MixedModel:
     z = 1.0 + rng.standard_normal(N) + size * groups @ rng.standard_normal(N // 5)
     # Of the first two components there is nothing; the noise is there with a factor near two.
     components = np.array([np.zeros((N, N)), np.zeros((N, N)), 0.5 * np.eye(N), groups @ groups.T])[:, None]
-    return MixedModel(z[None], np.full((1, N, 1), N**-0.5), components, scales=np.array([SCALE]), kin=np.array([kin]))
+    prior = FurtherPrior(np.array([SCALE]), np.array([shape]), np.array([kin]))
+    return MixedModel(z[None], np.full((1, N, 1), N**-0.5), components, further=prior)
 
 
 def on_a_grid(mixed: MixedModel) -> np.ndarray:
@@ -35,20 +37,33 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
         weights = np.linalg.solve(V, ones)
         mean = float(weights @ mixed.z[0] / weights.sum())
         likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
-        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.kin[0] else np.zeros(1)
+        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.further.kin[0] else np.zeros(1)
         over = b - 2 * np.log(SCALE) - 2 * factors
-        prior = -0.5 * ((a - np.log(2)) / 1.5) ** 2 + logsumexp(0.5 * 0.1 * over - 0.5 * 1.1 * np.log1p(np.exp(over)))
+        (shape,) = mixed.further.shapes
+        further = logsumexp(0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)))
+        prior = further - 0.5 * ((a - np.log(2)) / 1.5) ** 2
         logs.append(likelihood + prior)
     w = np.exp(np.array(logs) - max(logs))
     return np.array([w @ np.exp(noise.ravel()), w @ np.exp(group.ravel())]) / w.sum()
 
 
-@pytest.mark.parametrize(("size", "kin"), [(0.0, False), (2.0, False), (0.0, True), (0.5, True), (2.0, True)])
-def test_the_average_is_the_integral(size, kin, monkeypatch):
+@pytest.mark.parametrize(
+    ("size", "kin", "shape"),
+    [
+        (0.0, False, MAY_BE_ABSENT),
+        (2.0, False, MAY_BE_ABSENT),
+        (0.0, True, MAY_BE_ABSENT),
+        (0.5, True, MAY_BE_ABSENT),
+        (2.0, True, MAY_BE_ABSENT),
+        (0.0, False, THERE),
+        (0.5, False, THERE),
+    ],
+)
+def test_the_average_is_the_integral(size, kin, shape, monkeypatch):
     # 400 rounds know the mean of what spreads by as much as itself to a twentieth; of one size and a factor on it, of
     # which each follows the other, more are asked.
     monkeypatch.setattr("stitch.statistics.variance_posterior._ROUNDS", 2000 if kin else 400)
-    mixed = shared_errors(size, kin=kin)
+    mixed = shared_errors(size, kin=kin, shape=shape)
     found = mean_variances(mixed, fit_variances(mixed))
     assert found[2:] == pytest.approx(on_a_grid(mixed), rel=1 / 20, abs=0.01)
     assert (found[:2] == 0).all() or (found[:2] < 1e-100).all()
@@ -64,6 +79,6 @@ def test_among_very_many_numbers_the_maximum_must_do(monkeypatch):
 def test_a_mean_that_explains_all_numbers_leaves_the_maximum():
     """As many parameters as numbers: views of which hardly anything was seen."""
     mixed = shared_errors(1.0)
-    mixed = MixedModel(mixed.z[:, :2], np.eye(2)[None], mixed.components[:, :, :2, :2], scales=mixed.scales)
+    mixed = MixedModel(mixed.z[:, :2], np.eye(2)[None], mixed.components[:, :, :2, :2], further=mixed.further)
     fit = fit_variances(mixed)
     assert mean_variances(mixed, fit) == pytest.approx(fit.variances)

@@ -147,7 +147,7 @@ def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Arra
     """(K, 6, 6) Cholesky factors of the pose scatter of one view about the centre."""
     T = measurement.T_base_flange
     carried = frames.adjoint(to_centre @ (np.broadcast_to(np.eye(4), T.shape) if measurement.eye_to_hand else T))
-    variances = np.repeat(np.maximum(linear.null.variances[:2], 1e-300), 3)
+    variances = np.repeat(np.maximum(linear.flange_scatter(linear.null), 1e-300), 3)
     return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))
 
 

@@ -26,6 +26,7 @@ class SizedProcess:
 class FittedProcess:
     """A process at its likeliest size, all variances fitted beside it."""
 
+    base: LinearModel  # without it
     process: SmoothProcess
     columns: Array  # (n, R) of the channel, per unit of that size
     size: float
@@ -36,6 +37,11 @@ class FittedProcess:
     def joint(self) -> int | None:
         """That follows it, counted from 1; None: the flange, in time."""
         return self.process.joint
+
+    @property
+    def flange_scatter(self) -> Array:
+        """(2,) variances along an axis by which the flange turns and moves anew in every view, beside the process."""
+        return self.base.flange_scatter(self.fit)
 
     @property
     def numbers(self) -> Array:
@@ -70,4 +76,4 @@ def fitted(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedProces
     again = fit_variances(linear.mixed, G, size * unit, start=fit.variances)
     size, fit = (size, again) if again.deviance < fit.deviance else (sized.size, fit)
     gained = 0.5 * (linear.null.deviance - fit.deviance) - float(np.log(tried))
-    return FittedProcess(sized.process, columns, size, fit, gained)
+    return FittedProcess(linear, sized.process, columns, size, fit, gained)

@@ -52,7 +52,7 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     if linear.pose_errors is None:
         return _course(linear)
     law = _likelier(_clear_law(linear), _time_law(linear))
-    if _gain(linear, linear.scatter_only.null.deviance) < ODDS:
+    if _gain(linear, linear.nothing_again.null.deviance) < ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
@@ -121,10 +121,10 @@ def _gain(linear: LinearModel, deviance: float) -> float:
 
 def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     """Of the null without some components."""
-    assert linear.pose_errors is not None and linear.mixed.scales is not None
+    assert linear.pose_errors is not None and linear.mixed.further is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     every = np.append(np.ones(NOISE + 1, bool), keep)
-    scales = linear.mixed.scales[keep]
-    mixed = replace(linear.mixed, components=linear.mixed.components[every], scales=scales, kin=None)
-    plain = np.append(linear.scatter_only.null.variances, 1e-2 * scales**2)
+    further = linear.mixed.further.of(keep)
+    mixed = replace(linear.mixed, components=linear.mixed.components[every], further=further)
+    plain = np.append(linear.scatter_only.null.variances, 1e-2 * further.scales**2)
     return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))

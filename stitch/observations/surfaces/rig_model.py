@@ -34,7 +34,7 @@ class RigModel:
         R = block_diag(*(c.reduction for c in channels))
         components = np.array([*(block_diag(*c) for c in own), *(R @ C @ R.T for C in errors.components)])
         mean = mean_of(self.columns)
-        return MixedModel(self.z[None], mean[None], components[:, None], scales=errors.scales, kin=errors.of_arm)
+        return MixedModel(self.z[None], mean[None], components[:, None], further=errors.prior)
 
     def reduce(self, twists: Sequence[Array]) -> Array:
         """(N, K) visible directions of twists (6V, K) of every session."""

@@ -1,0 +1,44 @@
+"""What joints and links of any arm do a little wrong: effects of the library, and the twists of the views by them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.effects.contract import EFFECTS, Effect
+from stitch.effects.in_session import lacking
+from stitch.frames import Array
+from stitch.measurement.measurement import Measurement
+from stitch.model.jacobian import twists
+from stitch.model.model import Model
+from stitch.model.term import Term, term_of
+
+# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
+_EVERY_ARM = ("joints", "torque")
+FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
+
+
+def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
+    """What the library knows of every joint and link, as far as all sessions can have it."""
+    possible = [
+        e
+        for e in EFFECTS.values()
+        if e.tier == "physical" and e.place in ("robot", "links") and e.needs and set(e.needs) <= set(_EVERY_ARM)
+    ]
+    per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
+    return [e for e in per_joint if not any(lacking(m, e) for m in measurements)]
+
+
+def families(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
+    """Effects of one cause share a size."""
+    out: dict[str, list[Effect]] = {}
+    for e in effects:
+        out.setdefault(FAMILY.get(e.name, e.name), []).append(e)
+    return out
+
+
+def columns_of(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
+    """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
+    in_use: dict[str, Term] = {term.name: term for term in model.terms}
+    terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
+    found = zip(terms, twists(measurement, model, terms, centre), strict=True)
+    return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
