@@ -32,7 +32,7 @@ from stitch.statistics.variance_components import at_variances
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (846, 847)
+DEVELOPMENT, HELD_OUT = (0, 1), (848, 849)
 MULTIPLES = (1.0, 1.5, 2.0, 3.0)
 # A number of an effect counts if the views show it at its plausible size as more than a tenth of a sigma.
 _SEEN = 0.1
