@@ -41,7 +41,7 @@ _SEEN = 0.1
 def known(a: Asked) -> LinearModel:
     """The views under the scatter and the noise that they have in truth."""
     variances = np.array([SCATTER[0] ** 2, SCATTER[3] ** 2, a.cell.noise_factor])
-    mixed = replace(a.linear.mixed, components=a.linear.mixed.components[:3], scales=None, kin=None)
+    mixed = replace(a.linear.mixed, components=a.linear.mixed.components[:3], further=None)
     return replace(a.linear, mixed=mixed, null=at_variances(mixed, variances), pose_errors=None)
 
 

@@ -82,7 +82,7 @@ def with_overlaps_of(asked: Asked, world: World, linear: LinearModel) -> LinearM
 
 def white(linear: LinearModel) -> LinearModel:
     """As if poses scattered independently: what sizes are counted in."""
-    mixed = replace(linear.mixed, components=linear.mixed.components[:3], scales=None, kin=None)
+    mixed = replace(linear.mixed, components=linear.mixed.components[:3], further=None)
     return replace(linear, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None)
 
 
