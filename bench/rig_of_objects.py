@@ -25,7 +25,7 @@ from stitch.measurement.measurement import Measurement, about_part, measurement_
 from stitch.model.model import Model
 from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.hand_eye import HandEye, fit_hand_eye
+from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEye, fit_hand_eye
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.reading.session_folder import load_session
 from stitch.stages.coarse import coarse
@@ -71,7 +71,9 @@ def fitted(objects: Sequence[Object], T_mount: Array, shared: bool) -> HandEye:
         centres, errors = [f.overlaps.gram.centre for f in freed], None
         if shared and turn == _FITS - 1:
             errors = pose_errors([o.measurement for o in objects], Model(T_mount), centres)
-        found = fit_hand_eye(captures, freed, T_mount, repeating=[o.field for o in objects], errors=errors)
+        found = fit_hand_eye(
+            captures, freed, T_mount, repeating={SCANNER_FIELD: [o.field for o in objects]}, errors=errors
+        )
         T_mount = found.T_mount
     return found
 

@@ -8,7 +8,6 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
 from stitch.observations.error_model import WHITE
-from stitch.observations.surfaces.hand_eye import shares_of
 from stitch.observations.surfaces.hand_eye_solution import weak_prior
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE
 from stitch.observations.surfaces.shown_errors import USUAL_SHARE
@@ -61,4 +60,14 @@ def expected_hand_eye(linear: ExpectedModel, found: Seen, middle: Array | None =
     covariance = np.sum(list(sources.values()), axis=0)
     if middle is None:
         middle = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
-    return ExpectedHandEye(covariance[:6, :6], shares_of(sources, covariance), middle)
+    return ExpectedHandEye(covariance[:6, :6], _shares_of(sources, covariance), middle)
+
+
+def _shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
+    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1.
+
+    The hand-eye is what the first six rows of all these covariances are of.
+    """
+    scale = np.sqrt(np.diag(covariance)[:6])
+    unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
+    return {name: float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6 for name, own in sources.items()}

@@ -17,7 +17,7 @@ from stitch.model.model import Model
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.free_poses import FreePoses, free_poses
 from stitch.observations.surfaces.gram import assemble
-from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, fit_hand_eye
 from stitch.observations.surfaces.hand_eye_solution import step_hand_eye
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, common_samples, next_gate, pooled_rms
@@ -89,7 +89,7 @@ def tightened(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list
     return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
 
 
-# From freed views per capture to what `fit_hand_eye` calls `repeating`.
+# From freed views per capture to the twists (6V, K) of each by the scanner's errors that all views repeat.
 Repeating = Callable[[Sequence[FreePoses]], list[Array]]
 # From freed views per capture and a hand-eye to how their poses may err.
 Erring = Callable[[Sequence[FreePoses], Array], PoseErrors]
@@ -109,7 +109,7 @@ def correct(
         captures: one per session; all carry the same scanner on the same mount.
         T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
         gate: first distance between partners, length_unit: the coarse error at the part.
-        repeating: errors that all views have in common; they widen the covariance.
+        repeating: errors of the scanner that all views have in common; they widen the covariance.
         erring: how poses may err beside white scatter; None: they do not.
 
     Raises:
@@ -122,7 +122,7 @@ def correct(
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [weighing(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
     freed = _freed_again(captures, freed, gates, T_first)
-    common = None if repeating is None else repeating(freed)
+    common = None if repeating is None else {SCANNER_FIELD: repeating(freed)}
     errors = None if erring is None else erring(freed, T_first)
     hand_eye = fit_hand_eye(captures, freed, T_first, repeating=common, errors=errors)
     final = tuple(

@@ -95,12 +95,23 @@ def warnings(start: Coarse, found: HandEye) -> tuple[str, ...]:
             "give scanner.pose, or add views with other orientations."
         )
     if found.inflation > _WIDENED:
-        source, share = max(found.shares.items(), key=lambda item: item[1])
         notes.append(
             f"The hand-eye is {np.sqrt(found.inflation):.1f} times less certain than independent pose errors would "
-            f"leave it; the largest part of its variance, {share:.0%}, may come from {SOURCES.get(source, source)}."
+            f"leave it; {_largest_sources(found)}."
         )
     return tuple(notes)
+
+
+def _largest_sources(found: HandEye) -> str:
+    """Where most of its variance may come from."""
+    (turn, of_turn), (shift, of_shift) = (
+        max(shares.items(), key=lambda item: item[1]) for shares in (found.rotation_shares, found.position_shares)
+    )
+    first, second = (SOURCES.get(source, source) for source in (turn, shift))
+    largest = "the largest part of the variance of its"
+    if turn == shift:
+        return f"{largest} rotation, {of_turn:.0%}, and of its position, {of_shift:.0%}, may come from {first}"
+    return f"{largest} rotation, {of_turn:.0%}, may come from {first}, of its position, {of_shift:.0%}, from {second}"
 
 
 def view_notes(

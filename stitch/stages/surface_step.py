@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.frames import Array, Mask
+from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import kept_root
@@ -14,10 +14,11 @@ from stitch.model.term import sizes_of, split, stacked, values_of
 from stitch.observations.pose_errors import PoseErrors, pose_errors
 from stitch.observations.surfaces.free_poses import FreePoses
 from stitch.observations.surfaces.gram import pair_squares
-from stitch.observations.surfaces.hand_eye import HandEye, fit_hand_eye
+from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEye, fit_hand_eye
 from stitch.observations.surfaces.hand_eye_solution import Columns
 from stitch.observations.surfaces.pose_channel import whitened
 from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.stages.error_sources import ANOTHER_ARM, unfitted
 from stitch.stages.fit import WEAK, fitted_parameters
 from stitch.statistics.parameter_selection import Whitened, omitted_rms
 
@@ -28,7 +29,7 @@ class Choice:
 
     fitted: Mask  # (P,)
     omitted: Array  # (P,) rms that parameters at zero may well have
-    repeating: list[Array]  # per session (6V, K) of errors that all views have in common
+    scanner_field: list[Array]  # per session (6V, K) twists by the scanner's errors that all views repeat
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,11 @@ class Linearised:
     def choose(self, before: Choice | None) -> Choice:
         """The parameters that the views ask for, those of before first."""
         # What the scanner repeats hardly changes with the last micrometres.
-        repeating = field_scatters(self.measurements, self.freed)
+        field = field_scatters(self.measurements, self.freed)
         fitted = np.zeros(len(self.values), bool) if before is None else before.fitted
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
-        omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted)
-        return Choice(fitted, np.where(self._held, 0.0, omitted), repeating)
+        omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted, self._of_effect)
+        return Choice(fitted, np.where(self._held, 0.0, omitted), field)
 
     def solve(self, choice: Choice) -> Step:
         """The step, as the iteration of the fit asks for it."""
@@ -79,13 +80,8 @@ class Linearised:
     def step(self, choice: Choice, errors: PoseErrors | None = None) -> Step:
         """The step, with a covariance that counts how poses may err; without, one of scatter alone."""
         fitted, before = choice.fitted, self.values
-        # A parameter at zero that is not zero errs alike in every view, as the scanner does; so does another run's arm.
-        kept = kept_root(self.model.terms, self.model.effects_covariance)
-        repeating = [
-            np.hstack([r, c * choice.omitted, c @ kept]) for r, c in zip(choice.repeating, self.columns, strict=True)
-        ]
         columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
-        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, repeating, errors)
+        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, self._repeating(choice), errors)
         values = before.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[~self._held] = 0.0
@@ -106,6 +102,24 @@ class Linearised:
         """The step again, with all that the arm may do wrong in its covariance."""
         centres = [f.overlaps.gram.centre for f in self.freed]
         return self.step(choice, pose_errors(self.measurements, self.model, centres))
+
+    def _repeating(self, choice: Choice) -> dict[str, list[Array]]:
+        """Twists that all views have in common: a parameter at zero that is not zero errs alike in every view, as the
+        scanner does; so does another run's arm."""
+        terms = self.model.terms
+        kept = kept_root(terms, self.model.effects_covariance)
+        omitted = [choice.omitted * (self._of_effect == k) for k in range(len(terms))]
+        own = {unfitted(term.name): sizes for term, sizes in zip(terms, omitted, strict=True) if sizes.any()}
+        return {
+            SCANNER_FIELD: choice.scanner_field,
+            **{source: [c[:, sizes > 0] * sizes[sizes > 0] for c in self.columns] for source, sizes in own.items()},
+            ANOTHER_ARM: [c @ kept for c in self.columns],
+        }
+
+    @property
+    def _of_effect(self) -> Indices:
+        """(P,) index of the effect of every parameter."""
+        return np.array([k for k, term in enumerate(self.model.terms) for _ in term.parameters], int)
 
     @property
     def _held(self) -> Mask:

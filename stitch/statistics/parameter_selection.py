@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, logit
 
-from stitch.frames import Array, Mask
+from stitch.frames import Array, Indices, Mask
 from stitch.statistics.amplitude_scales import PLAUSIBLE, log_mixture
 from stitch.statistics.identifiability import project_out
 
@@ -20,6 +20,8 @@ _LOG_BAYES_FACTOR = 2.5
 # A parameter that these views know worse than this many times its plausible size stays at zero: it would
 # only borrow from the hand-eye.
 UNSEEN = 4.0
+# A parameter of an effect of which nobody knows more is there or not.
+_EVEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,23 +70,54 @@ def _evidence(told: Array, b: Array) -> float:
     return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
 
-def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask) -> Array:
+def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask, effects: Indices) -> Array:
     """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
 
-    Each may be there or not, even odds before the views were asked: with probability π it has the mean μ and the
-    sigma σ that they give it, so that its mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999).
+    Each may be there or not: with probability π it has the mean μ and the sigma σ that the views give it, so that its
+    mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999). What to expect before they are asked the
+    other parameters of its effect tell, each as far as the views tell it: how many of them are there, beside one at
+    even odds (Jeffreys' prior of a share), and how large those are, beside one of plausible size (credibility; Bühlmann
+    1967, ASTIN Bulletin 4:199). Where one joint of five is off, a sixth that nobody sees is likelier right than off;
+    where all are off, it is so too.
 
     Args:
         sizes: (P,) plausible sizes.
         fitted: (P,) bool.
+        effects: (P,) index of the effect that each belongs to.
     """
-    base = np.hstack([whitened.base, whitened.further[:, fitted]])
-    G, y = project_out(base, whitened.further * sizes), project_out(base, whitened.z[:, None])[:, 0]
-    told, pull = np.einsum("np,np->p", G, G), G.T @ y
-    mean, variance = pull / (1 + told), 1 / (1 + told)
-    gain = 0.5 * pull * mean - 0.5 * np.log1p(told)
-    rms = sizes * np.sqrt(expit(gain) * (mean**2 + variance))
+    told, pull = _each(whitened, sizes, fitted)
+    seen, gain, square = told / (1 + told), *_if_there(told, pull)
+    others = np.equal.outer(effects, effects) & ~np.eye(len(sizes), dtype=bool)
+    there = seen * expit(gain)
+    share = (_EVEN + others @ there) / (1 + others @ seen)
+    scale = np.sqrt((1 + others @ (there * square)) / (1 + others @ there))
+    gain, square = _if_there(scale**2 * told, scale * pull)
+    rms = sizes * scale * np.sqrt(expit(logit(share) + gain) * square)
     return np.where(fitted, 0.0, rms)
+
+
+def _if_there(told: Array, pull: Array) -> tuple[Array, Array]:
+    """(P,) log odds that a parameter of standard normal prior has over none, and its mean square if it is there."""
+    mean, variance = pull / (1 + told), 1 / (1 + told)
+    return 0.5 * pull * mean - 0.5 * np.log1p(told), mean**2 + variance
+
+
+def _each(whitened: Whitened, sizes: Array, fitted: Mask) -> tuple[Array, Array]:
+    """(P,) what the views know of every parameter beside all others that are fitted, per plausible size: information,
+    and that times the likeliest value."""
+
+    def beside(others: Mask, own: Mask) -> tuple[Array, Array]:
+        base = np.hstack([whitened.base, whitened.further[:, others]])
+        G = project_out(base, whitened.further[:, own] * sizes[own])
+        y = project_out(base, whitened.z[:, None])[:, 0]
+        return np.einsum("np,np->p", G, G), G.T @ y
+
+    told, pull = np.zeros(len(sizes)), np.zeros(len(sizes))
+    told[~fitted], pull[~fitted] = beside(fitted, ~fitted)
+    for p in np.flatnonzero(fitted):
+        only = np.arange(len(sizes)) == p
+        told[only], pull[only] = beside(fitted & ~only, only)
+    return told, pull
 
 
 def _grown(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:

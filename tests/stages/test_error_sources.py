@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.quiet_scenes import clean, simulated
+from stitch import pipeline
 from stitch.measurement.capture import capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.error_model import WHITE
 from stitch.observations.pose_errors import STOPS, pose_errors, usual_sizes
-from stitch.stages.error_sources import SOURCES
+from stitch.stages.error_sources import SOURCES, unfitted
 
 
 def test_every_component_has_words():
@@ -22,3 +25,10 @@ def test_every_component_has_words():
     assert set(STOPS) | set(usual_sizes()) <= set(prior.names)
     assert {*WHITE, *prior.names} <= set(SOURCES)
     assert len(set(SOURCES.values())) == len(SOURCES) and not set(SOURCES) & set(SOURCES.values())
+
+
+def test_joints_that_look_like_the_hand_eye_are_named_for_it():
+    """Of a wrong zero of the last joint nothing is seen: rotation and position may come from it, not from the scanner."""
+    session = session_of(simulated(clean("blade-table", rays=60), {"joint_offset": 1.0}, 2, 10))
+    (note,) = [n for n in pipeline.run(session, effects=["joint_offset"]).notes if "less certain" in n]
+    assert "of its rotation, " in note and note.split("may come from ")[1].startswith(unfitted("joint_offset"))

@@ -64,6 +64,28 @@ def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
     assert chosen[2] and chosen[:2].sum() == 1
 
 
+def test_what_nobody_sees_is_believed_of_the_size_of_its_like():
+    """Six parameters of an effect, in a share and of a size that are drawn for the effect; nothing tells the last.
+
+    Mean squares told and true agree, whether the five others are small or large.
+    """
+    rng, told, true = np.random.default_rng(4), [], []
+    for _ in range(3000):
+        size = 1 / np.sqrt(rng.chisquare(3))  # of a mean square of one
+        amplitudes = size * rng.standard_normal(6) * (rng.uniform(size=6) < rng.beta(0.5, 0.5))
+        further = 20 * np.linalg.qr(rng.standard_normal((30, 6)))[0]
+        further[:, 5] = 0.0
+        z = further @ amplitudes + rng.standard_normal(30)
+        fitted = np.abs(amplitudes) * (np.arange(6) < 5) > 0.2
+        told.append(omitted_rms(Whitened(np.zeros((30, 0)), further, z), np.ones(6), fitted, np.zeros(6))[5] ** 2)
+        true.append(amplitudes[5] ** 2)
+    told, true = np.array(told), np.array(true)
+    for some in (told < 0.2, (told > 0.2) & (told < 0.6), told > 0.6):
+        ratio = (true / told)[some]
+        known = ratio.std() / np.sqrt(len(ratio))
+        assert abs(ratio.mean() - 1) < 4 * known and known < 0.15
+
+
 def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
     """Amplitudes that are there in half the cases, drawn from their prior: mean squares told and true agree."""
     rng, told, true = np.random.default_rng(3), [], []
@@ -71,10 +93,12 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
         own, further, size = rng.standard_normal((12, 2)), 0.4 * rng.standard_normal((12, 1)), rng.uniform(0.2, 3)
         amplitude = size * rng.standard_normal() * rng.integers(0, 2)
         z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
-        told.append(omitted_rms(Whitened(own, further, z), np.array([size]), np.zeros(1, bool))[0] ** 2 / size**2)
+        told.append(
+            omitted_rms(Whitened(own, further, z), np.array([size]), np.zeros(1, bool), np.zeros(1))[0] ** 2 / size**2
+        )
         true.append(amplitude**2 / size**2)
     apart = np.array(told) - true
     assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
     # Beside a column that is fitted and says the same nothing is known of it but its size.
-    same = omitted_rms(Whitened(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]))
+    same = omitted_rms(Whitened(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]), np.arange(2))
     np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)

@@ -29,7 +29,8 @@ def show_ledger(result: Run) -> None:
             terminal.print(f"  {name}.{p.name} = {p.told}{how}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
-    for line in hand_eye_lines(result.T_mount, result.mount_covariance, result.session.mount, unit):
+    hand_eye = hand_eye_lines(result.T_mount, result.mount_covariance, result.session.mount, unit)
+    for line in (*result.notes[len(result.left_out) :], *hand_eye):
         terminal.print(line, soft_wrap=True)
 
 

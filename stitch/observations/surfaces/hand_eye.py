@@ -6,7 +6,7 @@ that out. `pose_errors.py` says how poses may err, the views say how much, and t
 and effects counts. Errors of the scanner that repeat in every view come on top.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +24,8 @@ from stitch.observations.surfaces.rig_model import rig_model
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
+# Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
+SCANNER_FIELD = "scanner field"
 # White scatter of more numbers is known well enough to take its maximum.
 _PLUG_IN = 300
 
@@ -37,7 +39,9 @@ class HandEye:
     inflation: float  # of the covariance over that of independent pose errors, geometric mean over directions, ≥ 1
     repeatability: tuple[Repeatability, ...]  # per capture
     heldout_ratio: float  # rms of left-out views over rms of the fit, same correspondences
-    shares: dict[str, float] = field(default_factory=dict)  # of what may be wrong in the hand-eye's variance; sum 1
+    # Shares of what may be wrong in the variance of its rotation and of its position; each adds up to 1.
+    rotation_shares: dict[str, float] = field(default_factory=dict)
+    position_shares: dict[str, float] = field(default_factory=dict)
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
@@ -52,7 +56,7 @@ def fit_hand_eye(
     freed: Sequence[FreePoses],
     T_mount: Array,
     columns: Columns | None = None,
-    repeating: Sequence[Array] | None = None,
+    repeating: Mapping[str, Sequence[Array]] | None = None,
     errors: PoseErrors | None = None,
 ) -> HandEye:
     """Generalised least squares over the pose channels of all captures; covariance under all errors of the poses.
@@ -61,12 +65,12 @@ def fit_hand_eye(
         freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
         T_mount: (4, 4) hand-eye at which that began.
         columns: effects to fit with it.
-        repeating: per capture (6V, K) twists that the views show for one standard deviation of each of K errors
-            that all views and captures have in common; they widen the covariance and change nothing else.
+        repeating: by source, per capture (6V, K) twists that the views show for one standard deviation of each of K
+            errors that all views and captures have in common; they widen the covariance and change nothing else.
         errors: how the poses may err beside white scatter; None: they do not.
     """
     found = solved(captures, freed, T_mount, columns)
-    sources = _sources(found, errors or white(sum(len(f.poses) for f in freed)), repeating)
+    sources = _sources(found, errors or white(sum(len(f.poses) for f in freed)), repeating or {})
     covariance = np.sum(list(sources.values()), axis=0)
     return HandEye(
         T_mount=T_mount @ frames.exp(found.x[:6]),
@@ -74,13 +78,14 @@ def fit_hand_eye(
         inflation=_inflation(covariance, found.weighed.covariance),
         repeatability=found.scatter,
         heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.pull), found.x),
-        shares=shares_of(sources, covariance),
+        rotation_shares=_shares(sources, slice(0, 3)),
+        position_shares=_shares(sources, slice(3, 6)),
         values=found.values + found.x[6:],
         values_covariance=covariance[6:, 6:],
     )
 
 
-def _sources(found: Solution, errors: PoseErrors, repeating: Sequence[Array] | None) -> dict[str, Array]:
+def _sources(found: Solution, errors: PoseErrors, repeating: Mapping[str, Sequence[Array]]) -> dict[str, Array]:
     """What each source does to the covariance (6 + P, 6 + P)."""
     rig, weighed = found.rig, found.weighed
     mixed = rig.mixed(errors)
@@ -89,9 +94,9 @@ def _sources(found: Solution, errors: PoseErrors, repeating: Sequence[Array] | N
     names = (*WHITE, *errors.names)
     components = zip(names, mean, mixed.components[:, 0], strict=True)
     sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in components}
-    if repeating is not None:
-        repeated = weighed.gain @ rig.reduce(repeating)
-        sources["scanner field"] = repeated @ repeated.T
+    for name, twists in repeating.items():
+        repeated = weighed.gain @ rig.reduce(twists)
+        sources[name] = repeated @ repeated.T
     # The rest is what the prior leaves where nothing is seen.
     sources["unseen"] = weighed.covariance @ found.prior @ weighed.covariance
     return sources
@@ -102,14 +107,10 @@ def _inflation(covariance: Array, alone: Array) -> float:
     return float(max(1.0, np.exp(ratio / len(covariance))))
 
 
-def shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
-    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1.
-
-    The hand-eye is what the first six rows of all these covariances are of.
-    """
-    scale = np.sqrt(np.diag(covariance)[:6])
-    unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
-    return {name: float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6 for name, own in sources.items()}
+def _shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
+    """Of every source in the variance of some axes of the hand-eye together."""
+    own = {name: float(np.trace(matrix[axes, axes])) for name, matrix in sources.items()}
+    return {name: square / max(sum(own.values()), 1e-300) for name, square in own.items()}
 
 
 def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
