@@ -75,12 +75,25 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
-    """(n,) points in the frame of a scan about whose direction all that it sees is farther away.
+    """(n,) points in the frame of a scan all about whose direction what it sees is farther away.
 
     One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
+    Where that face is too steep to be seen, there are looks on one side of the point alone.
     """
-    away = np.linalg.norm(points - scan.eye, axis=1)
-    beside, partners = look.query(scan.rays(points), k=min(_LOOKS, len(scan.points)))
+    away, rays = np.linalg.norm(points - scan.eye, axis=1), scan.rays(points)
+    beside, partners = look.query(rays, k=min(_LOOKS, len(scan.points)))
     beside, partners = beside.reshape(len(points), -1), partners.reshape(len(points), -1).astype(int)
-    seen = np.linalg.norm(scan.points[partners] - scan.eye, axis=2).min(axis=1)
-    return np.asarray((beside[:, 0] * away < _SPACINGS * scan.spacing) & (seen > away + behind))
+    found = scan.points[partners]
+    seen = np.linalg.norm(found - scan.eye, axis=2).min(axis=1)
+    looks = scan.rays(found.reshape(-1, 3)).reshape(found.shape)
+    near, farther = beside[:, 0] * away < _SPACINGS * scan.spacing, seen > away + behind
+    return np.asarray(near & farther & _surrounded(rays, looks))
+
+
+def _surrounded(rays: Array, looks: Array) -> Mask:
+    """(n,) which unit vectors (n, 3) have some of others (n, k, 3) on every side: in each half of the directions."""
+    across = np.linalg.svd(rays[:, None, :])[2][:, 1:]  # (n, 2, 3) perpendicular to each
+    off = np.einsum("nij,nkj->nki", across, looks - rays[:, None])
+    angles = np.sort(np.arctan2(off[..., 1], off[..., 0]), axis=1)
+    gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi)
+    return np.asarray(gaps.max(axis=1, initial=0.0) < np.pi)

@@ -12,6 +12,7 @@ from stitch.integrity.deep_check import deep_check
 from stitch.integrity.in_the_way import in_the_way
 from stitch.measurement.capture import capture, part_size
 from stitch.measurement.cloud import Cloud
+from stitch.measurement.scan import prepare_view
 from stitch.pipeline import run
 
 VIEWS, SIDE, COUNT = 10, 8.0, 300
@@ -53,6 +54,19 @@ def test_what_others_look_through_is_said_with_the_views_and_its_share(measured,
     shares = [COUNT / len(session.views[v].cloud.points) for v in shown_by]
     # Only what has the part behind it is looked through.
     assert 0.3 * np.mean(shares) < found.share < 1.3 * np.mean(shares)
+
+
+@pytest.mark.parametrize(("edge", "in_the_way_of_it"), [(30.0, True), (0.0, False)])
+def test_what_stands_beside_all_looks_is_looked_through_by_none(edge, in_the_way_of_it):
+    """A strip before a wall, and one beside its end, where a face too steep to be seen may lead to it."""
+    x, y = np.meshgrid(np.arange(-60.0, edge + 0.5), np.arange(-40.0, 40.5))
+    wall = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 500.0)])
+    # Its rays pass the wall's end by less than the wall's points lie apart.
+    x, y = np.meshgrid(np.linspace(0.2, 1.0, 5), np.linspace(-20.0, 20.0, 60))
+    strip = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 500.0)]) * 0.9
+    scans = [prepare_view("wall", wall), prepare_view("strip", np.concatenate([strip, wall[:3000]]))]
+    found = in_the_way(scans, np.tile(np.eye(4), (2, 1, 1)), 100.0)
+    assert (found is not None and found.views == (1,)) == in_the_way_of_it
 
 
 def test_a_run_and_a_deep_check_say_it_alike(measured):
