@@ -97,6 +97,12 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
         )
 
 
+def others_of_rig(run: Path) -> list[str]:
+    """Names of the runs that one rig's folder holds beside a run."""
+    own = run.resolve()
+    return [name for name in _inner(own.parent) if name != own.name]
+
+
 def _inner(path: Path) -> list[str]:
     """Names of the runs in the folder of a rig, which has no result of its own."""
     if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():

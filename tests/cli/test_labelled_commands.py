@@ -45,3 +45,19 @@ def test_every_command_works(kind, tmp_path, stitch_command, monkeypatch, few_ef
     assert "joint_offset" in json.loads((tmp_path / "r" / "result.json").read_text())["effects"]
     stitch_command("report", out, "--no-diagnosis")
     assert "Targets" in (tmp_path / "r" / "report.html").read_text()
+
+
+def test_a_member_of_a_rig_that_is_changed_says_that_the_others_are_not(tmp_path, stitch_command, capsys):
+    folders = [
+        write_labelled(tmp_path / name, labelled_cell(seed, views=16, offset=np.array([0, 1e-3, 0, 0, 2e-3, 0]))[0])
+        for seed, name in enumerate("abc")
+    ]
+    stitch_command("run", *folders, "-o", tmp_path / "rig", "--no-recording")
+    stitch_command("add", tmp_path / "rig" / "b", "joint_offset", "--no-recording")
+    said = " ".join(capsys.readouterr().err.split())
+    assert "this run alone has changed: a, c and their common model.toml are as they were" in said
+    assert "with all sessions --effects joint_offset and -o" in said
+    stitch_command("run", folders[0], "-o", tmp_path / "alone", "--no-recording")
+    capsys.readouterr()
+    stitch_command("add", tmp_path / "alone", "joint_offset", "--no-recording")
+    assert "alone has changed" not in " ".join(capsys.readouterr().err.split())

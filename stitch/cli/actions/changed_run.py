@@ -22,6 +22,7 @@ from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
 from stitch.writing.plain_finding import next_step
 from stitch.writing.result_document import result_document
+from stitch.writing.run_contents import others_of_rig
 
 
 def add_named(
@@ -82,7 +83,7 @@ def _suggested(
                 again = change(before, result.effects, recorder_for(scratch, recording))
                 result = replace(again, notes=result.notes)
             run_folder.write_with_page(result, scratch)
-        _show(result, as_json)
+        _show(result, run, as_json)
     elif as_json:
         emit((run / "result.json").read_text(encoding="utf-8").rstrip())
     else:
@@ -115,13 +116,20 @@ def _change(run: Path, state: State, effects: list[str], recording: bool, as_jso
     with doing("reading the run"), run_folder.changed(run) as scratch:
         result = change(state, effects, recorder_for(scratch, recording))
         run_folder.write_with_page(result, scratch)
-    _show(result, as_json)
+    _show(result, run, as_json)
     if not as_json:
         console().print(f"Next: stitch diagnose {shlex.quote(str(run))}", soft_wrap=True)
 
 
-def _show(result: Run, as_json: bool) -> None:
+def _show(result: Run, run: Path, as_json: bool) -> None:
     if as_json:
         emit(to_json(result_document(result)))
-    else:
-        show_ledger(result)
+        return
+    show_ledger(result)
+    if others := others_of_rig(run):
+        effects = f" --effects {','.join(result.effects)}" if result.effects else ""
+        console().print(
+            f"Of its rig this run alone has changed: {', '.join(others)} and their common model.toml are as they were. "
+            f"For one model of all: stitch run, with all sessions{effects} and -o {shlex.quote(str(run.parent))}",
+            soft_wrap=True,
+        )
