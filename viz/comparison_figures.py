@@ -4,7 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.comparison.tables import Comparison, Table
+from stitch.comparison.table import Table
+from stitch.comparison.tables import Comparison
 from stitch.units import MICROMETRES
 from viz.colours import BLUE
 from viz.drawing import plain

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from stitch.comparison.same_bins import same_bins
-from stitch.comparison.table import Table as Table
+from stitch.comparison.table import Table
 from stitch.frames import Array, Indices
 from stitch.measurement.views import Views
 

@@ -81,7 +81,9 @@ def _tried(linear: LinearModel, terms: Dictionary, chosen: Chosen, origin: str) 
         return Explanation(False, f"{beyond.objection(text)}.")
     tested = _tested(linear, terms, chosen, text)
     why = f"{text}: {_how(chosen.p_value, text, tested)}."
-    return Explanation(True, why, text, own[0].place, tested, share, chosen.p_value, source)
+    return Explanation(
+        True, why, text, own[0].place, tested, heldout_share=share, p_value=chosen.p_value, source=source
+    )
 
 
 def _coefficients(linear: LinearModel, ingredients: Sequence[Ingredient], scaled: Array) -> list[float]:

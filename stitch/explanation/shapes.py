@@ -26,7 +26,7 @@ def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity
     """exp(−((q − middle) / width)² / 2) of joint k, from 0; rad."""
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
     text = f"bump of q{k + 1} at {np.degrees(middle):.0f}°, {np.degrees(width):.2g}° wide"
-    return _bump(text, q, at, middle, width, "gear", k, partial(bump_of_joint, views, k))
+    return _bump(text, q, at, middle, width, kind="gear", joint=k, family=partial(bump_of_joint, views, k))
 
 
 def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
@@ -76,7 +76,8 @@ def beside_line(torque: Quantity, power: Callable[[Array], Array], text: str, co
 def bump_in_time(views: Views, middle: float, width: float) -> Quantity:
     """exp(−((t − middle) / width)² / 2); h."""
     text = f"bump of t at {middle:.2g} h, {width:.2g} h wide"
-    return _bump(text, views.hours, "views.hours", middle, width, "course", None, partial(bump_in_time, views))
+    family = partial(bump_in_time, views)
+    return _bump(text, views.hours, "views.hours", middle, width, kind="course", joint=None, family=family)
 
 
 def behind(views: Views, k: int, play: float) -> Quantity:
@@ -123,7 +124,7 @@ def warming(views: Views, constant: float) -> Quantity:
 
 
 def _bump(
-    text: str, x: Array, at: str, middle: float, width: float, kind: str, joint: int | None, family: Family
+    text: str, x: Array, at: str, middle: float, width: float, *, kind: str, joint: int | None, family: Family
 ) -> Quantity:
     code = f"np.exp(-0.5 * (({at} - {middle:.6g}) / {width:.6g}) ** 2)"
     # A bump of whose flank alone is seen could be of any height.

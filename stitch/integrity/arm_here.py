@@ -13,7 +13,6 @@ from stitch.frames import Array
 from stitch.model.model_toml import ModelFile
 from stitch.stages.finish import per_view_rms
 from stitch.stages.fitted import Fitted
-from stitch.stages.outlier_removal import FittedSession
 from stitch.statistics.shares import clearly_less
 from stitch.units import length_text
 
@@ -79,12 +78,4 @@ def squares_of_views(fitted: Fitted) -> Array:
     if fitted.correction is not None:
         every = zip(fitted.captures, fitted.correction.overlaps, strict=True)
         return np.concatenate([per_view_rms(overlaps, len(c.scans)) ** 2 for c, overlaps in every])
-    return np.concatenate([squares_of_targets(own) for own in fitted.sessions])
-
-
-def squares_of_targets(own: FittedSession) -> Array:
-    """(V,) mean square distance of the targets in every view; NaN where none was seen."""
-    assert own.targets is not None
-    d = own.targets.rows.distances(own.targets.rows.residual)
-    seen = np.isfinite(d).sum(axis=1)
-    return np.where(seen > 0, np.nansum(d**2, axis=1) / np.maximum(seen, 1), np.nan)
+    return np.concatenate([own.targets.view_squares for own in fitted.sessions if own.targets is not None])

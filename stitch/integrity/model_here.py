@@ -13,7 +13,6 @@ from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.admitted_fit import Admitted
-from stitch.integrity.arm_here import squares_of_targets
 from stitch.integrity.arm_limits import beyond_any_arm
 from stitch.measurement.session import Session
 from stitch.observations.targets.target_fit import TargetFit
@@ -98,7 +97,7 @@ def _compared(applied: FittedSession, own: FittedSession) -> ModelHere | None:
     """None where what is fitted here leaves no less than chance would."""
     there, here = applied.targets, own.targets
     assert there is not None and here is not None
-    squares = squares_of_targets(applied), squares_of_targets(own)
+    squares = there.view_squares, here.view_squares
     if not clearly_less(squares[1], squares[0], _CHANCE):
         return None
     apart = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)

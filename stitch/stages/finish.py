@@ -127,7 +127,7 @@ def finish_targets(
         stages=(before, corrected, registered),
         poses_model=poses_model,
         poses=poses,
-        view_rms=_rms_of_rows(distances),
+        view_rms=np.sqrt(found.view_squares),
         residual_rms=found.rms,
         heldout_rms=found.heldout_rms,
         noise_floor=found.noise_floor,
@@ -136,12 +136,6 @@ def finish_targets(
         verdict=target_sentence(found, rms_of(after), scatter, session.length_unit),
         convergence={"correct": list(found.history), "register": [rms_of(after)]},
     )
-
-
-def _rms_of_rows(distances: Array) -> Array:
-    """(V,) of distances (V, K); NaN where there is none: an unseen view is not a perfect one."""
-    count = np.isfinite(distances).sum(axis=1)
-    return np.where(count > 0, np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(count, 1)), np.nan)
 
 
 def _targets_as_cloud(found: TargetFit) -> FusedCloud:

@@ -127,7 +127,7 @@ def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
     square = float(rest @ rest) + float(mean @ (problem.precision * mean))
     logdet = inverse.logdet + float(of_information - 2 * np.log(scale).sum()) + problem.offset
     value = logdet + square + log_prior(log_variances, mixed.further)[0]
-    return Likelihood(problem, log_variances, value, mean, half, inverse, white, rest)
+    return Likelihood(problem, log_variances, value, mean, half, inverse, white=white, rest=rest)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:

@@ -11,7 +11,8 @@ from rich.table import Table as Printed
 from stitch.cli.terminal.streams import emit
 from stitch.comparison.compare_surfaces import compare
 from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.tables import CLEAR, PLACE, Comparison, Table, comparison_document
+from stitch.comparison.table import Table
+from stitch.comparison.tables import CLEAR, PLACE, Comparison, comparison_document
 from stitch.runs.state import State
 from stitch.stored.load_state import load_state
 from stitch.system.console import console

@@ -46,6 +46,13 @@ class TargetFit:
         return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)])
 
     @property
+    def view_squares(self) -> Array:
+        """(V,) mean square distance of the targets in every view; NaN where none was seen: no perfect view."""
+        distances = self.rows.distances(self.rows.residual)
+        seen = np.isfinite(distances).sum(axis=1)
+        return np.where(seen > 0, np.nansum(distances**2, axis=1) / np.maximum(seen, 1), np.nan)
+
+    @property
     def alone(self) -> tuple[str, ...]:
         """Targets that say nothing of the poses: fewer than two views show them, and no other run knows them."""
         s = self.rows.sightings
