@@ -26,10 +26,11 @@ from stitch.observations.pose_errors import pose_errors
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (742, 743, 744, 745)
+DEVELOPMENT, HELD_OUT = (0, 1), (746, 747, 748, 749)
 KINDS = (
     *(("clean", 0.0), ("ordinary arm", 0.1), ("ordinary arm", 0.3), ("ordinary arm", 1.0), ("ordinary arm", 2.0)),
     *(("memory", 0.5), ("memory", 0.9), ("stops", 1.0), ("coupling", 1.5e-4), ("coupling", 6e-4)),
+    *(("joints scatter", 1.5e-5), ("joints scatter", 6e-5)),
 )
 _MEDIAN = 0.891  # of χ²(6)/6
 _NORMAL = 1.96  # 95 % of a normal number
@@ -63,7 +64,7 @@ def trials(cell: Cell, kind: str, size: float, draws: int, alone: bool) -> Itera
     """Errors of the hand-eye (6,) and their covariances, one a draw."""
     measurement, T = cell.measurement, cell.T_mount
     centre = cell.freed.overlaps.gram.centre
-    errors = None if alone else pose_errors([measurement], Model(T), [centre])
+    errors = None if alone else pose_errors([measurement], Model(T), [centre]).that_repeats()
     for draw in range(draws):
         rng = np.random.default_rng([cell.seed, draw, round(size * 1e6), len(kind)])
         freed = seen(cell, erring(cell, kind, size, rng), rng)

@@ -80,6 +80,10 @@ def erring(cell: Cell, kind: str, size: float, rng: np.random.Generator) -> Arra
         T = on_rail(draw_arm(cell.plan.arm.joints, size, rng).flange(cell.plan.arm, cell.plan.joints), cell.rail)
     elif kind == "coupling":
         T = on_rail(coupled(cell.plan, size, rng), cell.rail)
+    elif kind == "joints scatter":
+        off = size * rng.standard_normal(cell.plan.joints.shape)
+        T = on_rail(kinematics.flange(cell.plan.arm, cell.plan.joints + off), cell.rail)
+        scatter = 0.5 * scatter
     elif kind == "memory":
         # Twice as large: 40 µm, as was seen to mislead.
         scatter = 2 * with_memory(views, size, rng)

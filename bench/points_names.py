@@ -2,8 +2,9 @@
 
 Usage: python bench/points_names.py [--views N] [--size S] [--seeds FIRST LAST] [--write]
 
-An arm with four reflectors before a tracker; every law of data_synth's unnamed ones, poses with memory, nothing, and
-effects of the library, each alone and beside an unnamed law of the same size: of these alone one name is right.
+An arm with four reflectors before a tracker; every law of data_synth's unnamed ones, poses with memory, joints that
+scatter, nothing, and effects of the library, each alone and beside an unnamed law of the same size: of these alone one
+name is right.
 --size is in units of the laws' own sizes, 0.15 mrad of a joint or 0.05 mm. --write puts the table into docs/points.md.
 """
 
@@ -35,16 +36,17 @@ from stitch.observations.targets.target_model import target_model
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 MARKS = ("<!-- names: begin -->", "<!-- names: end -->")
-NOTHING, MEMORY = "nothing hidden", "memory"
+NOTHING, MEMORY, SCATTER = "nothing hidden", "memory", "joints that scatter"
 # What is hidden by name, none of it by the library's code: offset of one joint, of all, gravity, a gear that runs out.
 LIBRARY = {"one offset": "joint_offset", "offsets": "joint_offset", "gravity": "joint_compliance"}
 LIBRARY |= {"eccentric gear": "gear_eccentricity"}
 BESIDE = " beside dress_pack"
 # These cells are given no torques, without which no spring stiffens.
 OUTSIDE = tuple(law for law in UNNAMED if law != "stiffening")
-KINDS = (NOTHING, MEMORY, *OUTSIDE, *LIBRARY, *(kind + BESIDE for kind in LIBRARY))
+KINDS = (NOTHING, MEMORY, *OUTSIDE, *LIBRARY, *(kind + BESIDE for kind in LIBRARY), SCATTER)
 # What a joint is off by, rad; gravity turns joint 2 by so much at a metre's reach.
 _SIZE = 1.5e-4
+_SCATTER = 2e-5  # of every joint from view to view, rad
 
 
 def errors_of(kind: str, size: float, joints: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -52,6 +54,8 @@ def errors_of(kind: str, size: float, joints: Array, rng: np.random.Generator) -
     off, moved = np.zeros_like(joints), np.zeros((len(joints), 6))
     if kind == MEMORY:
         moved = with_memory(len(joints), 0.9, rng) * np.repeat([40e-6, 0.04], 3) * size
+    elif kind == SCATTER:
+        off = _SCATTER * size * rng.standard_normal(joints.shape)
     elif kind != NOTHING:
         plan = Plan(joints, 0 * joints, 0 * joints, next(iter(ARMS.values())), useful=tuple(range(joints.shape[1])))
         found = size * UNNAMED[kind](plan, rng)

@@ -8,10 +8,11 @@ import numpy as np
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.frames import Array
+from stitch.observations.arm_errors import JOINT_SCATTER
 from stitch.observations.error_model import WHITE
 from stitch.observations.flange_errors import WANDERING
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors
+from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.statistics.identifiability import project_out

@@ -12,7 +12,11 @@ from stitch.model.jacobian import twists
 from stitch.model.model import Model
 from stitch.model.term import Term, term_of
 
+# What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
+# the flange turns.
+JOINT_SCATTER, ANEW = "joint scatter", 0.02
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
+_OFFSET = "joint_offset"
 _EVERY_ARM = ("joints", "torque")
 FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 
@@ -42,3 +46,10 @@ def columns_of(measurement: Measurement, model: Model, centre: Array, effects: S
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     found = zip(terms, twists(measurement, model, terms, centre), strict=True)
     return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
+
+
+def offsets_of(measurement: Measurement, model: Model, centre: Array) -> Array | None:
+    """(6V, n) twists of the views for a plausible offset of every joint; None where no joints are known."""
+    if not measurement.views.has("joints") or _OFFSET not in EFFECTS:
+        return None
+    return columns_of(measurement, model, centre, [EFFECTS[_OFFSET]])

@@ -1,18 +1,19 @@
 """Numbers that were seen, and how they may err: components of a covariance, their sizes, models with fewer."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from stitch.frames import Array, Indices
-from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors
+from stitch.observations.arm_errors import ANEW, JOINT_SCATTER
+from stitch.observations.pose_errors import PoseErrors
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.satterthwaite import Satterthwaite, satterthwaite
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances, whitener
-from stitch.statistics.variance_prior import NOISE
+from stitch.statistics.variance_prior import NOISE, THERE, FurtherPrior
 
 # The first components of whatever was observed, by their names; what poses err beside follows them.
 WHITE = ("white rotation", "white translation", "sensor noise")
@@ -35,6 +36,10 @@ class ErrorModel:
     mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
     null: VarianceFit  # fitted without further columns
     pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
+    # (B, m, n) plausible offsets of the joints, each block a view, where the covariance counts no scatter of theirs.
+    offsets: Array | None = None
+    # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
+    by_joints: Array = field(default_factory=lambda: np.zeros(2))
     whole: "ErrorModel | None" = None  # the one that this was taken from, where some pose errors are left out
 
     @cached_property
@@ -45,10 +50,16 @@ class ErrorModel:
     def flange_scatter(self, fit: VarianceFit) -> Array:
         """(2,) variances along an axis by which the flange turns and moves anew in every view, by its joints too."""
         own = fit.variances[:NOISE]
-        if self.pose_errors is None or JOINT_SCATTER not in self.pose_errors.names:
+        if JOINT_SCATTER not in self.further:
             return own
-        size = fit.variances[NOISE + 1 + self.pose_errors.names.index(JOINT_SCATTER)]
-        return np.asarray(own + size * self.pose_errors.by_joints)
+        return np.asarray(own + fit.variances[NOISE + 1 + self.further.index(JOINT_SCATTER)] * self.by_joints)
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """Components beside the flange's scatter and noise; without a prior of pose errors joints may scatter still."""
+        if self.pose_errors is not None:
+            return self.pose_errors.names
+        return (JOINT_SCATTER,) if self.mixed.further is not None else ()
 
     def in_blocks(self, columns: Array) -> Array:
         """(B, m, P) columns (n, P) as the variance components take them."""
@@ -98,11 +109,21 @@ class ErrorModel:
 
     @cached_property
     def scatter_only(self) -> Self:
-        """As if poses erred independently from view to view."""
-        if self.pose_errors is None:
+        """As if the flange alone erred, anew in every view."""
+        if self.mixed.further is None:
             return self
         mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
         return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
+
+    @cached_property
+    def joints_scatter(self) -> Self:
+        """As if joints erred anew in every view too, where that is not so already."""
+        if self.offsets is None:
+            return self
+        components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
+        further = FurtherPrior(np.array([ANEW]), np.array([THERE]), np.zeros(1, bool))
+        mixed = replace(self.mixed, components=components, further=further)
+        return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     @cached_property
     def arm_right(self) -> Self:

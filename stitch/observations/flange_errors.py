@@ -37,6 +37,13 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
     return np.asarray(np.concatenate(own).reshape(-1, 6) * unit)
 
 
+def along_axes(offsets: Array, flange: Array, unit: Array) -> Array:
+    """(2,) mean squares along an axis of what columns (6V, n) of unit variance turn and move the flange by."""
+    own = unit[:, None] * np.linalg.solve(flange.reshape(-1, 6, 6), offsets.reshape(len(flange) // 6, 6, -1))
+    squares = (own**2).sum(axis=2).mean(axis=0)
+    return np.asarray(squares.reshape(2, 3).mean(axis=1))
+
+
 def near_in_time(measurements: Sequence[Measurement], memory: float) -> Array:
     """(V, V) how alike views err that are near in time; sessions are far from each other.
 

@@ -22,8 +22,8 @@ from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
-from stitch.observations.arm_errors import FAMILY, arm_effects, columns_of, families
-from stitch.observations.flange_errors import WANDERING, flange_twists, near_in_time, usual_twist
+from stitch.observations.arm_errors import ANEW, FAMILY, JOINT_SCATTER, arm_effects, columns_of, families
+from stitch.observations.flange_errors import WANDERING, along_axes, flange_twists, near_in_time, usual_twist
 from stitch.observations.joint_processes import joint_processes
 from stitch.statistics.kernels import SmoothErrors, alike_in_joints, same_stop, spread_over
 from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
@@ -31,8 +31,6 @@ from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
 _ARM, SMOOTH = 0.1, 0.03
-# What every joint does anew in every view, and how much of it is usual: as much as the flange turns.
-JOINT_SCATTER, _ANEW = "joint scatter", 0.02
 # What the scans of a stop share.
 STOPS = ("stop rotation", "stop translation")
 # Dense matrices of more views take minutes; there the scatter alone must do.
@@ -102,6 +100,10 @@ class PoseErrors:
         """What scatters alone; nothing errs again."""
         return replace(self._kept(np.array([name == JOINT_SCATTER for name in self.names], bool)), effects={})
 
+    def that_repeats(self) -> "PoseErrors":
+        """All but what joints do anew: on average the scatter of the flange that views show holds it already."""
+        return self._kept(np.array([name != JOINT_SCATTER for name in self.names], bool))
+
     def but_in_time(self) -> "PoseErrors":
         """What joints and links do and what scans of a stop share; nothing wanders."""
         return self._kept(np.array([name not in WANDERING for name in self.names], bool))
@@ -146,8 +148,8 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         found["smooth"] = (spread_over(links, alike), SMOOTH)
         if constant[0].name == _CONSTANT[0]:
             offsets = links[:, : joints.shape[1]]
-            found[JOINT_SCATTER] = (spread_over(offsets, np.eye(len(joints))), _ANEW)
-            by_joints = _at_flange(offsets, flange, usual_twist(measurements[0].length_unit))
+            found[JOINT_SCATTER] = (spread_over(offsets, np.eye(len(joints))), ANEW)
+            by_joints = along_axes(offsets, flange, usual_twist(measurements[0].length_unit))
             of_one_joint = joint_processes(measurements, joints, offsets, alike)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
@@ -158,10 +160,3 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
     return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints)
-
-
-def _at_flange(offsets: Array, flange: Array, unit: Array) -> Array:
-    """(2,) mean squares along an axis of what columns (6V, n) of unit variance turn and move the flange by."""
-    own = unit[:, None] * np.linalg.solve(flange.reshape(-1, 6, 6), offsets.reshape(len(flange) // 6, 6, -1))
-    squares = (own**2).sum(axis=2).mean(axis=0)
-    return np.asarray(squares.reshape(2, 3).mean(axis=1))

@@ -65,11 +65,10 @@ def told(linear: LinearModel, noise: float, variances: Sequence[tuple[Array, Arr
     Args:
         noise: of the scans.
     """
-    names = () if linear.pose_errors is None else linear.pose_errors.names
     both = []
     for found in np.mean(variances, axis=0):
         rotation, translation = np.sqrt(found[:NOISE])
-        errors = dict(zip(names, map(float, found[NOISE + 1 :]), strict=True))
+        errors = dict(zip(linear.further, map(float, found[NOISE + 1 :]), strict=True))
         both.append(Scatter(float(rotation), float(translation), noise, float(found[NOISE]), errors))
     return Told(*both)
 

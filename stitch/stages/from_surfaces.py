@@ -72,7 +72,8 @@ def fit(
         captures = [m.capture for m in measurements]
 
         def erring(freed: Sequence[FreePoses], T_mount: Array) -> PoseErrors:
-            return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
+            centres = [f.overlaps.gram.centre for f in freed]
+            return pose_errors(measurements, Model(T_mount), centres).that_repeats()
 
         first = correct(captures, begun[0].T_mount, begun[0].gate, recorder, repeating, erring)
         if begin_at is None:

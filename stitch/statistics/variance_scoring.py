@@ -23,7 +23,7 @@ def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likeliho
     numbers in small blocks three steps do what a search without curvature needs sixteen for.
     """
     mixed = problem.mixed
-    if mixed.further is not None or len(mixed.z) < _MANY_BLOCKS:
+    if len(mixed.z) < _MANY_BLOCKS:
         return None
     x, here = begin, likelihood(begin, problem)
     for _ in range(_SCORINGS):
@@ -32,8 +32,8 @@ def scored(problem: Problem, begin: Array, flat: float) -> tuple[Array, Likeliho
         variances = np.exp(x)
         shares = variances[:, None, None, None] * (here.inverse.matrix @ mixed.components)
         curvature = shares.reshape(len(x), -1) @ shares.transpose(0, 1, 3, 2).reshape(len(x), -1).T
-        curvature += np.diag(2 * prior_information(variances, None))
-        step = _step(curvature, here.slope, np.maximum(here.slope - log_prior(x, None)[1], 0))
+        curvature += np.diag(2 * prior_information(variances, mixed.further))
+        step = _step(curvature, here.slope, np.maximum(here.slope - log_prior(x, mixed.further)[1], 0))
         gain = -0.5 * float(here.slope @ step)
         if gain < _SETTLED:
             return x, here

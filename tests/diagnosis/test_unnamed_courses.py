@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.arms import ARMS
-from data_synth.fixtures.labelled_arm import TARGETS, joints_of, labelled_cell
+from data_synth.fixtures.labelled_arm import TARGETS, flange, joints_of, labelled_cell
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
@@ -38,6 +38,19 @@ def test_what_no_library_has_gets_no_name(which):
     else:
         joint = 1 + int(np.abs(errors[0]).sum(axis=0).argmax())
         assert [u.words for u in found.unnamed] == [f"follow the joints, joint {joint} above all"]
+
+
+def test_joints_that_scatter_do_not_repeat():
+    """Every joint anew at every pose, 40 µrad beside a steady flange: scatter, and as large as it was drawn."""
+    for seed in range(4):
+        off = 4e-5 * np.random.default_rng([SEED, seed]).standard_normal((40, 6))
+        session, *_ = labelled_cell(SEED + seed, views=40, scatter=(1e-5, 0.01), errors=(off, np.zeros((40, 6))))
+        found = diagnose(run(session))
+        assert found.verdict == "adequate", found.sentence
+        joints = joints_of(np.random.default_rng(SEED + seed), 40)
+        moved = np.array([flange(q + e)[:3, 3] - flange(q)[:3, 3] for q, e in zip(joints, off, strict=True)])
+        drawn = np.sqrt((moved**2).mean() + 0.01**2)
+        assert found.translation == pytest.approx(drawn, rel=0.35)
 
 
 def test_beside_a_law_scatter_is_what_the_arm_scatters():

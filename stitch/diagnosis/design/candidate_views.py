@@ -22,6 +22,7 @@ from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import Surfaces
 from stitch.observations.targets.target_model import Targets
+from stitch.statistics.variance_prior import NOISE
 
 _SAMPLES = 6000
 _TRIED = 250
@@ -70,7 +71,8 @@ def _of_targets(linear: LinearModel, seen: Targets, a: Score, b: Score) -> Candi
     joints = nearby(linear.measurement.views.joints)[:_TRIED]
     measurement = candidate_measurement(linear.measurement, joints)
     zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
-    rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, linear.null.variances, zero)
+    flange_and_noise = np.append(linear.flange_scatter(linear.null), linear.null.variances[NOISE])
+    rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, flange_and_noise, zero)
     extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
     design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
     of_a, of_b = (c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True))

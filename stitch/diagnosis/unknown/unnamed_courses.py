@@ -41,8 +41,14 @@ def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
 
 
 def clear_course(linear: LinearModel) -> FittedProcess | None:
-    """The likeliest of them, where it is 20 to 1 likelier than scatter alone though it is the best of all."""
-    return next((course for course in unnamed_courses(linear) if course.log_bayes_factor > ODDS), None)
+    """The likeliest of them, where it is 20 to 1 likelier than scatter alone though it is the best of all.
+
+    Scatter of the joints counts here, as what repeats least resembles it. It does not where names are asked for: an arm
+    that errs by many small laws at once seems to scatter by its joints, and of two tracked arms of one series one was
+    then not what it was named for on the other's poses.
+    """
+    courses = unnamed_courses(linear.joints_scatter)
+    return next((course for course in courses if course.log_bayes_factor > ODDS), None)
 
 
 def least_wanted(linear: LinearModel, scored: Score) -> float:

@@ -132,6 +132,7 @@ def surface_model(
         mixed=mixed,
         null=null,
         pose_errors=errors,
+        by_joints=np.zeros(2) if errors is None else errors.by_joints,
     )
 
 

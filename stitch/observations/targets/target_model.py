@@ -11,6 +11,8 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import Term, sizes_of, stacked, values_of
+from stitch.observations.arm_errors import offsets_of
+from stitch.observations.flange_errors import along_axes, flange_twists, usual_twist
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import PointSums, Prior, Response
 from stitch.observations.targets.effect_rows import effect_columns, effect_rows
@@ -107,7 +109,7 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
     mixed = mixed_model_of_rows(rows, A)
     if (seen != used).any():
         null = fit_variances(mixed, both_starts=True)
-    values = values_of(model.terms)
+    values, offsets = values_of(model.terms), offsets_of(measurement, model, rows.centre)
     return LinearModel(
         measurement,
         model,
@@ -117,4 +119,11 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
         values=np.append(np.zeros(base.shape[2]), values[seen]),
         mixed=mixed,
         null=null,
+        offsets=None if offsets is None else rows.by_twists(offsets),
+        by_joints=np.zeros(2) if offsets is None else _at_flange(measurement, rows.centre, offsets),
     )
+
+
+def _at_flange(measurement: Measurement, centre: Array, offsets: Array) -> Array:
+    """(2,) variances along an axis by which joints that scatter by plausible offsets turn and move the flange."""
+    return along_axes(offsets, flange_twists([measurement], [centre]), usual_twist(measurement.length_unit))
