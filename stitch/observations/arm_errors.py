@@ -15,8 +15,8 @@ from stitch.model.term import Term, term_of
 # What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
 # the flange turns.
 JOINT_SCATTER, ANEW = "joint scatter", 0.02
-# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
 _OFFSET = "joint_offset"
+# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
 _EVERY_ARM = ("joints", "torque")
 FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
 
