@@ -125,6 +125,4 @@ def test_scoring_ends_where_a_search_ends(shape):
         )
         assert found is not None or factor != 1.0
         if found is not None:
-            # Where a prior bends the slope the last step leaves more, a hundredth of a nat.
-            left = 2e-3 if shape is None else 2e-2
-            assert found[1].deviance == deviance(found[0], problem)[0] == pytest.approx(looked.fun, abs=left)
+            assert found[1].deviance == deviance(found[0], problem)[0] == pytest.approx(looked.fun, abs=2e-3)
