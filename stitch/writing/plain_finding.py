@@ -39,7 +39,8 @@ def _finding(found: Diagnosis, length_unit: str) -> str:
         case "unknown_effect":
             return f"Something is missing in the model that no effect of the library explains{_where(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
-    missing = "Missing in the model" if found.certain else "Perhaps missing in the model"
+    though = "" if found.likelier_than_not else ", though chance is likelier"
+    missing = "Missing in the model" if found.certain else f"Perhaps missing in the model{though}"
     if validation is None:
         return f"{missing}: {named}.{doubt}"
     return f"{missing}: {named}.{doubt} {_gain(found.residual_rms, validation, length_unit)}"

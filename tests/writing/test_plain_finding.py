@@ -54,6 +54,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
         candidates=(cause,),
         doubts=(),
         certain=True,
+        likelier_than_not=True,
         sentence="",
         linear=SimpleNamespace(measurement=SimpleNamespace(length_unit="mm")),
     )
@@ -78,7 +79,9 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     same = FieldError(0.017, 0.0, 9.0, over_noise=False)
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
-        found = SimpleNamespace(verdict="adequate", effects=(), smooth=smooth, doubts=(), certain=True)
+        found = SimpleNamespace(
+            verdict="adequate", effects=(), smooth=smooth, doubts=(), certain=True, likelier_than_not=True
+        )
         assert said in plain_finding(found, "mm")
 
 
@@ -97,7 +100,9 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
         verdict="missing_effect", effects=("settling",), candidates=(candidate,), doubts=(), over_nothing=np.log(odds)
     )
     found.certain = Diagnosis.certain.fget(found)
+    found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)
     told = plain_finding(found, "mm")
+    assert ("though chance is likelier" in told) == (odds < 1)
     assert said in told and told.startswith("Perhaps missing") == (odds < 20)
 
 
@@ -118,6 +123,7 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
         candidates=(SimpleNamespace(name="settling", cross_validation=left),),
         doubts=(),
         certain=True,
+        likelier_than_not=True,
         residual_rms=0.04,
     )
     told = plain_finding(found, "mm")
