@@ -64,7 +64,7 @@ def trials(cell: Cell, kind: str, size: float, draws: int, alone: bool) -> Itera
     """Errors of the hand-eye (6,) and their covariances, one a draw."""
     measurement, T = cell.measurement, cell.T_mount
     centre = cell.freed.overlaps.gram.centre
-    errors = None if alone else pose_errors([measurement], Model(T), [centre]).that_repeats()
+    errors = None if alone else pose_errors([measurement], Model(T), [centre])
     for draw in range(draws):
         rng = np.random.default_rng([cell.seed, draw, round(size * 1e6), len(kind)])
         freed = seen(cell, erring(cell, kind, size, rng), rng)

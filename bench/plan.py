@@ -117,7 +117,7 @@ def diagnosed(measured: Measured, predicted: Row) -> Row:
     selection = concluded(linear, candidates_of(linear)[0], scatter_limit(session))
     out: Row = {"verdict": selection.verdict, "said": [r.name for r in selection.named]}
     if not measured.hidden:
-        errors = pose_errors([measurement], model, [freed.overlaps.gram.centre]).that_repeats()
+        errors = pose_errors([measurement], model, [freed.overlaps.gram.centre])
         T_mount = fit_hand_eye([capture], [freed], measured.T_mount, errors=errors).T_mount
         xi = frames.log(frames.inverse(measured.T_mount) @ T_mount)
         out["chi_square"] = float(xi @ np.linalg.solve(np.array(predicted["covariance"]), xi))

@@ -70,7 +70,7 @@ def fitted(objects: Sequence[Object], T_mount: Array, shared: bool) -> HandEye:
         freed = [o.freed.seen_from(o.capture.poses(T_mount)) for o in objects]
         centres, errors = [f.overlaps.gram.centre for f in freed], None
         if shared and turn == _FITS - 1:
-            errors = pose_errors([o.measurement for o in objects], Model(T_mount), centres).that_repeats()
+            errors = pose_errors([o.measurement for o in objects], Model(T_mount), centres)
         found = fit_hand_eye(
             captures, freed, T_mount, repeating={SCANNER_FIELD: [o.field for o in objects]}, errors=errors
         )

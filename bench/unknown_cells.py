@@ -80,12 +80,6 @@ def with_overlaps_of(asked: Asked, world: World, linear: LinearModel) -> LinearM
     return replace(linear, observation=replace(linear.observation, freed=freed))
 
 
-def white(linear: LinearModel) -> LinearModel:
-    """As if poses scattered independently: what sizes are counted in."""
-    mixed = replace(linear.mixed, components=linear.mixed.components[:3], further=None)
-    return replace(linear, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None)
-
-
 def _with_freed(linear: LinearModel, freed: FreePoses) -> LinearModel:
     assert isinstance(linear.observation, Surfaces)
     channel = linear.observation.channel

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from blind_cells import drawn, smallest
 from blind_trials import LIBRARY
-from unknown_cells import Asked, World, true_column, white
+from unknown_cells import Asked, World, true_column
 
 from data_synth import nature
 from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
@@ -145,7 +145,7 @@ def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> natur
 
 def _least(a: Asked, world: World) -> float:
     """Factor on the errors of a world at which one test for them, of as many as there are effects, finds them."""
-    plain = white(a.linear)
+    plain = a.linear.scatter_only
     seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
     scatter = plain.satterthwaite.of(plain.in_blocks(seen))
     return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter)) / np.linalg.norm(seen))
@@ -174,7 +174,7 @@ def _several(a: Asked, count: int, rng: np.random.Generator, k: int) -> tuple[Wo
 
 def _at(a: Asked, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> tuple[World, tuple[str, ...]]:
     chance = int(rng.integers(1 << 30))
-    plain = white(a.linear)
+    plain = a.linear.scatter_only
     true = drawn(a.cell.scene, a.cell.plan, a.cell.measurement, laws, chance)
     sizes = {law: smallest(plain, law, true[law]) for law in laws}
     hidden = {law: multiple * size for law, size in sizes.items() if size is not None}

@@ -116,16 +116,6 @@ class ErrorModel:
         return replace(self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, whole=None)
 
     @cached_property
-    def joints_scatter(self) -> Self:
-        """As if joints erred anew in every view too, where that is not so already."""
-        if self.offsets is None:
-            return self
-        components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
-        further = FurtherPrior(np.array([ANEW]), np.array([THERE]), np.zeros(1, bool))
-        mixed = replace(self.mixed, components=components, further=further)
-        return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
-
-    @cached_property
     def arm_right(self) -> Self:
         """As if neither joints nor links erred again, from pose to pose."""
         return self if self.pose_errors is None else self._with(self.pose_errors.but_of_the_arm())
@@ -133,7 +123,14 @@ class ErrorModel:
     @cached_property
     def nothing_again(self) -> Self:
         """As if poses erred anew in every view, by their joints or as a whole."""
-        return self if self.pose_errors is None else self._with(self.pose_errors.but_anew())
+        if self.pose_errors is not None:
+            return self._with(self.pose_errors.but_anew())
+        if self.offsets is None:
+            return self
+        components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
+        further = FurtherPrior(np.array([ANEW]), np.array([THERE]), np.zeros(1, bool))
+        mixed = replace(self.mixed, components=components, further=further)
+        return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     @cached_property
     def flange_steady(self) -> Self:

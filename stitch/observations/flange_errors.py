@@ -37,9 +37,12 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
     return np.asarray(np.concatenate(own).reshape(-1, 6) * unit)
 
 
-def along_axes(offsets: Array, flange: Array, unit: Array) -> Array:
-    """(2,) mean squares along an axis of what columns (6V, n) of unit variance turn and move the flange by."""
-    own = unit[:, None] * np.linalg.solve(flange.reshape(-1, 6, 6), offsets.reshape(len(flange) // 6, 6, -1))
+def along_axes(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
+    """(2,) mean squares, rad² and length_unit², along an axis of the flange of what columns (6V, n) of twists of the
+    views, of unit variance each, turn and move it by."""
+    flange = flange_twists(measurements, centres).reshape(-1, 6, 6)
+    unit = usual_twist(measurements[0].length_unit)
+    own = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
     squares = (own**2).sum(axis=2).mean(axis=0)
     return np.asarray(squares.reshape(2, 3).mean(axis=1))
 

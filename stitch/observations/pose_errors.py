@@ -23,7 +23,7 @@ from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.observations.arm_errors import ANEW, FAMILY, JOINT_SCATTER, arm_effects, columns_of, families
-from stitch.observations.flange_errors import WANDERING, along_axes, flange_twists, near_in_time, usual_twist
+from stitch.observations.flange_errors import WANDERING, along_axes, flange_twists, near_in_time
 from stitch.observations.joint_processes import joint_processes
 from stitch.statistics.kernels import SmoothErrors, alike_in_joints, same_stop, spread_over
 from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
@@ -65,8 +65,12 @@ class PoseErrors:
     @property
     def prior(self) -> FurtherPrior:
         """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
-        scatters = np.array([name == JOINT_SCATTER for name in self.names], bool)
-        return FurtherPrior(self.scales, np.where(scatters, THERE, MAY_BE_ABSENT), self.of_arm)
+        return FurtherPrior(self.scales, np.where(self._anew, THERE, MAY_BE_ABSENT), self.of_arm)
+
+    @property
+    def _anew(self) -> Mask:
+        """(c,) what joints do anew in every view."""
+        return np.array([name == JOINT_SCATTER for name in self.names], bool)
 
     def reduced(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
@@ -98,11 +102,11 @@ class PoseErrors:
 
     def but_anew(self) -> "PoseErrors":
         """What scatters alone; nothing errs again."""
-        return replace(self._kept(np.array([name == JOINT_SCATTER for name in self.names], bool)), effects={})
+        return replace(self._kept(self._anew), effects={})
 
     def that_repeats(self) -> "PoseErrors":
-        """All but what joints do anew: on average the scatter of the flange that views show holds it already."""
-        return self._kept(np.array([name != JOINT_SCATTER for name in self.names], bool))
+        """All but what joints do anew."""
+        return self._kept(~self._anew)
 
     def but_in_time(self) -> "PoseErrors":
         """What joints and links do and what scans of a stop share; nothing wanders."""
@@ -134,7 +138,6 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         return white(sum(m.views.count for m in measurements))
     found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     of_one_joint, by_joints = dict[str, SmoothErrors](), np.zeros(2)
-    flange = flange_twists(measurements, centres)
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
@@ -149,8 +152,9 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         if constant[0].name == _CONSTANT[0]:
             offsets = links[:, : joints.shape[1]]
             found[JOINT_SCATTER] = (spread_over(offsets, np.eye(len(joints))), ANEW)
-            by_joints = along_axes(offsets, flange, usual_twist(measurements[0].length_unit))
+            by_joints = along_axes(offsets, measurements, centres)
             of_one_joint = joint_processes(measurements, joints, offsets, alike)
+    flange = flange_twists(measurements, centres)
     for name, memory in WANDERING.items():
         found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))

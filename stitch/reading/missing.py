@@ -1,7 +1,8 @@
 """Why a file is missing: the folder is a run, or a run that has lost some of its files."""
 
-import json
 from pathlib import Path
+
+from stitch.reading.json_object import json_object
 
 # What every run of one session holds.
 _DOCUMENTS = ("model.toml", "result.json", "ledger.json")
@@ -38,12 +39,5 @@ def _sessions(folder: Path) -> list[str]:
 
 def _session(file: Path) -> str | None:
     """Where the session of a result lies, empty where it does not say; None for a file that is no result."""
-    if not file.is_file():
-        return None
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(document, dict) or not str(document.get("format")).startswith(_RUN):
-        return None
-    return str(document.get("session") or "")
+    document = json_object(file)
+    return str(document.get("session") or "") if str(document.get("format")).startswith(_RUN) else None

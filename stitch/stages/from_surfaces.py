@@ -72,8 +72,7 @@ def fit(
         captures = [m.capture for m in measurements]
 
         def erring(freed: Sequence[FreePoses], T_mount: Array) -> PoseErrors:
-            centres = [f.overlaps.gram.centre for f in freed]
-            return pose_errors(measurements, Model(T_mount), centres).that_repeats()
+            return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
 
         first = correct(captures, begun[0].T_mount, begun[0].gate, recorder, repeating, erring)
         if begin_at is None:

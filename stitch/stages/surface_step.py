@@ -101,7 +101,7 @@ class Linearised:
     def with_errors(self, choice: Choice) -> Step:
         """The step again, with all that the arm may do wrong in its covariance."""
         centres = [f.overlaps.gram.centre for f in self.freed]
-        return self.step(choice, pose_errors(self.measurements, self.model, centres).that_repeats())
+        return self.step(choice, pose_errors(self.measurements, self.model, centres))
 
     def _repeating(self, choice: Choice) -> dict[str, list[Array]]:
         """Twists that all views have in common: a parameter at zero that is not zero errs alike in every view, as the

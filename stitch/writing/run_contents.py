@@ -1,10 +1,10 @@
 """What in a run folder is the run's, and may be replaced; everything else there is a person's own."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from stitch.errors import InputError
+from stitch.reading.json_object import json_object
 from stitch.system.whole_folder import Ours
 
 # Of result.json.
@@ -111,13 +111,6 @@ def _inner(path: Path) -> list[str]:
 
 
 def _session(file: Path) -> str | None:
-    if not file.is_file():
-        return None
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        return None
-    session = document.get("session")
+    document = json_object(file)
+    session = document.get("session") if document.get("format") == FORMAT else None
     return session if isinstance(session, str) and "\0" not in session else None

@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from stitch.cli.actions.compared_run import show_comparison
-from stitch.comparison.table import table_of
-from stitch.comparison.tables import Comparison, binned
-from stitch.comparison.view_scatter import view_statistics
+from tests.comparison.compared_views import compared
 
 STATE = SimpleNamespace(
     session=SimpleNamespace(length_unit="mm", mount="eye_in_hand"),
@@ -17,13 +15,7 @@ STATE = SimpleNamespace(
 
 def said(errors, properties, run, capsys):
     """What is printed of views that are off by `errors` (V,) in mm, as one line without the frames of tables."""
-    tables = []
-    for name, values in properties.items():
-        edges, bins = binned(values)
-        n = (bins == np.arange(len(edges) - 1)[:, None]) * 1000.0
-        statistics = view_statistics(n, n * errors, n * errors**2)
-        tables.append(table_of(name, "deg", (edges[:-1], edges[1:]), (), statistics))
-    show_comparison(Comparison(tuple(tables), 0.03, 0.03), STATE, run)
+    show_comparison(compared(errors, properties, 0.03), STATE, run)
     return " ".join(capsys.readouterr().err.split())
 
 

@@ -3,20 +3,8 @@
 import numpy as np
 import pytest
 
-from stitch.comparison.table import table_of
-from stitch.comparison.tables import Comparison, binned, changes, comparison_document
-from stitch.comparison.view_scatter import view_statistics
-
-
-def compared(errors, properties):
-    """A comparison of views that are off by `errors` (V,), each with 1000 rows, by properties name -> (V,)."""
-    tables = []
-    for name, values in properties.items():
-        edges, bins = binned(values)
-        n = (bins == np.arange(len(edges) - 1)[:, None]) * 1000.0
-        sums = view_statistics(n, n * errors, n * errors**2)
-        tables.append(table_of(name, "deg", (edges[:-1], edges[1:]), (), sums))
-    return Comparison(tuple(tables), 1.0, 1.0)
+from stitch.comparison.tables import binned, changes, comparison_document
+from tests.comparison.compared_views import compared
 
 
 def clean(seed, views):

@@ -127,9 +127,10 @@ def _show(result: Run, run: Path, as_json: bool) -> None:
         return
     show_ledger(result)
     if others := others_of_rig(run):
+        folder = shlex.quote(str(run.resolve().parent))
         effects = f" --effects {','.join(result.effects)}" if result.effects else ""
         console().print(
             f"Of its rig this run alone has changed: {', '.join(others)} and their common model.toml are as they were. "
-            f"For one model of all: stitch run, with all sessions{effects} and -o {shlex.quote(str(run.parent))}",
+            f"For one model of all: stitch run, with all sessions{effects} and -o {folder}",
             soft_wrap=True,
         )

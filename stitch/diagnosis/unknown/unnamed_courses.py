@@ -47,7 +47,7 @@ def clear_course(linear: LinearModel) -> FittedProcess | None:
     that errs by many small laws at once seems to scatter by its joints, and of two tracked arms of one series one was
     then not what it was named for on the other's poses.
     """
-    courses = unnamed_courses(linear.joints_scatter)
+    courses = unnamed_courses(linear.nothing_again)
     return next((course for course in courses if course.log_bayes_factor > ODDS), None)
 
 

@@ -67,10 +67,12 @@ def fit_hand_eye(
         columns: effects to fit with it.
         repeating: by source, per capture (6V, K) twists that the views show for one standard deviation of each of K
             errors that all views and captures have in common; they widen the covariance and change nothing else.
-        errors: how the poses may err beside white scatter; None: they do not.
+        errors: how the poses may err beside white scatter; None: they do not. What joints do anew is not counted: on
+            average the scatter of the flange that views show holds it already.
     """
     found = solved(captures, freed, T_mount, columns)
-    sources = _sources(found, errors or white(sum(len(f.poses) for f in freed)), repeating or {})
+    errors = errors or white(sum(len(f.poses) for f in freed))
+    sources = _sources(found, errors.that_repeats(), repeating or {})
     covariance = np.sum(list(sources.values()), axis=0)
     return HandEye(
         T_mount=T_mount @ frames.exp(found.x[:6]),

@@ -12,7 +12,7 @@ from stitch.model.forward import corrected
 from stitch.model.model import Model
 from stitch.model.term import Term, sizes_of, stacked, values_of
 from stitch.observations.arm_errors import offsets_of
-from stitch.observations.flange_errors import along_axes, flange_twists, usual_twist
+from stitch.observations.flange_errors import along_axes
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.response import PointSums, Prior, Response
 from stitch.observations.targets.effect_rows import effect_columns, effect_rows
@@ -120,10 +120,5 @@ def target_model(measurement: Measurement, model: Model, drawing: Drawing | None
         mixed=mixed,
         null=null,
         offsets=None if offsets is None else rows.by_twists(offsets),
-        by_joints=np.zeros(2) if offsets is None else _at_flange(measurement, rows.centre, offsets),
+        by_joints=np.zeros(2) if offsets is None else along_axes(offsets, [measurement], [rows.centre]),
     )
-
-
-def _at_flange(measurement: Measurement, centre: Array, offsets: Array) -> Array:
-    """(2,) variances along an axis by which joints that scatter by plausible offsets turn and move the flange."""
-    return along_axes(offsets, flange_twists([measurement], [centre]), usual_twist(measurement.length_unit))
