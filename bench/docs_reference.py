@@ -7,6 +7,7 @@ import typer
 from typer.cli import get_docs_for_click
 
 import stitch
+from stitch import MODULES
 from stitch.cli.actions.listed_effects import signature
 from stitch.cli.main import build
 from stitch.effects import EFFECTS
@@ -48,7 +49,7 @@ Made from the library: `stitch effects` lists the same. What the places mean and
 
 def python_page() -> str:
     """What `import stitch` offers."""
-    names = "\n\n".join(f"::: stitch.{stitch._HOMES[name]}.{name}" for name in stitch.__all__)
+    names = "\n\n".join(f"::: {module}.{name}" for name, module in MODULES.items())
     told = "Made from the docstrings of what `import stitch` offers; frames and units: [glossary](glossary.md)."
     return f"# Python\n\n{told}\n\n{names}\n"
 

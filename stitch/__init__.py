@@ -10,54 +10,49 @@ run = stitch.add(run, "joint_compliance")
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+# Type checkers do not read the table; `as` exports a name to them. A test compares the two.
 if TYPE_CHECKING:
-    from stitch.diagnosis.diagnosis import Diagnosis
-    from stitch.errors import InputError, NoResultError, StitchError
-    from stitch.measurement.session import Session
-    from stitch.model.model import Model
-    from stitch.model.model_toml import read_model
-    from stitch.pipeline import diagnose, run, run_rig
-    from stitch.reading.session_folder import load_session
-    from stitch.revision import add, drop
-    from stitch.runs.run import Run
+    from stitch.diagnosis.diagnosis import Diagnosis as Diagnosis
+    from stitch.errors import InputError as InputError
+    from stitch.errors import NoResultError as NoResultError
+    from stitch.errors import StitchError as StitchError
+    from stitch.measurement.session import Session as Session
+    from stitch.model.model import Model as Model
+    from stitch.model.model_toml import read_model as read_model
+    from stitch.pipeline import diagnose as diagnose
+    from stitch.pipeline import run as run
+    from stitch.pipeline import run_rig as run_rig
+    from stitch.reading.session_folder import load_session as load_session
+    from stitch.revision import add as add
+    from stitch.revision import drop as drop
+    from stitch.runs.run import Run as Run
 
-# Where each name lives. It is imported when it is asked for: whoever reads a session does not wait for the statistics.
-_HOMES = {
-    "Diagnosis": "diagnosis.diagnosis",
-    "InputError": "errors",
-    "Model": "model.model",
-    "NoResultError": "errors",
-    "Run": "runs.run",
-    "Session": "measurement.session",
-    "StitchError": "errors",
-    "add": "pipeline",
-    "diagnose": "pipeline",
-    "drop": "pipeline",
-    "load_session": "reading.session_folder",
-    "read_model": "model.model_toml",
-    "run": "pipeline",
-    "run_rig": "pipeline",
+# Public names and their modules. A module is imported on first use: reading a session does not wait for the statistics.
+MODULES = {
+    "Diagnosis": "stitch.diagnosis.diagnosis",
+    "InputError": "stitch.errors",
+    "Model": "stitch.model.model",
+    "NoResultError": "stitch.errors",
+    "Run": "stitch.runs.run",
+    "Session": "stitch.measurement.session",
+    "StitchError": "stitch.errors",
+    "add": "stitch.revision",
+    "diagnose": "stitch.pipeline",
+    "drop": "stitch.revision",
+    "load_session": "stitch.reading.session_folder",
+    "read_model": "stitch.model.model_toml",
+    "run": "stitch.pipeline",
+    "run_rig": "stitch.pipeline",
 }
 
-__all__ = [
-    "Diagnosis",
-    "InputError",
-    "Model",
-    "NoResultError",
-    "Run",
-    "Session",
-    "StitchError",
-    "add",
-    "diagnose",
-    "drop",
-    "load_session",
-    "read_model",
-    "run",
-    "run_rig",
-]
+__all__ = list(MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in MODULES:
         raise AttributeError(f"module 'stitch' has no attribute {name!r}")
-    return getattr(import_module(f"stitch.{_HOMES[name]}"), name)
+    return getattr(import_module(MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *MODULES})

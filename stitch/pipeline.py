@@ -140,7 +140,7 @@ def _of_each(
 
 
 def diagnose(run: Run | State) -> Diagnosis:
-    """Which effect is missing in the model of a run.
+    """Find which effect is missing in the model of a run.
 
     Raises:
         NoResultError: no two views overlap.

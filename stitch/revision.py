@@ -1,4 +1,4 @@
-"""What changes the model of a run: effects put in or taken out, and everything fitted anew."""
+"""Change the model of a run: put effects in or take them out, and fit everything again."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from stitch.system.threads import Clock, library_threads_off
 
 
 def add(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
-    """The run with further effects in its model, hand-eye and all effects fitted anew.
+    """Fit a run again with further effects in its model: hand-eye and all effects together.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.
@@ -26,13 +26,13 @@ def add(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Ru
 
 
 def drop(run: Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
-    """The run without some effects, the rest fitted anew."""
+    """Fit a run again without some of its effects."""
     state = state_of(run) if isinstance(run, Run) else run
     return change(state, [name for name in state.model.effects if name not in effects], recorder)
 
 
 def change(state: State, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
-    """The run with these effects in its model: hand-eye and all effects fitted together, matched anew.
+    """Fit a run again with these effects in its model: matches, hand-eye and all effects.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.

@@ -73,7 +73,7 @@ class StatedRepeatability:
 
 @dataclass(frozen=True)
 class Session:
-    """What was measured. Lengths in length_unit, angles in rad."""
+    """Measured data of one session. Lengths in length_unit, angles in rad."""
 
     path: Path
     name: str

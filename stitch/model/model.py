@@ -21,7 +21,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Model:
-    """Everything that is fitted of a cell. Lengths in the session's length_unit, angles in rad."""
+    """Fitted parameters of a cell: hand-eye, effects, targets. Lengths in the session's length_unit, angles in rad."""
 
     T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
     terms: tuple[Term, ...] = ()

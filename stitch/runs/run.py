@@ -77,7 +77,7 @@ class LedgerStep:
 
 @dataclass(frozen=True)
 class Run:
-    """Everything `result.json` and the report show of one session; lengths in length_unit, angles in rad."""
+    """Result of one session, as `result.json` and the report show it; lengths in length_unit, angles in rad."""
 
     session: Session
     measurement: Measurement  # as it counts: without outliers

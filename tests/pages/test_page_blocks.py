@@ -1,10 +1,13 @@
 """Blocks of the pages: of a kind that is known, run or left alone for a reason; every command line of `stitch` parses."""
 
+import ast
 import re
+from importlib import import_module
 
 import pytest
 import typer
 
+import stitch
 from bench.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
 from stitch.cli.main import build
 
@@ -54,3 +57,14 @@ def test_every_command_stands_on_the_page_of_commands():
 )
 def test_a_wrong_line_is_refused(line):
     assert refused(line)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_names_only_what_exists(page):
+    """Without running it, blocks that cannot be run included."""
+    for node in (node for b in blocks(page) if b.language == "python" for node in ast.walk(ast.parse(b.text))):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                assert hasattr(import_module(node.module), alias.name), f"{node.module} has no {alias.name}"
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "stitch":
+            assert node.attr in stitch.__all__

@@ -1,0 +1,77 @@
+"""What `import stitch` offers: every name resolves, the type checkers see the same, the package's example runs."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from contextlib import chdir
+from importlib import import_module, util
+from pathlib import Path
+
+import pytest
+
+import stitch
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.write import write_session
+
+# How the docstring of a function begins.
+VERBS = {"Compute", "Find", "Fit", "Read", "Return", "Stitch", "Write"}
+
+
+def imported_for_type_checkers():
+    """Names and modules of the `if TYPE_CHECKING:` block of the package, names exported by `as` alone."""
+    tree = ast.parse(Path(stitch.__file__).read_text(encoding="utf-8"))
+    block = next(n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
+    return {(alias.asname, node.module) for node in block.body for alias in node.names if alias.asname == alias.name}
+
+
+@pytest.mark.parametrize("name", stitch.__all__)
+def test_every_public_name_resolves_in_its_module(name):
+    module = import_module(stitch.MODULES[name])
+    assert getattr(stitch, name) is getattr(module, name)
+    # Where it is written, and not a module that happens to import it.
+    assert getattr(stitch, name).__module__ == module.__name__
+
+
+def test_one_table_gives_the_names_the_directory_and_the_types():
+    assert stitch.__all__ == sorted(stitch.MODULES)
+    assert set(stitch.__all__) <= set(dir(stitch))
+    assert imported_for_type_checkers() == set(stitch.MODULES.items())
+    assert all(util.find_spec(module) for module in stitch.MODULES.values())
+
+
+def test_another_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'stitch' has no attribute 'stich'"):
+        stitch.stich  # noqa: B018
+
+
+@pytest.mark.parametrize("name", stitch.__all__)
+def test_every_public_name_says_what_it_returns_or_is(name):
+    public = getattr(stitch, name)
+    first, *_ = inspect.getdoc(public).split(maxsplit=1)
+    if inspect.isclass(public):
+        # What dataclass writes where nobody does begins with the name and its arguments.
+        assert not public.__doc__.startswith(f"{name}(")
+        assert re.fullmatch(r"[A-Z]\w+,?", first) and first not in {"What", "How", "Everything", "Whether"}
+    else:
+        assert first in VERBS
+
+
+def test_the_package_alone_is_imported_at_once():
+    """The best of three: another process may be at work."""
+    code = "import time; began = time.perf_counter(); import stitch; print(time.perf_counter() - began)"
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True) for _ in range(3)]
+    assert min(float(run.stdout) for run in runs) <= 0.15
+
+
+def test_the_example_of_the_package_runs(tmp_path, few_effects, capsys):
+    code = stitch.__doc__.split("\n", 1)[1]
+    name = re.search(r'load_session\("([^"]+)"\)', code)[1]
+    write_session(tmp_path / name, measured_blade(0, views=6, pixels=50), name)
+    found = {}
+    with chdir(tmp_path):
+        exec(compile(code, "the docstring of stitch", "exec"), found)
+    assert capsys.readouterr().out.strip()
+    assert found["run"].effects == ["joint_compliance"]
+    assert stitch.drop(found["run"], "joint_compliance").effects == []
