@@ -1,6 +1,6 @@
 """What `stitch check --deep` and data snooping find in sessions with one mistake, and in sessions without any.
 
-Usage: python bench/integrity.py good|scattering|sizes|kinds|many|real FILE [--seeds 0 5] [--minutes 30] [--every 6]
+Usage: python bench/integrity.py good|scattering|kinds|many|real FILE [--seeds 0 5] [--minutes 30] [--every 6]
 
 `scattering` runs sessions in which every joint errs anew in every view. `many` runs sessions in which a third of the
 views and more are wrong. `real` puts mistakes into measured scans (folder in STITCH_SHARED_DATA), and runs them too.
@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from integrity_cells import MOUNTS, PARTS, good, kinds, scattering, sizes
+from integrity_cells import MOUNTS, PARTS, good, kinds, scattering
 from integrity_many import many
 from integrity_real import real
 
@@ -32,7 +32,7 @@ def append(file: Path, row: dict[str, Any]) -> None:
 def main() -> None:
     """Run one part of the bench."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("good", "scattering", "sizes", "kinds", "many", "real"))
+    parser.add_argument("what", choices=("good", "scattering", "kinds", "many", "real"))
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 1))
     parser.add_argument("--minutes", type=float, default=30)
@@ -57,7 +57,7 @@ def main() -> None:
         found = (
             kinds(part, mount, seed, cases, (number, given.every))
             if given.what == "kinds"
-            else {"good": good, "scattering": scattering, "sizes": sizes, "many": many}[given.what](part, mount, seed)
+            else {"good": good, "scattering": scattering, "many": many}[given.what](part, mount, seed)
         )
         for row in found:
             append(given.file, {"part": part, "mount": mount, "seed": seed} | row)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from integrity_faults import Fault, displaced, faults, in_base_frame
+from integrity_faults import Fault, faults, in_base_frame
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
@@ -15,7 +15,6 @@ from data_synth.simulate import Measured
 from stitch.errors import StitchError
 from stitch.integrity.arm_limits import judged_by_size
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.reliability import blunder_sizes, normal_blocks
 from stitch.integrity.snooping import Snooping, snoop
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.measurement.capture import Capture, capture
@@ -91,30 +90,6 @@ def _unfaulted(m: Measured, kind: str) -> Iterator[dict[str, Any]]:
         "suspected": [m.view for m in found.suspected],
         "groups": len(found.disconnected), "seconds": time.perf_counter() - start,
     }  # fmt: skip
-
-
-def sizes(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
-    """One view off by a multiple of its minimal detectable and identifiable blunder, in a random direction."""
-    m = measured(part, mount, seed)
-    session, rng = session_of(m), np.random.default_rng([seed, 7])
-    _, T_mount, clean = snooped(session, m.T_mount)
-    normal = normal_blocks(clean.model, clean.found)
-    v = int(rng.integers(VIEWS))
-    flange = rng.standard_normal(6) * [1, 1, 1, clean.model.lever, clean.model.lever, clean.model.lever]
-    # A right twist of the flange, as a left twist of the view about the centre: A·exp(ξ) or, inverted, exp(−ξ)·A⁻¹.
-    sign = -1.0 if mount == "eye_to_hand" else 1.0
-    detectable, identifiable = blunder_sizes(normal, v, (sign * clean.model.carried[v] @ flange)[None])
-    for times, unit, size in [(k, "detectable", detectable[0]) for k in (1, 2, 10)] + [
-        (2, "identifiable", identifiable[0])
-    ]:
-        if not np.isfinite(size):
-            yield {"case": f"{times} x {unit}", "skipped": "the others do not hold this direction"}
-            continue
-        _, _, found = snooped(displaced({v: times * size * flange})(session), T_mount)
-        named = (*found.left_out, *(m.view for m in found.suspected))
-        yield {"case": f"{times} x {unit}", "detected": bool(named), "named": named == (v,),
-               "left_out": found.left_out == (v,),
-               "size_mm": float(times * size * np.linalg.norm(flange[3:]))}  # fmt: skip
 
 
 def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, int]) -> Iterator[dict[str, Any]]:

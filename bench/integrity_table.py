@@ -1,4 +1,4 @@
-"""The rows of bench/integrity.py as tables: python bench/integrity_table.py good.jsonl sizes.jsonl …"""
+"""The rows of bench/integrity.py as tables: python bench/integrity_table.py good.jsonl kinds.jsonl …"""
 
 import json
 import sys
@@ -29,13 +29,6 @@ def good(rows: Sequence[Row]) -> None:
     for case, own in [*sorted(found.items()), ("all", every)]:
         counts = (sum(bool(r[what]) for r in own) for what in ("tested_out", "left_out", "suspected"))
         print(f"| {case.strip() or 'nothing hidden'} | {len(own)} | {' | '.join(map(str, counts))} |")
-
-
-def sizes(rows: Sequence[Row]) -> None:
-    """One view displaced by a multiple of what can be detected or identified."""
-    print("| one view off by | cells | a view stands out | the right one, and no other |\n|---|---|---|---|")
-    for case, own in cases([r for r in rows if "named" in r]).items():
-        print(f"| {case} | {len(own)} | {sum(r['detected'] for r in own)} | {sum(r['named'] for r in own)} |")
 
 
 def kinds(rows: Sequence[Row]) -> None:
@@ -76,7 +69,7 @@ def real(rows: Sequence[Row]) -> None:
 
 if __name__ == "__main__":
     for file in map(Path, sys.argv[1:]):
-        {"good": good, "sizes": sizes, "kinds": kinds, "many": many, "real": real}[file.stem](
+        {"good": good, "kinds": kinds, "many": many, "real": real}[file.stem](
             [json.loads(line) for line in file.read_text().splitlines()]
         )
         print()

@@ -1,12 +1,10 @@
-"""Robot-world and hand-eye calibration A·X = Z·B from poses: two closed-form solvers.
+"""Robot-world and hand-eye calibration A·X = Z·B from poses, in closed form.
 
 A (V, 4, 4) and B (V, 4, 4) are poses of the same views, X and Z unknown and constant. For a probe on
 the flange and a sensor in the cell: A = T_base_flange, X = T_flange_probe, Z = T_base_sensor,
 B = T_sensor_probe. For a camera on the flange and a board in the cell: A = T_base_flange,
 X = T_flange_camera, Z = T_base_board, B = T_camera_board inverted, T_board_camera.
 """
-
-from collections.abc import Callable
 
 import numpy as np
 
@@ -50,30 +48,8 @@ def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array
     return _with_translations(A, B, frames.nearest_rotation(sign * x), frames.nearest_rotation(sign * z), weights)
 
 
-def li(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
-    """X, Z with rotations and translations in one linear system (Li, Wang & Wu 2010).
-
-    Raises:
-        NoResultError: poses that cannot show both; names the axis they share.
-    """
-    require_poses(A)
-    eye, unit = np.eye(3), float(np.abs(np.concatenate([A[:, :3, 3], B[:, :3, 3]])).max()) or 1.0
-    rows, right = [], []
-    for a, b, root in zip(A, B, roots(A, weights), strict=True):
-        turn = np.hstack([np.kron(a[:3, :3], eye), -np.kron(eye, b[:3, :3].T), np.zeros((9, 6))])
-        move = np.hstack([np.zeros((3, 9)), np.kron(eye, b[None, :3, 3]) / unit, -a[:3, :3], eye])
-        rows.append(root * np.vstack([turn, move]))
-        right.append(root * np.concatenate([np.zeros(9), a[:3, 3] / unit]))
-    x = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
-    R_x, R_z = (frames.nearest_rotation(x[k : k + 9].reshape(3, 3)) for k in (0, 9))
-    return _with_translations(A, B, R_x, R_z, weights)
-
-
 def _with_translations(A: Array, B: Array, R_x: Array, R_z: Array, weights: Array | None) -> tuple[Array, Array]:
     """t_X, t_Z from R_A t_X − t_Z = R_Z t_B − t_A, weighted least squares."""
     left = np.concatenate([A[:, :3, :3], np.broadcast_to(-np.eye(3), (len(A), 3, 3))], axis=2)
     t = solve_translation(left, B[:, :3, 3] @ R_z.T - A[:, :3, 3], weights)
     return frames.make(R_x, t[:3]), frames.make(R_z, t[3:])
-
-
-SOLVERS: dict[str, Callable[..., tuple[Array, Array]]] = {"Shah": shah, "Li": li}

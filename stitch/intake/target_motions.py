@@ -18,16 +18,15 @@ _LINE = 0.05
 
 def target_motions(sightings: Sequence[Sighting]) -> RelativeScans:
     """Motions (Arun, Huang & Blostein 1987) between views with three common targets or more that span a plane."""
-    pairs, motions, tried = list[tuple[int, int]](), list[Array](), 0
+    pairs, motions = list[tuple[int, int]](), list[Array]()
     showing = [v for v, s in enumerate(sightings) if len(s.targets) >= _FEWEST]
     for place, v in enumerate(showing):
         for w in showing[place + 1 : place + 1 + _NEXT]:
-            tried += 1
             T = _motion(sightings[v], sightings[w])
             if T is not None:
                 pairs.append((v, w))
                 motions.append(T)
-    return RelativeScans(tuple(pairs), np.array(motions).reshape(-1, 4, 4), tried)
+    return RelativeScans(tuple(pairs), np.array(motions).reshape(-1, 4, 4))
 
 
 def _motion(first: Sighting, second: Sighting) -> Array | None:

@@ -41,7 +41,7 @@ def between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> I
         if len(pairs) < FEWEST:
             continue
         seen = np.array([frames.exp(-half[v]) @ frames.exp(steps[v]) @ frames.exp(half[w]) for v, w in pairs])
-        X = fit_motions(stated, RelativeScans(pairs, seen, len(pairs)), length).T_mount
+        X = fit_motions(stated, RelativeScans(pairs, seen), length).T_mount
         used = tuple(sorted(half))
         T = np.array(stated.T_reference_mount)
         for v in used:

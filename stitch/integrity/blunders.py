@@ -13,7 +13,7 @@ from stitch.frames import Array
 from stitch.integrity.left_alone import left_alone
 from stitch.integrity.step import Step
 from stitch.integrity.view_model import Projector, ViewModel, projector
-from stitch.integrity.view_test import Test, beside, test
+from stitch.integrity.view_test import beside, test
 from stitch.statistics.variance_components import VarianceFit
 
 # Chance that a session without blunders loses a view.
@@ -31,7 +31,6 @@ class Blunder:
     """One view whose pose contradicts the others."""
 
     view: int
-    test: Test
     p_value: float  # family-wise
 
 
@@ -61,10 +60,10 @@ def off_anyway(
     """Of views that no surface links where they should stand, those that the scatter of all others does not explain."""
     out = []
     for v in unlinked:
-        tested, p = left_alone(model, columns_of(model, [*alone, *(w for w in unlinked if w != v)], steps), v)
+        p = left_alone(model, columns_of(model, [*alone, *(w for w in unlinked if w != v)], steps), v)[1]
         p = min(1.0, model.count * p)
         if p < FAMILY_WISE:
-            out.append(Blunder(v, tested, p))
+            out.append(Blunder(v, p))
     return out
 
 
@@ -95,7 +94,7 @@ def _rosner(model: ViewModel, first: Array | None, alone: Sequence[int]) -> Foun
         chance = {v: min(tests[v].p_value, left_alone(model, columns, v)[1]) for v in likely}
         worst = min(likely, key=lambda v: chance[v])
         p = min(1.0, chance[worst] * len(rest))
-        freed.append(Blunder(worst, tests[worst], p))
+        freed.append(Blunder(worst, p))
         if p < FAMILY_WISE:
             significant = len(freed)
         columns = beside(columns, model.views[worst])

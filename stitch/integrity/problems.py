@@ -6,33 +6,14 @@ from typing import Any
 
 from stitch.integrity.view_names import listed
 
-KINDS = (
-    "exchanged",
-    "shifted",
-    "reversed",
-    "inverse",
-    "mount",
-    "euler",
-    "degrees",
-    "quaternion",
-    "unit",
-    "scale",
-    "mirrored",
-    "joint_row",
-    "duplicate_scan",
-    "duplicate_pose",
-    "displaced",
-    "foreign",
-    "reclamped",
-    "disconnected",
-)
-
 
 @dataclass(frozen=True)
 class Problem:
     """What is wrong, where, and how to put it right; `views` is empty where it concerns the whole session."""
 
-    kind: str  # one of KINDS
+    # exchanged | shifted | reversed | inverse | mount | euler | degrees | quaternion | unit | scale | mirrored |
+    # joint_row | duplicate_scan | duplicate_pose | displaced | foreign | reclamped | disconnected
+    kind: str
     views: tuple[str, ...]
     fix: str  # one line
     certain: bool = True  # False: a hint that the numbers do not prove

@@ -30,7 +30,6 @@ class RelativeScans:
 
     pairs: tuple[tuple[int, int], ...]
     T: Array  # (M, 4, 4) that maps view w's scanner frame into view v's
-    tried: int
 
 
 def relative_scans(capture: Capture) -> RelativeScans:
@@ -44,7 +43,7 @@ def relative_scans(capture: Capture) -> RelativeScans:
     found = list(parallel(lambda pair: _between(capture, *pair, starts, size), tried, "pairs of scans"))
     good = [i for i, best in enumerate(found) if best.closure > _CLOSES and best.near > _SHARED]
     motions = np.array([found[i].T for i in good]).reshape(-1, 4, 4)
-    return RelativeScans(tuple(tried[i] for i in good), motions, len(pairs))
+    return RelativeScans(tuple(tried[i] for i in good), motions)
 
 
 def _between(capture: Capture, v: int, w: int, turns: Array, size: float) -> Placement:

@@ -97,7 +97,7 @@ def _motions(capture: Capture) -> RelativeScans:
         if spread[1] > _LINE * spread[0]:
             pairs.append((v, w))
             T.append(best_fit(b, a))
-    return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4), len(pairs))
+    return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4))
 
 
 def _fit(capture: Capture, hypothesis: Hypothesis) -> TargetFit | None:

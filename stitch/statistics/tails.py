@@ -21,11 +21,6 @@ def normal_tail(x: float) -> float:
     return float(special.ndtr(-x))
 
 
-def normal_limit(p: float) -> float:
-    """The normal number that a share p exceeds."""
-    return float(-special.ndtri(p))
-
-
 def binomial_tail(x: int, count: int, share: float) -> float:
     """P(X > x) of so many trials with a chance each."""
     return float(special.bdtrc(x, count, share))
@@ -45,8 +40,3 @@ def f_limit(p: float, numerator: float, denominator: float) -> float:
 def noncentral_f_tail(x: float, numerator: float, denominator: float, shift: float) -> float:
     """P(F > x) of the noncentral F distribution with noncentrality `shift`."""
     return float(1 - special.ncfdtr(numerator, denominator, shift, x))
-
-
-def noncentral_chi2_tail(x: float, degrees: float, shift: float) -> float:
-    """P(χ² > x) of the noncentral χ² distribution with noncentrality `shift`."""
-    return float(1 - special.chndtr(x, degrees, shift))

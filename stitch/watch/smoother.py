@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.watch.follow import Sessions, State, one_more
-from stitch.watch.state_bank import LEVEL, Bank, freed, predicted, transition
+from stitch.watch.state_bank import Bank, freed, predicted, transition
 
 # Directions of a predicted covariance below this share of its largest are not known to move.
 _SINGULAR = 1e-13
@@ -23,7 +23,6 @@ class Smoothed:
 
     values: Array  # (n, P) at the conditions of each session
     own_sigmas: Array  # (n, P) without what all sessions have in common
-    levels: Array  # (n, P) at the conditions of the first session
 
 
 def smoothed(state: State, sessions: Sessions, moved: Mapping[int, Sequence[int]], last: State) -> Smoothed:
@@ -68,7 +67,6 @@ def _backwards(
     return Smoothed(
         values=last.origin + last.unit * np.einsum("npi,ni->np", means, x),
         own_sigmas=last.unit * np.sqrt(np.maximum(variance, 0.0)),
-        levels=last.origin + last.unit * means[:, :, LEVEL],
     )
 
 

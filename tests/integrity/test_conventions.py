@@ -23,7 +23,7 @@ def motions(session, T_mount, seed=0):
     pairs = [(v, v + step) for step in (1, 2) for v in range(len(T) - step)]
     noise = rng.normal(size=(len(pairs), 6)) * 3e-4
     B = np.array([frames.inverse(poses[v]) @ poses[w] for v, w in pairs]) @ frames.exp(noise * [1, 1, 1, 300, 300, 300])
-    return RelativeScans(tuple(pairs), B, len(pairs))
+    return RelativeScans(tuple(pairs), B)
 
 
 def cell_of(mount):
@@ -81,7 +81,7 @@ def slid(some, share, seed=5):
     T = some.T.copy()
     wrong = rng.permutation(len(T))[: round(share * len(T))]
     T[wrong] = T[wrong] @ frames.exp(rng.normal(size=(len(wrong), 6)) * [0.3, 0.3, 0.3, 30, 30, 30])
-    return RelativeScans(some.pairs, T, len(T))
+    return RelativeScans(some.pairs, T)
 
 
 @pytest.mark.parametrize("mistake", ["KUKA angles as xyz", "w first", "shifted by one", "reversed"])
@@ -103,7 +103,7 @@ def test_right_poses_have_no_likelier_ones(cell, share):
 def test_few_motions_say_nothing(cell):
     session, T_mount = cell
     some = motions(session, T_mount)
-    assert explained(session, RelativeScans(some.pairs[:3], some.T[:3], 3)) == []
+    assert explained(session, RelativeScans(some.pairs[:3], some.T[:3])) == []
 
 
 def test_undoing_every_order_of_euler_angles_is_among_the_hypotheses():

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from stitch.integrity.blunders import find_blunders
-from stitch.integrity.reliability import blunder_sizes, noncentrality, normal_blocks, reliability
 from stitch.integrity.view_model import ViewModel, projector
 from stitch.integrity.view_test import test
 from stitch.statistics.variance_components import at_variances
@@ -42,42 +41,6 @@ def test_statistic_is_the_drop_of_least_squares():
     both = np.column_stack([model.hand_eye, model.views[3]])
     free = whitened - both @ np.linalg.lstsq(both, whitened, rcond=None)[0]
     assert test(under, model.views[3]).statistic == pytest.approx(null @ null - free @ free, rel=1e-4)
-
-
-def test_redundancy_of_directly_observed_poses_is_one_less_their_share_of_the_mean():
-    model = direct()
-    found = find_blunders(model)
-    fit, under = known(model)
-    for view in reliability(model, replace(found, fit=fit, under=under, further=None)):
-        assert np.allclose(view.redundancy, 1 - 1 / VIEWS, atol=1e-4)
-        assert view.weak == ()
-
-
-def test_noncentrality_is_baardas():
-    """λ₀ = 17.07 for one degree of freedom, α = 0.1 % and a power of 80 % (Baarda 1968)."""
-    assert noncentrality(1, 10) == pytest.approx(17.07, abs=0.01)
-
-
-def test_blunder_of_the_detectable_size_is_found_and_named_as_often_as_stated():
-    model = direct()
-    _fit, under = known(model)
-    normal = normal_blocks(model, replace(find_blunders(model), under=under))
-    rng, found, named, trials = np.random.default_rng(1), 0, 0, 300
-    limit = stats.chi2.isf(0.01 / VIEWS, 6)
-    for _ in range(trials):
-        v, direction = int(rng.integers(VIEWS)), rng.standard_normal(6)
-        detectable, identifiable = (size[0] for size in blunder_sizes(normal, v, direction[None]))
-        for size in (detectable, 2 * identifiable):
-            z = SIGMA * rng.standard_normal(6 * VIEWS) + model.views[v] @ (size * direction)
-            own = replace(under, pushed=under.P @ z)
-            values = [test(own, columns).statistic for columns in model.views]
-            if size == detectable:
-                found += values[v] > limit
-            else:
-                named += int(np.argmax(values)) == v
-    # Binomial: 80 % ± 3 sigma of 300 trials; at twice the identifiable size at least the promised 95 %.
-    assert abs(found / trials - 0.8) < 3 * np.sqrt(0.16 / trials)
-    assert named / trials >= 0.95
 
 
 @pytest.mark.slow
