@@ -61,7 +61,7 @@ ifdef UV
 else
 	$(PIP) install --require-hashes -r constraints.txt -r constraints-docs.txt
 endif
-	$(PYTHON) -m bench.docs_site
+	$(PYTHON) -m bench.docs.site_pages
 	$(VENV)/bin/zensical build --clean --strict --config-file mkdocs.yml
 
 # Pins every package with hashes, with its extras: pip takes the newest of a package whose extra alone is asked for, and

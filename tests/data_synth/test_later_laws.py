@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.later_laws import LATER, LATER_OF_FLANGE
+from data_synth.later_laws import LATER
 from data_synth.moment import Plan
 from tests.data_synth.law_plans import SEEDS, SHIFT, SIZE, VIEWS, plan_of
-
-NEVER_MIND_USEFUL = (*LATER_OF_FLANGE, "creeping_belt")  # a load says which joint errs, where no useful one bears any
 
 
 def drawn(law: str, plan: Plan, seed: int, **time: np.ndarray) -> np.ndarray:

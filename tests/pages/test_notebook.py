@@ -3,8 +3,8 @@
 import pytest
 from matplotlib.figure import Figure
 
-from bench.docs_notebook import NOTEBOOK, cells, notebook_page, printed_in, run_cells
-from bench.page_examples import differences
+from bench.docs.notebook_page import NOTEBOOK, cells, notebook_page, printed_in, run_cells
+from bench.docs.page_examples import differences
 
 CODE = [cell for cell in cells(NOTEBOOK) if cell["cell_type"] == "code"]
 
@@ -13,7 +13,7 @@ CODE = [cell for cell in cells(NOTEBOOK) if cell["cell_type"] == "code"]
 def test_the_notebook_prints_what_it_shows():
     done = run_cells(NOTEBOOK)
     for (text, _), cell in zip(done, CODE, strict=True):
-        assert not differences(text, printed_in(cell)), "to fix: python -m bench.docs_notebook"
+        assert not differences(text, printed_in(cell)), "to fix: python -m bench.docs.notebook_page"
     assert any(isinstance(value, Figure) for _, value in done)
 
 

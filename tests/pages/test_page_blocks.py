@@ -8,7 +8,7 @@ import pytest
 import typer
 
 import stitch
-from bench.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
+from bench.docs.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
 from stitch.cli.main import build
 
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))

@@ -5,9 +5,9 @@ from contextlib import chdir
 
 import pytest
 
-from bench.compensated_cell import PROGRAM, moved_line, tool_errors
-from bench.page_blocks import PAGES, blocks, examples
-from bench.page_examples import differences, printed
+from bench.docs.compensated_cell import PROGRAM, moved_line, tool_errors
+from bench.docs.page_blocks import PAGES, blocks, examples
+from bench.docs.page_examples import differences, printed
 from stitch.effects import EFFECTS
 
 # A second or two each; the others simulate, run and diagnose.
@@ -30,7 +30,7 @@ def same_library():
 )
 def test_a_page_prints_what_it_shows(page, tmp_path):
     for anew, shown in zip(printed(page, tmp_path), examples(page), strict=True):
-        assert not differences(anew, shown), f"to fix: python -m bench.page_examples docs/{page.name}"
+        assert not differences(anew, shown), f"to fix: python -m bench.docs.page_examples docs/{page.name}"
     own = {}
     with chdir(tmp_path):
         for block in blocks(page):

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from bench.page_blocks import ROOT, blocks
+from bench.docs.page_blocks import ROOT, blocks
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
 from stitch.pipeline import diagnose, run
 from stitch.reading.session_folder import load_session

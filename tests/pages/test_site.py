@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from bench.docs_site import ROOT, pages
+from bench.docs.site_pages import ROOT, pages
 
 
 @pytest.fixture(scope="module")

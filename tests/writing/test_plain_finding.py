@@ -7,7 +7,7 @@ import pytest
 
 import stitch.stepwise as stepwise
 import stitch.writing.plain_finding as plain
-from bench.page_blocks import refused
+from bench.docs.page_blocks import refused
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS

@@ -1,4 +1,6 @@
-"""Pictures of `stitch review`, click by click, and what it needs: python -m bench.review_pictures [--session FOLDER].
+"""Pictures of `stitch review`, click by click, and what it needs.
+
+Run: python -m bench.docs.review_pictures [--session FOLDER]
 
 Writes docs/pictures/review-*.png: the demo's cell with joint compliance hidden (seed 3), from opening to the error that
 fell, a note, an effect of one's own, undo; in dark and on a phone; a session of labelled points. Prints start-up time,
@@ -15,10 +17,10 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, expect, sync_playwright
 
-from bench.page_folders import tracked_arm
-from bench.report_pictures import call
-from bench.review_clicks import LONG, Camera, after, story
-from bench.review_server import choices, memory, served
+from bench.docs.page_folders import tracked_arm
+from bench.docs.report_pictures import call
+from bench.docs.review_clicks import LONG, Camera, after, story
+from bench.docs.review_server import choices, memory, served
 from stitch.cli.terminal.printing import printing_browser
 
 DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")

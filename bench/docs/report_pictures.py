@@ -1,4 +1,4 @@
-"""Pictures of pages and recording of the demo's cell, as people see them: python -m bench.report_pictures.
+"""Pictures of pages and recording of the demo's cell, as people see them: python -m bench.docs.report_pictures.
 
 Writes docs/pictures/report-*.png (light, dark, phone, paper), two-runs.png (the run before and after an effect was
 added) and recording-*.png (tabs, five moments of `model`).
@@ -19,11 +19,10 @@ from pathlib import Path
 import rerun.experimental as viewer
 from PIL import Image
 
-from bench.few_colours import few_colours
 from stitch.cli.main import main as stitch
 from stitch.cli.terminal.printing import print_page, printing_browser
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 _DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 _PAGES = {
     "report-light": (1100, 1500),
@@ -140,6 +139,14 @@ def _loaded() -> viewer.ViewerClient:
             time.sleep(4)
             return client
     raise RuntimeError("the viewer did not open the recording")
+
+
+def few_colours(picture: Image.Image) -> Image.Image:
+    """Return a screenshot in 256 colours, a third of the bytes, with grounds even and colour bars whole.
+
+    The median cut would give rare colours to the large areas.
+    """
+    return picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
 
 
 def keep(picture: Image.Image, name: str) -> None:

@@ -1,6 +1,6 @@
 """Figures and pages of the cells, from the jobs in examples/: writes docs/pictures/*.png and cell-*.webp.
 
-Run: python -m bench.cell_pictures. The pages need a Chromium on the path.
+Run: python -m bench.docs.cell_pictures. The pages need a Chromium on the path.
 """
 
 import tempfile
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from bench.report_pictures import call, shot
+from bench.docs.report_pictures import call, shot
 from stitch.cells.base_to_base.stand_file import read_stand
 from stitch.cells.base_to_base.stand_solution import solve
 from stitch.cells.drilling.drill_job import read_job as read_drilling
@@ -19,7 +19,7 @@ from stitch.cells.window.window_jobs import read_seam_job
 from stitch.cells.window.window_solution import solve_seam
 from viz.cells import base_to_base_figures, drilling_figures, panel_figures, window_seam
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures"
 
 

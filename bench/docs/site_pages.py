@@ -1,4 +1,4 @@
-"""Put the site's pages into build/docs, from which `make docs` builds it: python -m bench.docs_site.
+"""Put the site's pages into build/docs, from which `make docs` builds it: python -m bench.docs.site_pages.
 
 README.md is the first page, CHANGELOG.md another; the reference and the notebook's page are made from the code; and
 every source file that a page links to gets a page of its own, so that no link of the site leads out of it.
@@ -9,10 +9,10 @@ import re
 import shutil
 from pathlib import Path
 
-from bench.docs_notebook import notebook_page
-from bench.docs_reference import commands_page, effects_page, python_page
+from bench.docs.notebook_page import notebook_page
+from bench.docs.reference_pages import commands_page, effects_page, python_page
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "build" / "docs"
 # Pages whose place in the project is another one than in the site.
 MOVED = {"README.md": "index.md", "CHANGELOG.md": "changes.md", "docs/error-falls.ipynb": "error-falls.ipynb.md"}

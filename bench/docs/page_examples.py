@@ -1,6 +1,8 @@
-"""Run the commands that the pages show, and write what they print: python -m bench.page_examples [PAGE …] [--check].
+"""Run the commands that the pages show, and write what they print.
 
-Tests run them too and compare. What a page needs before its first command is made by `bench/page_folders.py`.
+Run: python -m bench.docs.page_examples [PAGE …] [--check]
+
+Tests run them too and compare. What a page needs before its first command is made by `bench/docs/page_folders.py`.
 """
 
 import argparse
@@ -17,8 +19,8 @@ from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from itertools import zip_longest
 from pathlib import Path
 
-from bench.page_blocks import PAGES, ROOT, commands, examples
-from bench.page_folders import AFTER, PREPARE
+from bench.docs.page_blocks import PAGES, ROOT, commands, examples
+from bench.docs.page_folders import AFTER, PREPARE
 from stitch.cli.main import main as stitch
 from stitch.effects.contract import EFFECTS
 

@@ -1,4 +1,4 @@
-"""Draw the rooms of stitch from its import graph: python bench/architecture.py → docs/pictures/architecture.png.
+"""Draw the rooms of stitch from its import graph: python bench/docs/architecture.py → docs/pictures/architecture.png.
 
 Floors come from the import rules in pyproject.toml, arrows from the imports themselves (lazy and type-checking
 ones included), so that the picture cannot say what the code does not.
@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PICTURE = ROOT / "docs" / "pictures" / "architecture.png"
 WIDTH, HEIGHT, GAP = 4.6, 0.95, 0.42
 EDGE, FACE, ARROW = "#34495e", "#eef3f8", "#5d6d7e"

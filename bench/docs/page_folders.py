@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.compensated_cell import moved_line, truth, write_cell
-from bench.page_blocks import ROOT, blocks
+from bench.docs.compensated_cell import moved_line, truth, write_cell
+from bench.docs.page_blocks import ROOT, blocks
 from data_synth.commands import synth
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled

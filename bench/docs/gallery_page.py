@@ -86,7 +86,7 @@ def page(told: dict[Case, Entry], others: list[str]) -> str:
     """
     synthetic = [told[case].section for case in told if case.hidden is not None]
     measured = [told[case].section for case in told if case.hidden is None]
-    missing = f"Not on this page: {', '.join(others)}; `python -m bench.gallery` adds them.\n" if others else ""
+    missing = f"Not on this page: {', '.join(others)}; `python -m bench.docs.gallery` adds them.\n" if others else ""
     table = "\n".join([*_TABLE, *(told[case].row for case in told), ""])
     parts = [_HEAD, missing, table, "## Scenes of the simulator\n", _SCENES, *synthetic]
     if measured:
@@ -125,11 +125,11 @@ _SECTION = r"^### (\S+)$.*?(?=^##|\Z)"
 _HEAD = """# Gallery
 
 Scenes of the simulator and measured objects, run and diagnosed by the command line. Made by
-`python -m bench.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in the
-stitched cloud, light where the views agree, dark red where they do not, grey where one view alone saw it, each with a
-scale of its own ([how to read them](report.md)).
+`python -m bench.docs.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in
+the stitched cloud, light where the views agree, dark red where they do not, grey where one view alone saw it, each with
+a scale of its own ([how to read them](report.md)).
 
-Recordings are not kept in the project; `python -m bench.gallery --keep FOLDER` makes them, then
+Recordings are not kept in the project; `python -m bench.docs.gallery --keep FOLDER` makes them, then
 `stitch view FOLDER/blade/run` shows one.
 """
 

@@ -1,6 +1,6 @@
 """The notebook of the docs: run as plain Python, written with what its cells print and draw, shown as a page.
 
-Run: python -m bench.docs_notebook (writes the outputs into docs/error-falls.ipynb, and its picture for README.md)
+Run: python -m bench.docs.notebook_page (writes the outputs into docs/error-falls.ipynb, and its picture for README.md)
 """
 
 import ast
@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOK, PICTURE = ROOT / "docs" / "error-falls.ipynb", ROOT / "docs" / "pictures" / "error-falls.png"
 _DPI, _COLOURS = 110, 256
 

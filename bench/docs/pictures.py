@@ -1,6 +1,6 @@
 """A picture of every scene: the part with the scanner where the views are taken. Writes docs/pictures/*.png.
 
-Run: python bench/pictures.py [SCENE …]
+Run: python bench/docs/pictures.py [SCENE …]
 """
 
 import sys
@@ -16,7 +16,7 @@ from data_synth.scene import load_scene, names
 from data_synth.simulate import part_mesh
 from stitch import frames
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 # Azimuth and elevation of the camera in degrees: where scanners hide least of the part.
 CAMERAS = {
     "blade": (75.0, 30.0), "blade-table": (-175.0, 18.0), "car-door": (-118.0, 16.0), "drill-plate": (-50.0, 18.0),

@@ -1,6 +1,6 @@
 """Every scene of the simulator and every measured object as a stranger meets them: docs/gallery.md and its pictures.
 
-Run: python -m bench.gallery [CASE …] [--keep FOLDER]
+Run: python -m bench.docs.gallery [CASE …] [--keep FOLDER]
 
 Each case is made, run and diagnosed by the command line. With --keep, runs and recordings stay in FOLDER, and cases
 that are there already are not made again. Of a case that is not made, the page keeps what it says. Measured objects
@@ -17,9 +17,9 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-from bench.gallery_page import Case, Made, entries, entry, page, picture_of
+from bench.docs.gallery_page import Case, Made, entries, entry, page, picture_of
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 MEASURED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data") / "reghec"
 _VIEWS, _SEED = 12, 3

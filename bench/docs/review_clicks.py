@@ -7,9 +7,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
-from bench.few_colours import few_colours
+from bench.docs.report_pictures import few_colours
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 LONG = 900_000  # ms that a command may take
 OWN = '''from stitch.effects import effect, number
 
