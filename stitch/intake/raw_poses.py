@@ -15,7 +15,7 @@ from stitch.intake.clock_times import ClockTimes, clock_of
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
 from stitch.reading.text_file import read_text, require_file, shortened
-from stitch.reading.yaml_subset import parse_yaml
+from stitch.reading.yaml_file import parse_yaml
 
 STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses")

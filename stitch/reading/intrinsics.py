@@ -17,7 +17,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.text_file import read_text, shortened
-from stitch.reading.yaml_subset import parse_yaml
+from stitch.reading.yaml_file import parse_yaml
 
 _NAMED = re.compile(r"intrinsic|camera_?info|calib|camera|^k$", re.IGNORECASE)
 _ENDINGS = (".json", ".yaml", ".yml", ".txt")
