@@ -7,11 +7,11 @@ import io
 import struct
 from pathlib import Path
 
+import lzf
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading import lzf
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 
@@ -98,12 +98,12 @@ def _compressed(
     path: Path, body: bytes, header: dict[str, list[str]], layout: np.dtype[np.void], count: int
 ) -> dict[str, Array]:
     """LZF-compressed, and stored field by field."""
-    if len(body) < 8:
+    packed, size = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
+    if size != layout.itemsize * count or len(body) < 8 + packed:
         raise InputError(f"{path}: compressed data are cut short; export it again")
-    packed, size = struct.unpack("<II", body[:8])
-    data = lzf.decompress(body[8 : 8 + packed], size) if len(body) >= 8 + packed else None
-    if data is None or size != layout.itemsize * count:
-        raise InputError(f"{path}: compressed data are cut short; export it again")
+    data = lzf.decompress(body[8 : 8 + packed], size) if size else b""
+    if data is None or len(data) != size:
+        raise InputError(f"{path}: compressed data do not give its {count} points; export it again")
     sizes = [layout[name].itemsize for name in layout.names or ()]
     first = np.concatenate([[0], np.cumsum(sizes)]) * count
     return {name: np.frombuffer(data, layout[i], count, int(first[i])) for name, i in _wanted(header).items()}

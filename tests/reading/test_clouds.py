@@ -8,7 +8,6 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
-from stitch.reading import lzf
 from stitch.reading.clouds import read_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
@@ -121,11 +120,27 @@ def test_broken_files_say_so(tmp_path, name, content, message):
         read_cloud(tmp_path / name)
 
 
-def test_lzf_refuses_nonsense():
-    assert lzf.decompress(b"\xff\xff\xff\xff", 10) is None
-    assert lzf.decompress(b"\x02abc", 3) == b"abc"
-    # Three literals, then 6 bytes from 3 back: a pattern that reads what it writes.
-    assert lzf.decompress(b"\x02abc\x80\x02", 9) == b"abcabcabc"
+@pytest.mark.parametrize(
+    ("count", "packed", "size", "told"),
+    [
+        (1, b"\x0b" + bytes(12), 12, "nothing was measured"),
+        # Four bytes, then eight more from four back: a pattern that reads what it writes.
+        (1, b"\x03\0\0\x80\x3f\xc0\x03", 12, None),
+        (1, b"\xff\xff\xff\xff", 12, "do not give its 1 points"),
+        (1, b"\x20\x00abc", 12, "error in compressed data"),
+        (1, b"\x02abc", 12, "do not give its 1 points"),
+        (9, b"\x02abc", 12, "cut short"),
+        (0, b"", 0, "no points"),
+    ],
+)
+def test_compressed_pcd_of_few_bytes(tmp_path, count, packed, size, told):
+    header = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS {count}\nDATA binary_compressed\n"
+    (tmp_path / "c.pcd").write_bytes(header.encode() + struct.pack("<II", len(packed), size) + packed)
+    if told is None:
+        assert read_cloud(tmp_path / "c.pcd").points.tolist() == [[1, 1, 1]]
+        return
+    with pytest.raises(InputError, match=told):
+        read_cloud(tmp_path / "c.pcd")
 
 
 @pytest.mark.parametrize("name", ["s.ply", "s.pcd", "s.xyz", "s.stl", "s.e57", "s.png"])
