@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from natsort import natsorted, ns
+
 from stitch.errors import InputError
 from stitch.intake.cloud_files import clouds_among
 from stitch.intake.layouts import layouts
 from stitch.intake.program_poses import PROGRAMS, is_program, read_by_its_program
-from stitch.intake.raw_poses import STRUCTURED, TABLES, natural, read_raw_poses
+from stitch.intake.raw_poses import STRUCTURED, TABLES, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.reading.poses_in_scans import poses_in_scans
 from stitch.reading.rights import readable
@@ -94,7 +96,7 @@ def _no_clouds(folder: Path, files: Sequence[Path]) -> str:
 def _files(folder: Path, depth: int) -> list[Path]:
     """Files in a folder and below, hidden ones and folders of runs left out."""
     out = []
-    for entry in natural(folder.iterdir()):
+    for entry in natsorted(folder.iterdir(), alg=ns.IGNORECASE):
         if entry.name.startswith(".") or entry.name in _OWN:
             continue
         if entry.is_file():
@@ -111,10 +113,10 @@ def _may_hold_poses(file: Path) -> bool:
 
 def _named(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
     if poses.is_dir():
-        inside = [f for f in natural(poses.iterdir()) if f.is_file() and f not in clouds and _may_hold_poses(f)]
+        inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
         if not inside:
             raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
-        return inside, []
+        return natsorted(inside, alg=ns.IGNORECASE), []
     return [poses], []
 
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -150,12 +150,3 @@ def _from_rows(file: Path, rows: Sequence[tuple[tuple[str, ...], dict[str, float
         raise InputError(f"{file}: a number is not finite; to fix: leave that pose out")
     header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
     return RawPoses(str(file), header, numbers, tuple(labels for labels, _ in rows), kind)
-
-
-def natural(names: Iterable[Path]) -> list[Path]:
-    """Paths with numbers in order of size: view2 before view10."""
-    return sorted(names, key=lambda p: [(0, int(s), "") if s.isdigit() else (1, 0, s) for s in _parts(p)])
-
-
-def _parts(path: Path) -> list[str]:
-    return [s for s in re.split(r"(\d+)", str(path).lower()) if s]

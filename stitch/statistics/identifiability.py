@@ -1,12 +1,13 @@
 """Which parameters the views can know: absolute first, then beside the hand-eye and each other."""
 
 import numpy as np
+from scipy.linalg import qr
 
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
 
 
-def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Array:
+def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:
     """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
 
     The clearest is chosen first (QR with pivoting), so that of two that say the same the better known stays.
@@ -17,15 +18,11 @@ def independent(base: Array, further: Array, sizes: Array, threshold: float) -> 
         sizes: (P,) plausible sizes of the parameters.
     """
     rest = project_out(base, further * sizes)
+    R, order = qr(rest, mode="r", pivoting=True)
+    clear = np.abs(np.diag(R)) >= threshold
     chosen = np.zeros(further.shape[1], bool)
-    while True:
-        strength = np.where(chosen, 0.0, np.linalg.norm(rest, axis=0))
-        if not len(strength) or strength.max() < threshold:
-            return chosen
-        best = int(strength.argmax())
-        chosen[best] = True
-        direction = rest[:, best] / strength[best]
-        rest = rest - np.outer(direction, direction @ rest)
+    chosen[order[: len(clear)][clear]] = True
+    return chosen
 
 
 def project_out(base: Array, columns: Array) -> Array:

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
+from stitch.intake.found_files import look_into
 from stitch.intake.layouts import layouts
-from stitch.intake.raw_poses import natural, read_raw_poses
+from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.readings import readings
 
 POSE_OF_ROS = """  position:
@@ -105,9 +106,11 @@ def test_matrices_of_zivid(tmp_path, name, text):
 
 
 def test_one_file_for_each_pose_in_the_order_of_their_numbers(tmp_path):
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "scan.xyz").write_text("0 0 1\n", encoding="utf-8")
     for i in (1, 2, 10):
-        (tmp_path / f"robot_pose_{i}.yaml").write_text(ZIVID.replace("569.5", str(i)), encoding="utf-8")
-    raw = read_raw_poses(natural(tmp_path.iterdir()))
+        (tmp_path / "poses" / f"robot_pose_{i}.yaml").write_text(ZIVID.replace("569.5", str(i)), encoding="utf-8")
+    raw = read_raw_poses(look_into(tmp_path, tmp_path / "poses").poses)
     assert only(raw).T[:, 0, 3].tolist() == [1, 2, 10]
     assert [labels[0] for labels in raw.labels] == ["robot_pose_1", "robot_pose_2", "robot_pose_10"]
 
