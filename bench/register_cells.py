@@ -1,15 +1,17 @@
-"""Cells of the benchmark of the register's weights: four kinds of trouble on a blade, the truth known."""
+"""Cells of the benchmark of the register: five kinds of trouble on a blade, the truth known."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from unittest.mock import patch
 
 import numpy as np
 
 from data_synth.fixtures.blade_cells import captured, disturbed
-from data_synth.fixtures.quiet_scenes import plan_for, simulated
+from data_synth.fixtures.quiet_scenes import mesh_for, plan_for, simulated
 from data_synth.scanner import Cloud as Seen
 from data_synth.scanner import Scanner, half_field
 from data_synth.scene import Scene, load_scene
+from data_synth.shapes.casting import with_stock
 from data_synth.simulate import Measured, simulate
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
@@ -21,6 +23,8 @@ PIXELS, VIEWS = 150, 14
 _UNEVEN = np.array([0, 1, 2, 3, 4, 5, 6, 7, 10, 13, 15, 18, 20, 22])
 # Flying points: share of the pixels on a silhouette, and how far behind them the wall stands, mm.
 _FLYING, _WALL = 0.7, 60.0
+# What stands on the casting all over while one of its views is taken, mm.
+STOCK = 0.3
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,30 @@ def biased_scanner(seed: int) -> Measured:
     return simulated(_scene(field_error=0.01), {"incidence_bias": 0.6}, seed, VIEWS)
 
 
+def stock_on_a_casting(seed: int) -> Measured:
+    """One view was taken before the stock was ground off, all others after."""
+    scene = _scene()
+    plan = plan_for(scene, seed, VIEWS)
+    ground = simulated(scene, {}, seed, VIEWS)
+    raw = with_stock(mesh_for(scene), lambda places: np.full(len(places), STOCK))
+    with patch("data_synth.simulate.part_mesh", lambda _: raw):
+        before = simulate(scene, {}, seed, planned=plan)
+    clouds = list(ground.clouds)
+    clouds[view_with_stock(seed)] = before.clouds[view_with_stock(seed)]
+    return replace(ground, clouds=clouds)
+
+
+def view_with_stock(seed: int) -> int:
+    """The view of `stock_on_a_casting` that shows it."""
+    return seed % VIEWS
+
+
 KINDS: dict[str, Callable[[int], Measured]] = {
     "uneven overlap": uneven_overlap,
     "mixed pixels": mixed_pixels,
     "thin trailing edges": thin_edges,
     "biased scanner": biased_scanner,
+    "stock left on a casting": stock_on_a_casting,
 }
 
 

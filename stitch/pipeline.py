@@ -24,6 +24,7 @@ from stitch.runs.state import State, state_of
 from stitch.stages.coarse import Coarse
 from stitch.stages.course import End, collected, course_of
 from stitch.stages.fitted import BeginAt, Course, Fitted
+from stitch.stages.register import DEFAULT, method_named
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 
@@ -35,6 +36,7 @@ def run(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | None = None,
+    register: str = DEFAULT,
 ) -> Run:
     """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
 
@@ -42,12 +44,13 @@ def run(
         effects: names of effects to fit together with the hand-eye.
         arm: effects of joints and links that stay as they are, while everything else is fitted.
         keep: fuse also the views that do not belong.
+        register: method by which single views are registered, `dpwvm` or `gicp`; labelled points need none.
 
     Raises:
         InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
-    return run_rig([session], model, [recorder or Silent()], effects, keep, arm)[0]
+    return run_rig([session], model, [recorder or Silent()], effects, keep, arm, register)[0]
 
 
 def run_rig(
@@ -57,8 +60,10 @@ def run_rig(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | None = None,
+    register: str = DEFAULT,
 ) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
+    method_named(register)
     require_same_rig(sessions, model)
     recorders = recorders or [Silent() for _ in sessions]
     with library_threads_off():
@@ -88,7 +93,7 @@ def run_rig(
         else:
             fit = partial(course.fit, begun=begun, begin_at=with_arm(arm), recorder=recorders[0])
         found = admitted_fit(sessions, measurements, fit, keep)
-        end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None)
+        end = End(begun, found.fitted, clock.lap(), model.effects_file if model else None, register)
         if model and not sessions[0].has_clouds:
             found = held_against_own(found, partial(_fitted_here, course, found, with_arm(arm_in(model))))
         if len(sessions) > 1 and effects:

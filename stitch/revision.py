@@ -10,6 +10,7 @@ from stitch.runs.run import Run
 from stitch.runs.state import State, state_of
 from stitch.stages.coarse import COARSE_GATE, Coarse
 from stitch.stages.course import End, collected, course_of
+from stitch.stages.register import DEFAULT
 from stitch.stages.rig import require_effects
 from stitch.system.threads import Clock, library_threads_off
 
@@ -58,6 +59,7 @@ def change(state: State, effects: Sequence[str], recorder: Recorder | None = Non
             fitted=fitted,
             seconds=clock.lap(),
             effects_file=state.effects_file,
+            register=state.register or DEFAULT,
             ledger=state.ledger,
             left_out=state.left_out,
             links=state.links,

@@ -22,6 +22,10 @@ _Arm = Annotated[
 ]
 _Effects = Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")]
 _Keep = Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")]
+_Register = Annotated[
+    str | None,
+    typer.Option("--register", metavar="METHOD", help="How single views are registered: dpwvm (usual) or gicp."),
+]
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
 _Mesh = Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")]
 
@@ -36,6 +40,7 @@ def run(
     trust: Trust = False,
     force: Force = False,
     keep: _Keep = False,
+    register: _Register = None,
     recording: _Recording = True,
     mesh: _Mesh = False,
     tolerance: Tolerance = None,
@@ -64,6 +69,7 @@ def run(
         model=ModelOptions(hand_eye, arm, named, effects_file=effects_file, trust=trust),
         force=force,
         keep=keep,
+        register=register,
         recording=recording,
         mesh=mesh,
         tolerance=tolerance,

@@ -23,6 +23,7 @@ class RunOptions:
     model: ModelOptions = ModelOptions()
     force: bool = False
     keep: bool = False
+    register: str | None = None  # method; None: the usual one
     recording: bool = True
     mesh: bool = False
     tolerance: float | None = None

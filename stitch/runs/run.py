@@ -23,6 +23,7 @@ class StageResult:
     iterations: int
     seconds: float
     note: str = ""  # one plain sentence for people
+    method: str = ""  # of register, between surfaces: dpwvm | gicp
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,11 @@ class Run:
     def effects(self) -> list[str]:
         """Names of the effects in use."""
         return self.model.effects
+
+    @property
+    def register_method(self) -> str:
+        """By which method single views were registered; empty without clouds."""
+        return next((stage.method for stage in self.stages if stage.method), "")
 
     def __repr__(self) -> str:
         unit = self.session.length_unit

@@ -27,6 +27,7 @@ class State:
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not count; session and measurement are without
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
+    register: str = ""  # method of register; empty: the usual one
 
     @property
     def heldout_rms(self) -> float:
@@ -53,4 +54,5 @@ def state_of(run: Run) -> State:
         left_out=run.left_out,
         links=run.links,
         doubts=run.doubts,
+        register=run.register_method,
     )

@@ -15,6 +15,7 @@ from stitch.stages.coarse import Coarse
 from stitch.stages.finish import Finished
 from stitch.stages.fitted import Course, Fitted
 from stitch.stages.observability import unobservable
+from stitch.stages.register import DEFAULT
 from stitch.stages.sentences import view_notes
 
 
@@ -43,6 +44,7 @@ class End:
     fitted: Fitted
     seconds: float
     effects_file: str | None
+    register: str = DEFAULT  # its method
     ledger: tuple[LedgerStep, ...] = ()
     left_out: tuple[LeftOut, ...] = ()  # views of the session that do not belong
     kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
@@ -55,7 +57,7 @@ class End:
 def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
     """Register and fuse one session, collect its result with its line in the history, and show it."""
     course, fitted = course_of(session), end.fitted
-    finished = course.finish(session, fitted, index, before, recorder, end.seconds)
+    finished = course.finish(session, fitted, index, before, recorder, end.seconds, end.register)
     own, model, begun = fitted.sessions[index], fitted.model_of(index), end.begun[index]
     # Where several sessions share a hand-eye no joint has one place for all.
     shared = fitted.captures if session.has_clouds else [fitted.captures[index]]

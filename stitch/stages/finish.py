@@ -1,6 +1,6 @@
 """The last steps of a run: register single views, fuse them, collect the result."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
 from stitch.stages.correction import Correction
 from stitch.stages.fuse_whole import Registered, fuse_every_point
-from stitch.stages.register import register
+from stitch.stages.register import Method, register
 from stitch.stages.register_targets import register_targets
-from stitch.stages.sentences import correct_note, surface_sentence, target_sentence
+from stitch.stages.sentences import correct_note, register_note, surface_sentence, target_sentence
 from stitch.statistics.robust import MAD_TO_SIGMA
 from stitch.system.mapped_file import release
 from stitch.system.threads import Clock
@@ -63,6 +63,7 @@ def finish_surfaces(
     before: StageResult,
     recorder: Recorder,
     seconds: float,
+    method: Method,
 ) -> Finished:
     """Register and fuse session `index` of a rig under the common model, and show it to the recorder.
 
@@ -77,8 +78,11 @@ def finish_surfaces(
     corrected = _of_overlaps("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
     clock.lap()
-    registration = register(own, poses_model, scatter, overlaps.gate, recorder, correction.freed[index].poses)
-    registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap())
+    start = correction.freed[index].poses
+    registration = register(own, poses_model, scatter, overlaps.gate, recorder, start, method)
+    note = register_note(method, registration, session)
+    registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap(), note)
+    registered = replace(registered, method=method.name)
     fused = fuse_every_point(Registered(session, measurement, model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
     recorder.stage(registered, registration.poses)

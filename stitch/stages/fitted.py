@@ -80,9 +80,16 @@ class Course(Protocol):
         ...
 
     def finish(
-        self, session: Session, fitted: Fitted, index: int, before: StageResult, recorder: Recorder, seconds: float
+        self,
+        session: Session,
+        fitted: Fitted,
+        index: int,
+        before: StageResult,
+        recorder: Recorder,
+        seconds: float,
+        register: str,
     ) -> Finished:
-        """Single views registered, and fused."""
+        """Single views registered by a method, and fused."""
         ...
 
     def notes(self, session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[str, ...]:

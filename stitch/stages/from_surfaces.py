@@ -29,6 +29,7 @@ from stitch.stages.finish import Finished, finish_surfaces
 from stitch.stages.fit_surfaces import fit_surfaces
 from stitch.stages.fitted import BeginAt, Fitted
 from stitch.stages.outlier_removal import FittedSession, without_outliers
+from stitch.stages.register import METHODS
 from stitch.stages.reuse import reuse
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
 
@@ -121,7 +122,13 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
 
 
 def finish(
-    session: Session, fitted: Fitted, index: int, before: StageResult, recorder: Recorder, seconds: float
+    session: Session,
+    fitted: Fitted,
+    index: int,
+    before: StageResult,
+    recorder: Recorder,
+    seconds: float,
+    register: str,
 ) -> Finished:
     """Register and fuse session `index` under the common model."""
     assert fitted.correction is not None
@@ -133,6 +140,7 @@ def finish(
         before=before,
         recorder=recorder,
         seconds=seconds,
+        method=METHODS[register],
     )
 
 

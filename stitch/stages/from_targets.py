@@ -119,9 +119,15 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
 
 
 def finish(
-    session: Session, fitted: Fitted, index: int, before: StageResult, recorder: Recorder, seconds: float
+    session: Session,
+    fitted: Fitted,
+    index: int,
+    before: StageResult,
+    recorder: Recorder,
+    seconds: float,
+    register: str,
 ) -> Finished:
-    """Register single views."""
+    """Register single views; `register` names a method of surfaces, which labelled points do not need."""
     found = fitted.sessions[index].targets
     assert found is not None
     return finish_targets(session, found, before, recorder, seconds)

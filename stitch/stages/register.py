@@ -1,19 +1,21 @@
 """Register what the hand-eye cannot explain: all views at once, each held by the robot's pose.
 
-Correspondences weigh as `correspondence_weights.py` says. The cost is the weighted mean of d² = Var(d) + mean(d)²: an
-offset common to all points of a pair is the very step that stitching has to close, so it counts in full (λ = 1).
-Against CAD with an unknown allowance it does not (`cells/window`).
+Two methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm.py`), and
+`gicp`, plane to plane inside Tukey's biweight (`correspondence_weights.py`). The cost is the weighted mean of Var(d) +
+λ·mean(d)² with λ = 1: an offset common to all points of a pair is the very step that stitching has to close. Under
+`dpwvm` λ is 0 for a view that shows an offset of its own, as stock on a casting.
 
 Solving all views together leaves no drift around a loop. The prior is each view's pose from the robot, with the
 scatter that the overlaps themselves show (REML).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stitch import frames
+from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, assemble, gram
@@ -24,11 +26,41 @@ from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.surfaces.target_pairs import joined
 from stitch.runs.recorder import Recorder, Silent
 from stitch.stages.correspondence_weights import plane_weights
+from stitch.stages.dpwvm import OffsetSums, dpwvm_weights, with_offsets
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 5e-3
+# Iterations in a row in which neither the rms nor the step may fall by this share, at a gate that stands still.
+_PATIENCE, _FALLS = 3, 1e-3
 # Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
 Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """What correspondences count, and whether an offset that a view's whole surface shows costs nothing."""
+
+    name: str
+    title: str
+    weigh: Weighing
+    offsets: bool = False
+
+
+DPWVM = Method("dpwvm", "weighted variance of signed distances (DPWVM-style)", dpwvm_weights, offsets=True)
+GICP = Method("gicp", "plane to plane inside Tukey's biweight (GICP)", plane_weights)
+METHODS = {method.name: method for method in (DPWVM, GICP)}
+DEFAULT = DPWVM.name
+
+
+def method_named(name: str) -> Method:
+    """Return the method of `--register`.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in METHODS:
+        raise InputError(f"--register {name}: no method has this name; to fix: {' or '.join(METHODS)}")
+    return METHODS[name]
 
 
 @dataclass(frozen=True)
@@ -38,6 +70,8 @@ class Registration:
     poses: Array  # (V, 4, 4) T_reference_scanner
     overlaps: Overlaps
     history: tuple[float, ...]
+    note: str = ""  # why it ended before the views stood still
+    offsets: dict[int, float] = field(default_factory=dict)  # by which whole surfaces of views stand off, outwards
 
 
 def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
@@ -54,46 +88,71 @@ def register(
     gate: float,
     recorder: Recorder | None = None,
     start: Array | None = None,
-    weigh: Weighing = plane_weights,
+    method: Method = METHODS[DEFAULT],
 ) -> Registration:
-    """Move every view by its own twist until the overlaps agree.
+    """Move every view by its own twist until the overlaps agree, or until neither rms nor step falls any more.
 
     Args:
         model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
         scatter: prior of the flange poses and the factor on the overlap noise.
         gate: first distance between partners, length_unit.
         start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
-        weigh: what every correspondence counts.
+        method: what every correspondence counts.
 
     Raises:
         NoResultError: no two views overlap.
     """
     recorder = recorder or Silent()
     picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses, history = np.array(model_poses if start is None else _held(start, model_poses)), []
+    poses, history = np.array(model_poses if start is None else _held(start, model_poses)), list[float]()
     overlaps = collect(capture, poses, gate, picked)
     last: LastStep = None
+    progress = _Progress()
     for index in range(_MAXIMUM_ITERATIONS):
         g = overlaps.gram
         history.append(g.rms)
         recorder.iteration("register", index, poses, g.rms, gate)
-        to_centre = frames.make(np.eye(3), -g.centre)
-        off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
-        step = _step(_weighed(overlaps, capture, weigh(overlaps.matches, capture, poses)), capture, scatter, off)
+        equations = normal_equations(overlaps, capture, poses, model_poses, scatter=scatter, method=method)
+        step = equations.step
         tighter = min(gate, next_gate(overlaps, capture))
         if settled(g, step, _CONVERGED) and tighter > 0.9 * gate:
+            return Registration(poses, overlaps, tuple(history), offsets=equations.offsets)
+        if progress.made(g, step, gate):
+            best = Registration(poses, overlaps, (), offsets=equations.offsets)
+        elif progress.stalled >= _PATIENCE:
             break
         poses, last = moved(poses, g, step, last)
         gate = tighter
         overlaps = collect(capture, poses, gate, picked, overlaps)
-    return Registration(poses, overlaps, tuple(history))
+    return replace(best, history=tuple(history), note=progress.note(len(history)))
 
 
-def _weighed(overlaps: Overlaps, capture: Capture, weights: Sequence[Array]) -> Gram:
-    """The normal equations of the overlaps under other weights."""
-    old = overlaps.gram
-    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
-    return joined(surfaces, overlaps.targets, capture.noise_factor)
+class _Progress:
+    """Whether the rms or the step still falls, and for how many iterations neither has."""
+
+    def __init__(self) -> None:
+        self.rms = self.step = self.gate = np.inf
+        self.stalled = 0
+
+    def made(self, g: Gram, step: Array, gate: float) -> bool:
+        """Return True if one of both fell below all before; under a tighter gate they begin anew."""
+        size = float(np.sqrt(np.mean(step[:, 3:] ** 2)))
+        if gate < 0.9 * self.gate:
+            self.rms, self.step, self.gate = np.inf, np.inf, gate
+        falls = g.rms < (1 - _FALLS) * self.rms or size < (1 - _FALLS) * self.step
+        self.rms, self.step = min(self.rms, g.rms), min(self.step, size)
+        self.stalled = 0 if falls else self.stalled + 1
+        return falls
+
+    def note(self, iterations: int) -> str:
+        """Return one sentence on why register ended and where."""
+        kept = iterations - self.stalled
+        if self.stalled >= _PATIENCE:
+            return (
+                f"stopped after {iterations} iterations, since the rms no longer fell; "
+                f"the poses of iteration {kept} are kept"
+            )
+        return f"did not come to rest in {iterations} iterations; the poses of iteration {kept} are kept"
 
 
 def _held(start: Array, model_poses: Array) -> Array:
@@ -102,12 +161,35 @@ def _held(start: Array, model_poses: Array) -> Array:
     return np.asarray(frames.exp(-common) @ start)
 
 
-def _step(g: Gram, capture: Capture, scatter: Repeatability, off: Array) -> Array:
-    """(V, 6) Gauss–Newton step of data and prior, about the centre, of views that stand `off` (V, 6) the robot's."""
-    H, b = assemble(g)
+@dataclass(frozen=True)
+class NormalEquations:
+    """Of data and prior, for twists of all views about the centre; the inverse of H is their covariance."""
+
+    H: Array  # (6V, 6V)
+    b: Array  # (6V,)
+    offsets: dict[int, float] = field(default_factory=dict)  # that views show, eliminated
+
+    @property
+    def step(self) -> Array:
+        """(V, 6) of Gauss and Newton."""
+        return np.asarray(np.linalg.solve(self.H, -self.b).reshape(-1, 6))
+
+
+def normal_equations(
+    overlaps: Overlaps, capture: Capture, poses: Array, model_poses: Array, *, scatter: Repeatability, method: Method
+) -> NormalEquations:
+    """Return what the overlaps say under a method's weights, and the robot's prior."""
+    old, weights = overlaps.gram, method.weigh(overlaps.matches, capture, poses)
+    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
+    sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
+    if sums is not None:
+        surfaces = replace(surfaces, square=sums.square)
+    g = joined(surfaces, overlaps.targets, capture.noise_factor)
     variance, prior = g.variance * scatter.noise_factor, prior_precision(capture, scatter, g.centre)
-    views = len(prior)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
+    H, b = assemble(g)
     H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
-    for v in range(views):
-        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += prior[v]
-    return np.asarray(np.linalg.solve(H, -b).reshape(views, 6))
+    for v, precision in enumerate(prior):
+        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
+    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance, old.scale))

@@ -12,6 +12,7 @@ from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut
 from stitch.stages.coarse import Coarse
 from stitch.stages.error_sources import SOURCES
+from stitch.stages.register import Method, Registration
 from stitch.units import angle_text, length_text
 
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
@@ -44,6 +45,16 @@ def surface_sentence(
         f"{model} leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
         f"{_scatter(scatter, registered, length_unit)}."
     )
+
+
+def register_note(method: Method, found: Registration, session: Session) -> str:
+    """Return by which method views were registered, which surfaces stand off as a whole, and how it ended early."""
+    lines = [method.title]
+    for v, size in found.offsets.items():
+        side = "outside" if size > 0 else "inside"
+        apart = length_text(abs(size), session.length_unit)
+        lines.append(f"the whole surface of {session.names[v]} lies {apart} {side} that of the other views")
+    return "; ".join([*lines, found.note] if found.note else lines)
 
 
 def target_sentence(found: TargetFit, registered: float, scatter: Repeatability, length_unit: str) -> str:

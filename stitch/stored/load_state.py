@@ -58,6 +58,7 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
         left_out=left_out,
         links=links,
         doubts=tuple(document.get("doubts", ())),
+        register=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
     )
 
 

@@ -39,7 +39,7 @@ RESULT = _table(
         "heldout_rms": _MAYBE,
         "noise_floor": _NUMBER,
         "effects": {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _PARAMETER}},
-        "stages": _list(_table(_STAGE, note=_TEXT)),
+        "stages": _list(_table(_STAGE, note=_TEXT, method=_TEXT)),
         "views": _list(_table(_VIEW)),
         "unobservable": _list(_TEXT),
         "repeatability": _table({"rotation": _MAYBE, "translation": _MAYBE}),

@@ -108,8 +108,8 @@ def _registered(own: Capture, poses: Array, document: dict[str, Any], gate: floa
 
 
 def _stage(row: dict[str, Any]) -> StageResult:
-    rms, note = _number(row["rms"]), row.get("note", "")
-    return StageResult(row["name"], rms, row["correspondences"], row["iterations"], row["seconds"], note)
+    rms, words = _number(row["rms"]), (row.get("note", ""), row.get("method", ""))
+    return StageResult(row["name"], rms, row["correspondences"], row["iterations"], row["seconds"], *words)
 
 
 def _targets(folder: Path, state: State) -> TargetFit:

@@ -10,7 +10,7 @@ from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
-from stitch.runs.run import LeftOut, Run
+from stitch.runs.run import LeftOut, Run, StageResult
 from stitch.writing.run_contents import FORMAT
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
@@ -48,7 +48,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
         "hand_eye_covariance": run.mount_covariance.tolist(),
         "unobservable": list(run.unobservable),
-        "stages": [asdict(s) | {"seconds": round(s.seconds, 3)} for s in run.stages],
+        "stages": [_stage(s) for s in run.stages],
         "residual_rms": run.residual_rms,
         "heldout_rms": run.heldout_rms,
         "noise_floor": run.noise_floor,
@@ -74,6 +74,12 @@ def result_document(run: Run) -> dict[str, Any]:
         "notes": list(run.notes),
         "versions": _versions(),
     }
+
+
+def _stage(stage: StageResult) -> dict[str, Any]:
+    """A row of the stages; only register has a method."""
+    row = asdict(stage) | {"seconds": round(stage.seconds, 3)}
+    return row if stage.method else {key: value for key, value in row.items() if key != "method"}
 
 
 def points_of(view: View) -> int:

@@ -16,6 +16,7 @@ from stitch.model.arm import kept_arm
 from stitch.model.model_toml import ModelFile, write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
+from stitch.stages.register import DEFAULT, method_named
 from stitch.stored.trusted_model import trusted_model
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
@@ -34,6 +35,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
         load_effects(asked.model.effects_file)
     for name in asked.model.effects:
         known(name)
+    method = method_named(asked.register or DEFAULT).name
     here = not sessions
     sessions = sessions or [_here()]
     memory = None if asked.memory is None else asked.memory / len(sessions)
@@ -48,7 +50,7 @@ def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
     ):
         folders = _folders(scratch, names)
         recorders = [recorder_for(folder, asked.recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, asked.model.effects, asked.keep, kept)
+        runs = run_rig(loaded, model, recorders, asked.model.effects, asked.keep, kept, method)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
             run_folder.write_with_page(result, folder, asked.tolerance)
