@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from register_weights import PAGE
-from weighings import WEIGHINGS
+from weighings import METHODS
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.scene import load_scene
@@ -23,17 +23,16 @@ from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture, capture, part_size
 from stitch.measurement.scan import Scan
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.gram import assemble
 from stitch.observations.surfaces.match import sample
 from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.reading.session_folder import load_session
 from stitch.stages.coarse import coarse
 from stitch.stages.correct import correct
-from stitch.stages.register import Registration, prior_precision, register
+from stitch.stages.register import Method, Registration, normal_equations, register
 
 OBJECTS = ("cone", "gripperopen", "rubik", "sphere", "david")
-SHOWN = ("GICP inside Tukey", "Tukey", "sign classes")
+SHOWN = ("DPWVM-style", "GICP inside Tukey", "Tukey", "sign classes")
 BEGIN, END = "<!-- real: begin -->", "<!-- real: end -->"
 
 
@@ -43,13 +42,10 @@ def left_out(scan: Scan) -> Indices:
     return others[np.linspace(0, len(others) - 1, min(len(others), FINE_SAMPLES)).astype(int)]
 
 
-def spread(own: Capture, found: Registration, scatter: Repeatability) -> Array:
+def spread(own: Capture, found: Registration, poses: Array, scatter: Repeatability, method: Method) -> Array:
     """(6V, 6V) covariance of the views' twists about the centre of the overlaps."""
-    g = found.overlaps.gram
-    H = assemble(g)[0] / (g.variance * scatter.noise_factor)
-    for v, precision in enumerate(prior_precision(own, scatter, g.centre)):
-        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
-    return np.linalg.inv(H)
+    equations = normal_equations(found.overlaps, own, found.poses, poses, scatter=scatter, method=method)
+    return np.linalg.inv(equations.H)
 
 
 def sigma_of(covariance: Array) -> float:
@@ -81,11 +77,11 @@ def rows_of(name: str, session: Session, T_start: Array | None) -> list[str]:
     lines, first, sigma = [], None, 0.0
     for weights in SHOWN:
         begun_at = time.perf_counter()
-        registered = register(own, poses, scatter, overlaps.gate, start=found.freed[0].poses, weigh=WEIGHINGS[weights])
+        registered = register(own, poses, scatter, overlaps.gate, start=found.freed[0].poses, method=METHODS[weights])
         seconds = time.perf_counter() - begun_at
         if first is None:
             first = registered
-            sigma = sigma_of(spread(own, registered, scatter))
+            sigma = sigma_of(spread(own, registered, poses, scatter, METHODS[weights]))
         fresh = collect(own, registered.poses, registered.overlaps.gate, spare).gram.rms
         off = np.sqrt(np.mean(apart(registered, first) ** 2))
         numbers = (registered.overlaps.gram.rms, fresh, off, sigma)

@@ -1,6 +1,7 @@
-"""Weights of correspondences that register could take: published kernels, and two of the "plus and minus" family."""
+"""Methods that register could take: published kernels, and members of the "plus and minus" family."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,8 +9,8 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import robust_scale
 from stitch.observations.surfaces.match import Match
-from stitch.stages.correspondence_weights import agreement, plane_weights
-from stitch.stages.register import Weighing
+from stitch.stages.correspondence_weights import agreement
+from stitch.stages.register import DPWVM, GICP, Method
 from stitch.statistics.robust import MAD_TO_SIGMA, mad_sigma, tukey
 
 _HUBER = 1.345  # 95 % efficient on normal errors (Holland & Welsch 1977)
@@ -70,11 +71,14 @@ def _by_density(m: Match, capture: Capture) -> Array:
     return np.asarray(np.clip(np.sqrt(area / np.median(area)), 0.2, 5.0))
 
 
-WEIGHINGS: dict[str, Callable[..., list[Array]] | Weighing] = {
-    "Tukey": by_tukey,
-    "Huber": by_huber,
-    "GICP": by_gicp,
-    "GICP inside Tukey": plane_weights,
-    "sign classes": by_sign_classes,
-    "symmetric, own variances": by_own_variances,
+CLOSED, DPWVM_STYLE = "GICP inside Tukey", "DPWVM-style"
+METHODS: dict[str, Method] = {
+    "Tukey": Method("tukey", "", by_tukey),
+    "Huber": Method("huber", "", by_huber),
+    "GICP": Method("plane", "", by_gicp),
+    CLOSED: GICP,
+    "sign classes": Method("sign", "", by_sign_classes),
+    "symmetric, own variances": Method("own", "", by_own_variances),
+    "DPWVM-style, λ = 1 for all": replace(DPWVM, offsets=False),
+    DPWVM_STYLE: DPWVM,
 }
