@@ -128,9 +128,14 @@ def with_offsets(H: Array, b: Array, sums: OffsetSums, variance: float) -> tuple
     free = shared_offsets(D - C.T @ np.linalg.solve(H, C), e - C.T @ np.linalg.solve(H, b), sums.scatter / variance)
     if not free:
         return H, b, {}
-    eliminated = np.linalg.solve(D[np.ix_(free, free)], np.column_stack([C[:, free].T, e[free]]))
-    offsets = {v: float(size) for v, size in zip(free, eliminated[:, -1], strict=True)}
-    return H - C[:, free] @ eliminated[:, :-1], b - C[:, free] @ eliminated[:, -1], offsets
+    H, b, sizes = eliminate(H, b, C[:, free], D[np.ix_(free, free)], e[free])
+    return H, b, dict(zip(free, map(float, sizes), strict=True))
+
+
+def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array) -> tuple[Array, Array, Array]:
+    """Return the normal equations with F offsets at their best for every twist, and their sizes at no twist."""
+    solved = np.linalg.solve(matrix, np.column_stack([coupling.T, vector]))
+    return H - coupling @ solved[:, :-1], b - coupling @ solved[:, -1], solved[:, -1]
 
 
 def shared_offsets(information: Array, vector: Array, scatter: Array) -> list[int]:

@@ -8,7 +8,7 @@ import pytest
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
 from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.stages.register import register
+from stitch.stages.register import GICP, register
 from stitch.statistics.robust import tukey
 
 SCATTER = Repeatability(2e-4, 0.1, 1.0)
@@ -29,14 +29,14 @@ def test_full_weight_at_agreement_and_none_beyond_the_limit():
 
 def test_the_order_of_the_views_changes_nothing(cell):
     capture, poses = cell
-    forth = register(capture, poses, SCATTER, 5.0).poses
+    forth = register(capture, poses, SCATTER, 5.0, method=GICP).poses
     turned = replace(
         capture,
         scans=capture.scans[::-1],
         T_reference_mount=capture.T_reference_mount[::-1],
         T_reference_flange=capture.T_reference_flange[::-1],
     )
-    back = register(turned, poses[::-1], SCATTER, 5.0).poses[::-1]
+    back = register(turned, poses[::-1], SCATTER, 5.0, method=GICP).poses[::-1]
     assert np.abs(forth - back).max() < 1e-6
 
 
@@ -48,7 +48,8 @@ def test_the_weights_are_gicps_inside_tukeys(cell):
         middle = np.median(np.abs(np.concatenate([m.residual for m in matches])))
         return [plane_to_plane(m, capture, poses) * biweight(m.residual / (1.4826 * middle)) for m in matches]
 
-    own, handed = register(capture, poses, SCATTER, 5.0), register(capture, poses, SCATTER, 5.0, weigh=formula)
+    own = register(capture, poses, SCATTER, 5.0, method=GICP)
+    handed = register(capture, poses, SCATTER, 5.0, method=replace(GICP, weigh=formula))
     assert np.abs(own.poses - handed.poses).max() < 1e-9
 
 
@@ -73,6 +74,7 @@ def test_other_weights_are_taken(cell):
     def only_first(matches, capture, poses):
         return [m.weight * ((m.v, m.w) == (0, 1)) for m in matches]
 
-    moved = frames.log(register(capture, poses, SCATTER, 5.0, weigh=only_first).poses @ frames.inverse(poses))
+    found = register(capture, poses, SCATTER, 5.0, method=replace(GICP, weigh=only_first))
+    moved = frames.log(found.poses @ frames.inverse(poses))
     assert np.abs(moved[2:]).max() < 1e-12
     assert np.abs(moved[:2, 3:]).max() > 1e-2
