@@ -73,12 +73,12 @@ def _by_density(m: Match, capture: Capture) -> Array:
 
 CLOSED, DPWVM_STYLE = "GICP inside Tukey", "DPWVM-style"
 METHODS: dict[str, Method] = {
-    "Tukey": Method("tukey", "", by_tukey),
-    "Huber": Method("huber", "", by_huber),
-    "GICP": Method("plane", "", by_gicp),
+    "Tukey": Method("tukey", by_tukey),
+    "Huber": Method("huber", by_huber),
+    "GICP": Method("plane", by_gicp),
     CLOSED: GICP,
-    "sign classes": Method("sign", "", by_sign_classes),
-    "symmetric, own variances": Method("own", "", by_own_variances),
+    "sign classes": Method("sign", by_sign_classes),
+    "symmetric, own variances": Method("own", by_own_variances),
     "DPWVM-style, λ = 1 for all": replace(DPWVM, offsets=False),
     DPWVM_STYLE: DPWVM,
 }

@@ -19,6 +19,7 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]
         lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
         lines += [""]
+    lines += [f"- Registered by {stage.remark}." for stage in run.stages if stage.method]
     lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
     lines += [f"- {note}" for note in run.notes]
     return "\n".join(lines)

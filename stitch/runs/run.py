@@ -12,6 +12,9 @@ from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_fit import TargetFit
 
+# By which methods register moves single views, for people.
+METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
+
 
 @dataclass(frozen=True)
 class StageResult:
@@ -24,6 +27,11 @@ class StageResult:
     seconds: float
     note: str = ""  # one plain sentence for people
     method: str = ""  # of register, between surfaces: dpwvm | gicp
+
+    @property
+    def remark(self) -> str:
+        """The method in words, and the note."""
+        return "; ".join(text for text in (METHOD_TITLES.get(self.method, self.method), self.note) if text)
 
 
 @dataclass(frozen=True)

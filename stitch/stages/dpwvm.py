@@ -135,7 +135,7 @@ def with_offsets(H: Array, b: Array, sums: OffsetSums, variance: float) -> tuple
 def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array) -> tuple[Array, Array, Array]:
     """Return the normal equations with F offsets at their best for every twist, and their sizes at no twist."""
     solved = np.linalg.solve(matrix, np.column_stack([coupling.T, vector]))
-    return H - coupling @ solved[:, :-1], b - coupling @ solved[:, -1], solved[:, -1]
+    return H - coupling @ solved[:, :-1], b - coupling @ solved[:, -1], np.asarray(solved[:, -1], float)
 
 
 def shared_offsets(information: Array, vector: Array, scatter: Array) -> list[int]:

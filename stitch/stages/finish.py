@@ -80,7 +80,7 @@ def finish_surfaces(
     clock.lap()
     start = correction.freed[index].poses
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, start, method)
-    note = register_note(method, registration, session)
+    note = register_note(registration, session)
     registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap(), note)
     registered = replace(registered, method=method.name)
     fused = fuse_every_point(Registered(session, measurement, model, own, registration.poses))

@@ -41,13 +41,12 @@ class Method:
     """What correspondences count, and whether an offset that a view's whole surface shows costs nothing."""
 
     name: str
-    title: str
     weigh: Weighing
     offsets: bool = False
 
 
-DPWVM = Method("dpwvm", "weighted variance of signed distances (DPWVM-style)", dpwvm_weights, offsets=True)
-GICP = Method("gicp", "plane to plane inside Tukey's biweight (GICP)", plane_weights)
+DPWVM = Method("dpwvm", dpwvm_weights, offsets=True)
+GICP = Method("gicp", plane_weights)
 METHODS = {method.name: method for method in (DPWVM, GICP)}
 DEFAULT = DPWVM.name
 

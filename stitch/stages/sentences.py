@@ -12,7 +12,7 @@ from stitch.observations.targets.target_fit import TargetFit
 from stitch.runs.run import LeftOut
 from stitch.stages.coarse import Coarse
 from stitch.stages.error_sources import SOURCES
-from stitch.stages.register import Method, Registration
+from stitch.stages.register import Registration
 from stitch.units import angle_text, length_text
 
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
@@ -47,14 +47,14 @@ def surface_sentence(
     )
 
 
-def register_note(method: Method, found: Registration, session: Session) -> str:
-    """Return by which method views were registered, which surfaces stand off as a whole, and how it ended early."""
-    lines = [method.title]
+def register_note(found: Registration, session: Session) -> str:
+    """Return which surfaces stand off as a whole, and that register ended early; empty where neither is so."""
+    lines = []
     for v, size in found.offsets.items():
         side = "outside" if size > 0 else "inside"
         apart = length_text(abs(size), session.length_unit)
         lines.append(f"the whole surface of {session.names[v]} lies {apart} {side} that of the other views")
-    return "; ".join([*lines, found.note] if found.note else lines)
+    return "; ".join([*lines, *([found.note] if found.note else [])])
 
 
 def target_sentence(found: TargetFit, registered: float, scatter: Repeatability, length_unit: str) -> str:

@@ -1,0 +1,48 @@
+"""`--register`: the method that was asked for is the one that runs, is written down, and stays with the run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stitch.cli.main import main
+from stitch.errors import InputError
+from stitch.pipeline import run
+from stitch.reading.session_folder import load_session
+from stitch.revision import change
+from stitch.runs.state import state_of
+from stitch.stages.register import DEFAULT, METHODS
+from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import stored_run
+from stitch.writing.run_folder import write_run
+from viz.run_markdown import run_markdown
+
+
+def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path):
+    loaded = load_session(session)
+    usual, asked = run(loaded), run(loaded, register="gicp")
+    assert usual.register_method == DEFAULT
+    assert asked.register_method == "gicp"
+    assert not np.array_equal(usual.poses, asked.poses)
+    write_run(asked, tmp_path)
+    stages = json.loads((tmp_path / "result.json").read_text())["stages"]
+    assert [stage.get("method") for stage in stages] == [None, None, "gicp", None]
+    state = load_state(tmp_path)
+    assert stored_run(tmp_path, state).register_method == "gicp"
+    assert change(state, []).register_method == "gicp"
+    assert state_of(usual).register == DEFAULT
+    assert "Registered by plane to plane (GICP)" in run_markdown(asked, None)
+    assert "Registered by DPWVM-style weighted fit" in run_markdown(usual, None)
+
+
+def test_a_method_of_another_name_is_bad_input(session):
+    with pytest.raises(InputError, match="--register icp: no method has this name; to fix: dpwvm or gicp"):
+        run(load_session(session), register="icp")
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "--register", "icp"])
+    assert ended.value.code == 2
+
+
+def test_both_methods_stand_by_their_names():
+    assert list(METHODS) == ["dpwvm", "gicp"]
+    assert all(name == method.name for name, method in METHODS.items())
