@@ -4,7 +4,7 @@ Usage: python bench/register_weights.py [--held-out] [--cells N] [--keep FILE] [
 
 Eight cells each of five kinds (`register_cells.py`). All methods begin at the same poses, with the same prior, scans
 and samples; each is iterated by the register's own loop. Seeds are of two kinds: those of development (100 …), and
-held-out ones (1700 …), run once. --keep stores every cell as it is done, and goes on from there; --write puts the
+held-out ones (2700 …), run once. --keep stores every cell as it is done, and goes on from there; --write puts the
 tables into the page. A pose error is the rms displacement of a view's own points, the motion that all views have in
 common removed: no overlap shows it.
 """
@@ -25,7 +25,7 @@ from stitch.stages.register import Method, Registration, normal_equations, regis
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "register.md"
 BEGIN, END = "<!-- weights: begin -->", "<!-- weights: end -->"
-DEVELOPMENT, HELD_OUT = 100, 1700
+DEVELOPMENT, HELD_OUT = 100, 2700
 _CASTING = "stock left on a casting"
 _DRAWS = 4000
 Rows = dict[str, list[dict[str, Any]]]  # by kind, one per cell

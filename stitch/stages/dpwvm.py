@@ -30,10 +30,10 @@ _POOLED = 200
 _CLASS = 10
 # Density: surface per point is believed up to these factors of its median in a pair.
 _SPARSE = 2.0
-# An offset is one of a view's whole surface where it stands out of chance by 5 sigma, and explains a fifth of the mean
-# square of the view's distances. Stock of 0.3 mm on a blade explains a quarter or more; a scanner's own errors up to a
-# seventh on a shiny cone, and a five-hundredth in cells with a biased scanner.
-_SURE, _SHARE = 25.0, 0.2
+# An offset is one of a view's whole surface where it stands out of chance by 5 sigma, and is 6 times the scatter of
+# single distances. Stock of 0.3 mm on simulated blades showed 9 to 14 times the scatter; a scanner's own errors showed
+# up to 4 on a shiny cone, and 0.6 in cells with a biased scanner.
+_SURE, _LARGE = 25.0, 6.0
 
 
 def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
@@ -99,7 +99,6 @@ class OffsetSums:
         self.coupling = np.zeros((views, 6, views))  # Σ ±w Bᵀ, twists against offsets, less their sign
         self.matrix = np.zeros((views, views))  # Σ ±w
         self.vector = np.zeros(views)  # Σ ±w e
-        self.scatter = np.zeros(views)  # Σ w (e − ē)² of a view's pairs
         self.square = np.zeros(len(matches))  # (P,) Σ w (e − ē)²: a pair's weighted variance, times its weight
         for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
             normal, weight, first = w @ m.normal, float(w.sum()), float(w @ m.residual)
@@ -111,10 +110,11 @@ class OffsetSums:
             self.vector[m.v] += first
             self.vector[m.w] -= first
             self.square[i] = float(w @ m.residual**2) - first**2 / max(weight, 1e-300)
-            self.scatter[[m.v, m.w]] += self.square[i]
 
 
-def with_offsets(H: Array, b: Array, sums: OffsetSums, variance: float) -> tuple[Array, Array, dict[int, float]]:
+def with_offsets(
+    H: Array, b: Array, sums: OffsetSums, variance: float, scale: float
+) -> tuple[Array, Array, dict[int, float]]:
     """Return normal equations (6V, 6V) and (6V,) in which the offsets that views show cost nothing, and these offsets.
 
     An offset that is eliminated (Schur complement) leaves the weighted variance of that view's distances, λ = 0; the
@@ -123,9 +123,10 @@ def with_offsets(H: Array, b: Array, sums: OffsetSums, variance: float) -> tuple
     Args:
         H, b: of the twists, with the prior of the robot, in units of variance.
         variance: of a correspondence's distance, by which `sums` are divided.
+        scale: robust sigma of the distances.
     """
     C, D, e = sums.coupling.reshape(len(H), -1) / variance, sums.matrix / variance, sums.vector / variance
-    free = shared_offsets(D - C.T @ np.linalg.solve(H, C), e - C.T @ np.linalg.solve(H, b), sums.scatter / variance)
+    free = shared_offsets(D - C.T @ np.linalg.solve(H, C), e - C.T @ np.linalg.solve(H, b), _LARGE * scale)
     if not free:
         return H, b, {}
     H, b, sizes = eliminate(H, b, C[:, free], D[np.ix_(free, free)], e[free])
@@ -138,16 +139,16 @@ def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array)
     return H - coupling @ solved[:, :-1], b - coupling @ solved[:, -1], np.asarray(solved[:, -1], float)
 
 
-def shared_offsets(information: Array, vector: Array, scatter: Array) -> list[int]:
+def shared_offsets(information: Array, vector: Array, least: float) -> list[int]:
     """Return the views whose surface stands off as a whole, the surest first; never all of them.
 
     One after the other the view with the largest χ² = c²/A of its offset, those before it set free, until χ² < 25 or
-    χ² falls below a fifth of χ² and `scatter` together. One offset of all views is none: A is blind to it.
+    the offset −c/A is smaller than `least`. One offset of all views is none: A is blind to it.
 
     Args:
         information: A (V, V) of the offsets, the twists eliminated.
         vector: c (V,) gradient at no offset.
-        scatter: (V,) weighted squares of the views' distances about the means of their pairs, in the same unit.
+        least: size below which an offset is left to the poses.
     """
     free: list[int] = []
     A, c = information.copy(), vector.copy()
@@ -155,7 +156,7 @@ def shared_offsets(information: Array, vector: Array, scatter: Array) -> list[in
     while len(free) < len(A) - 1:
         size = np.maximum(np.diag(A), blind)
         chi2 = np.where(np.isin(np.arange(len(A)), free), 0.0, c**2 / size)
-        shown = (chi2 > _SURE) & (chi2 > _SHARE * (chi2 + scatter))
+        shown = (chi2 > _SURE) & (np.abs(c) > least * size)
         if not shown.any():
             break
         best = int(np.argmax(np.where(shown, chi2, 0.0)))

@@ -191,4 +191,4 @@ def normal_equations(
     H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
     for v, precision in enumerate(prior):
         H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
-    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance))
+    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance, old.scale))

@@ -91,7 +91,7 @@ def test_an_offset_that_no_motion_imitates_is_freed_and_misleads_no_pose():
     for a in (0.0, 0.3):
         H, b, sums = sums_of(faces(box, a, t))
         sums.coupling[1] = 0.0  # the second view is held
-        H, b, offsets = with_offsets(*both(H, b), sums, VARIANCE)
+        H, b, offsets = with_offsets(*both(H, b), sums, VARIANCE, 0.01)
         assert -np.linalg.solve(H, b)[3:6] == pytest.approx(-t, abs=1e-5)
         assert sum(abs(size) for size in offsets.values()) == pytest.approx(a if a == 0 else a + t[2] / 5, abs=1e-6)
     H, b, _ = sums_of(faces(box, 0.3, t))
@@ -148,11 +148,11 @@ def test_the_cleaner_class_gives_the_scale():
     assert class_scale(-flying, 0.02) == pytest.approx(class_scale(flying, 0.02), rel=1e-12)
 
 
-def test_an_offset_is_free_only_where_it_explains_the_distances():
-    A, c = np.diag([4.0, 1.0, 1.0]), np.array([40.0, 10.0, 4.0])
-    assert shared_offsets(A, c, np.full(3, 10.0)) == [0, 1]  # χ² 400, 100, 16
-    assert shared_offsets(A, c, np.full(3, 1000.0)) == [0]
-    assert shared_offsets(A, c, np.full(3, 2000.0)) == []
+def test_an_offset_is_free_only_where_it_is_sure_and_large():
+    A, c = np.diag([4.0, 1.0, 1.0]), np.array([-40.0, 20.0, 4.0])  # χ² 400, 400, 16; sizes 10, 20, 4
+    assert shared_offsets(A, c, 1.0) == [0, 1]
+    assert shared_offsets(A, c, 15.0) == [1]
+    assert shared_offsets(A, c, 30.0) == []
 
 
 def test_stock_of_one_view_is_found_and_moves_no_pose():
