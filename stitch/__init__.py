@@ -2,9 +2,12 @@
 
 import stitch
 
-run = stitch.run(stitch.load_session("blade-17"))
+session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", unit="mm")
+run = stitch.run(session)
+print(run)
 print(stitch.diagnose(run).sentence)
 run = stitch.add(run, "joint_compliance")
+run.save("runs/blade-17")
 """
 
 from importlib import import_module
@@ -12,20 +15,25 @@ from typing import TYPE_CHECKING, Any
 
 # Type checkers do not read the table; `as` exports a name to them. A test compares the two.
 if TYPE_CHECKING:
+    from stitch.api.run import Run as Run
+    from stitch.api.session import Session as Session
+    from stitch.api.session import load_session as load_session
+    from stitch.api.verbs import add as add
+    from stitch.api.verbs import compare as compare
+    from stitch.api.verbs import diagnose as diagnose
+    from stitch.api.verbs import drop as drop
+    from stitch.api.verbs import explain as explain
+    from stitch.api.verbs import export_run as export_run
+    from stitch.api.verbs import load_run as load_run
+    from stitch.api.verbs import plan as plan
+    from stitch.api.verbs import run as run
+    from stitch.api.verbs import run_rig as run_rig
     from stitch.diagnosis.diagnosis import Diagnosis as Diagnosis
     from stitch.errors import InputError as InputError
     from stitch.errors import NoResultError as NoResultError
     from stitch.errors import StitchError as StitchError
-    from stitch.measurement.session import Session as Session
     from stitch.model.model import Model as Model
     from stitch.model.model_toml import read_model as read_model
-    from stitch.pipeline import diagnose as diagnose
-    from stitch.pipeline import run as run
-    from stitch.pipeline import run_rig as run_rig
-    from stitch.reading.session_folder import load_session as load_session
-    from stitch.revision import add as add
-    from stitch.revision import drop as drop
-    from stitch.runs.run import Run as Run
 
 # Public names and their modules. A module is imported on first use: reading a session does not wait for the statistics.
 MODULES = {
@@ -33,16 +41,21 @@ MODULES = {
     "InputError": "stitch.errors",
     "Model": "stitch.model.model",
     "NoResultError": "stitch.errors",
-    "Run": "stitch.runs.run",
-    "Session": "stitch.measurement.session",
+    "Run": "stitch.api.run",
+    "Session": "stitch.api.session",
     "StitchError": "stitch.errors",
-    "add": "stitch.revision",
-    "diagnose": "stitch.pipeline",
-    "drop": "stitch.revision",
-    "load_session": "stitch.reading.session_folder",
+    "add": "stitch.api.verbs",
+    "compare": "stitch.api.verbs",
+    "diagnose": "stitch.api.verbs",
+    "drop": "stitch.api.verbs",
+    "explain": "stitch.api.verbs",
+    "export_run": "stitch.api.verbs",
+    "load_run": "stitch.api.verbs",
+    "load_session": "stitch.api.session",
+    "plan": "stitch.api.verbs",
     "read_model": "stitch.model.model_toml",
-    "run": "stitch.pipeline",
-    "run_rig": "stitch.pipeline",
+    "run": "stitch.api.verbs",
+    "run_rig": "stitch.api.verbs",
 }
 
 __all__ = list(MODULES)

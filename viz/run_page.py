@@ -57,7 +57,7 @@ def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
     return {
         "run": run,
         "um": MICROMETRES[unit],
-        "part": _targets(run) if history is None else _part(run, history),
+        "part": shown_part(run, history),
         "surfaces": history is not None,
         "first": rows[:_FIRST],
         "rest": rows[_FIRST:],
@@ -72,6 +72,11 @@ def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
         "pictures": _pictures(run),
         "targets": target_rows(run),
     }
+
+
+def shown_part(run: Run, history: ModelHistory | None) -> dict[str, Any] | None:
+    """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither."""
+    return _targets(run) if history is None else _part(run, history)
 
 
 def _part(run: Run, history: ModelHistory) -> dict[str, Any]:

@@ -46,12 +46,12 @@ def robot_toml(robot: Robot, told: Sequence[str] = (), stated: StatedRepeatabili
     # Without a mass the centre is that of the column payload_kg.
     if robot.payload_mass or not robot.carries_at_flange:
         table["payload"] = {"mass": robot.payload_mass, "com": robot.payload_com.tolist()}
-    if stated is not None and (repeatability := _repeatability(stated)):
+    if stated is not None and (repeatability := repeatability_table(stated)):
         table["repeatability"] = repeatability
     return "".join(f"# {line}\n" for line in told) + tomli_w.dumps({"robot": table})
 
 
-def _repeatability(stated: StatedRepeatability) -> dict[str, float]:
-    """As session.toml writes it: length_unit, mrad."""
+def repeatability_table(stated: StatedRepeatability) -> dict[str, float]:
+    """Return [robot] repeatability as session.toml writes it: length_unit, mrad; {} where nothing is stated."""
     turn = None if stated.rotation is None else 1e3 * stated.rotation
     return {key: x for key, x in (("position", stated.position), ("rotation_mrad", turn)) if x is not None}

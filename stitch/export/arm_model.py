@@ -12,12 +12,14 @@ from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import place
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
+from stitch.measurement.session import Session
 from stitch.measurement.torques import PAYLOAD, Torques, torques_of
 from stitch.measurement.views import Views, no_torques, views_of
 from stitch.model.arm import ARM
 from stitch.model.bound import bound, in_unit
 from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.forward import perturbed_frames
+from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
 from stitch.reading.session_folder import load_session
 from stitch.stored.run_documents import read_result
@@ -68,10 +70,18 @@ def arm_of(folder: Path, effects_file: Path | None = None, trust: bool = False) 
     path = Path(read_result(folder)["session"])
     if not path.is_dir():
         raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
-    session = load_session(path, scans=False)
+    return arm_from(load_session(path, scans=False), file)
+
+
+def arm_from(session: Session, file: ModelFile) -> ArmModel:
+    """Return the arm of a session with the arm's effects of a model.
+
+    Raises:
+        InputError: the session has no robot with joint angles, or an effect does not fit it.
+    """
     views = views_of(session)
     if session.robot is None or not views.joints.shape[1]:
-        raise InputError(f"{path}: no joint angles or no [robot]; where the arm goes needs both")
+        raise InputError(f"{session.path}: no joint angles or no [robot]; where the arm goes needs both")
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     measurement = _bare(session.name, session.robot, T_base_flange, views, session.length_unit)
     own = {name: values for name, values in file.effects.items() if known(name).place in ARM}

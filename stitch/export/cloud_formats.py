@@ -62,9 +62,14 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
             f"{file}: holds no points, the session shows labelled points alone; there is no cloud to export"
         )
     mesh = folder / "mesh.ply"
+    return coloured(fused, unit, mesh if mesh.is_file() else None)
+
+
+def coloured(fused: FusedCloud, length_unit: str, mesh: Path | None = None) -> ColouredCloud:
+    """Return a stitched cloud with its residuals as colours."""
     known = fused.residual[np.isfinite(fused.residual)]
     span = float(np.quantile(known, _SPAN)) if len(known) else 0.0
-    return ColouredCloud(fused, residual_colours(fused.residual, span), span, unit, mesh if mesh.is_file() else None)
+    return ColouredCloud(fused, residual_colours(fused.residual, span), span, length_unit, mesh)
 
 
 def residual_colours(residual: Array, span: float) -> Colours:

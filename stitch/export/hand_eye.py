@@ -76,6 +76,22 @@ def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner")
     result, model, told = read_result(folder), read_model(folder), read_diagnosis(folder)
     if model.mount not in _PARENTS:
         raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
+    return hand_eye_from(result, model, told, parent, child)
+
+
+def hand_eye_from(
+    result: dict[str, Any], model: ModelFile, told: dict[str, Any], parent: str | None = None, child: str = "scanner"
+) -> HandEye:
+    """Return the corrected hand-eye of a result and its model.
+
+    Args:
+        result: as result.json.
+        told: as diagnosis.json; {} where there is none.
+        parent, child: names of frames, as `hand_eye_of` takes them.
+
+    Raises:
+        InputError: a name that a frame cannot have.
+    """
     metres = METRES[model.length_unit]
     T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
     T[:3, 3] *= metres

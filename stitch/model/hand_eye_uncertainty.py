@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.units import METRES, known_text
 
 # Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
 COVERAGE_FACTOR = 2.0
@@ -47,6 +48,23 @@ def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covari
 def expanded(T_mount: Array, covariance: Array) -> Array:
     """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
     return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
+
+
+def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
+    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner."""
+    frame = "base" if mount == "eye_to_hand" else "flange"
+    to_mm = METRES[length_unit] * 1e3
+    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
+    U = expanded(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+    position, turn = (
+        ", ".join(f"{axis} {known_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
+    )
+    return [
+        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
+        f"  position {position} mm",
+        f"  rotation vector {turn} mrad",
+    ]
 
 
 def stands_for(verdict: str | None) -> str:

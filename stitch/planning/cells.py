@@ -86,10 +86,19 @@ def cell_of_run(state: State, folder: Path) -> PlannedCell:
     cloud = read_cloud(file)
     if cloud.normals is None:
         raise InputError(f"{file}: has no normals; to fix: stitch run {state.session.path} -o {folder}")
+    return cell_of_state(state, cloud.points, cloud.normals)
+
+
+def cell_of_state(state: State, points: Array, normals: Array) -> PlannedCell:
+    """Return the cell as a run found it.
+
+    Args:
+        points, normals: (N, 3) of its stitched cloud, reference frame, length_unit.
+    """
     scans = state.measurement.capture.scans
-    points = np.concatenate([scan.points for scan in scans])
-    reach = np.linalg.norm(points, axis=1)
-    slopes = np.abs(points[:, :2] / points[:, 2:])
+    seen = np.concatenate([scan.points for scan in scans])
+    reach = np.linalg.norm(seen, axis=1)
+    slopes = np.abs(seen[:, :2] / seen[:, 2:])
     near, far = np.quantile(reach, [1 - _SEEN, _SEEN])
     field = Field(
         np.quantile(slopes, _SEEN, axis=0) * (1 + _MARGIN),
@@ -100,7 +109,7 @@ def cell_of_run(state: State, folder: Path) -> PlannedCell:
     )
     noise = float(np.nanmedian([scan.noise for scan in scans]))
     told = found_scatter(linear_model_of(state), noise)
-    return PlannedCell(Cell(state.model, thinned_surface(cloud.points, cloud.normals), field, told.believed), (), told)
+    return PlannedCell(Cell(state.model, thinned_surface(points, normals), field, told.believed), (), told)
 
 
 def _part(session: Session, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:

@@ -59,25 +59,35 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no cloud
         raise InputError(f"{path}: cannot be read ({reason_of(error)}); export it again") from None
-    return _cloud(path, columns, scale)
+    return cloud_of_columns(path, columns, scale)
 
 
-def _cloud(path: Path, columns: dict[str, Array], scale: float) -> Cloud:
+def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float = 1.0) -> Cloud:
+    """Return a cloud from its columns (N,) by name: x, y, z, normals, and any scalar; points at 0 0 0 are left out.
+
+    Args:
+        where: file, or name of the scan, for messages.
+        columns: is emptied of what is taken, so that large scans are not held twice.
+        scale: turns the unit of the columns into the session's.
+
+    Raises:
+        InputError: no x, y, z, no points, or points that are not finite.
+    """
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
-        raise InputError(f"{path}: no column {', '.join(missing)}; a cloud needs x, y, z")
+        raise InputError(f"{where}: no column {', '.join(missing)}; a cloud needs x, y, z")
     points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64)
     if not len(points):
-        raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
+        raise InputError(f"{where}: no points; leave this view out of views.csv or scan it again")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
-        raise InputError(f"{path}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
+        raise InputError(f"{where}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
     # Structured exports write 0 0 0 for a pixel that measured nothing; the scanner's own place has no ray.
     x, y, z = points.T
     seen = (x != 0) | (y != 0) | (z != 0)
     if not seen.any():
         raise InputError(
-            f"{path}: all {len(points)} points are 0 0 0, nothing was measured; leave this view out of views.csv or "
+            f"{where}: all {len(points)} points are 0 0 0, nothing was measured; leave this view out of views.csv or "
             "scan it again"
         )
     normals = None

@@ -51,12 +51,23 @@ def read_depth(path: Path) -> Array:
     Raises:
         InputError: no depth image, no intrinsics, or those of another size of image.
     """
-    depth = _pixels(path)
-    camera = intrinsics_beside(path)
+    return lifted(path, _pixels(path), intrinsics_beside(path))
+
+
+def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
+    """Return (H, W, 3) points of a depth image (H, W), camera frame, NaN where nothing was measured.
+
+    Args:
+        where: file, or name of the scan, for messages.
+        depth: distance along the axis; 0, negative or NaN where nothing was measured.
+
+    Raises:
+        InputError: the intrinsics are those of another size of image.
+    """
     height, width = depth.shape
     if camera.size is not None and camera.size != (width, height):
         raise InputError(
-            f"{path}: {width}×{height} pixels, {camera.source.name} is of {camera.size[0]}×{camera.size[1]}; to fix: "
+            f"{where}: {width}×{height} pixels, {camera.source.name} is of {camera.size[0]}×{camera.size[1]}; to fix: "
             "put the intrinsics of this image there"
         )
     if not (0 <= camera.cx <= width and 0 <= camera.cy <= height):

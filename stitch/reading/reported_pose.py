@@ -58,16 +58,25 @@ def flange_pose(
         )
     reported = frames.from_quaternion(values[:3], values[3:] / norm)
     if robot is not None and from_joints is not None:
-        _agree(file, line, name, reported, from_joints, robot.metres_per_unit)
+        require_agreement(f"{file} line {line}: view {name}", reported, from_joints, robot.metres_per_unit)
     return reported
 
 
-def _agree(file: Path, line: int, name: str, reported: Array, from_joints: Array, metres: float) -> None:
+def require_agreement(where: str, reported: Array, from_joints: Array, metres: float) -> None:
+    """Refuse a reported pose (4, 4) that is not that of the joints.
+
+    Args:
+        where: row and view, for messages.
+        metres: in one length_unit.
+
+    Raises:
+        InputError: by how much they differ, and what to check.
+    """
     angle = float(frames.angle_between(reported, from_joints))
     distance = float(np.linalg.norm(reported[:3, 3] - from_joints[:3, 3]))
     reach = float(np.linalg.norm(from_joints[:3, 3]))
     if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
         raise InputError(
-            f"{file} line {line}: view {name}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
+            f"{where}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
             f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
         )

@@ -53,17 +53,35 @@ def _cloud(
         return None
     file = path / row.cloud
     try:
-        cloud = read(file)
-        if len(cloud.points) < _FEWEST:
-            raise InputError(
-                f"{file}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
-                "it again"
-            )
-        # Looked at before some are taken: each of them will be fused.
-        require_near(str(file), cloud.points * metres)
+        return checked_scan(row.name, str(file), partial(read, file), metres=metres, scanner=scanner, at_most=at_most)
     except InputError as error:
         raise InputError(f"view {row.name} (views.csv line {row.line}): {error}") from None
-    return cloud if at_most is None else thinned_cloud(row.name, cloud, at_most, scanner, partial(read, file))
+
+
+def checked_scan(
+    name: str, where: str, read: Callable[[], Cloud], *, metres: float, scanner: Scanner, at_most: int | None
+) -> Cloud:
+    """Read one scan, check it, and keep so many of its points in memory.
+
+    Args:
+        name: of the view.
+        where: file, or name of the scan, for messages.
+        read: gives the whole scan in length_unit, and once more when it is fused.
+        metres: in one length_unit.
+        at_most: points that stay in memory; None: all.
+
+    Raises:
+        InputError: too few points, or one farther away than any sensor sees.
+    """
+    cloud = read()
+    if len(cloud.points) < _FEWEST:
+        raise InputError(
+            f"{where}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
+            "it again"
+        )
+    # Looked at before some are taken: each of them will be fused.
+    require_near(where, cloud.points * metres)
+    return cloud if at_most is None else thinned_cloud(name, cloud, at_most, scanner, read)
 
 
 def _read(file: Path, scale: float, within: Array | None) -> Cloud:

@@ -39,6 +39,8 @@ class SessionFiles:
     frames: Columns | None = None  # view, x, y, z, qx, qy, qz, qw of a probe in the sensor's frame
     targets: Mapping[str, Array] = field(default_factory=dict)  # nominal places (3,), part frame
     copies: Sequence[Path] = ()  # files that lie beside session.toml, such as the part's CAD
+    texts: Mapping[str, str] = field(default_factory=dict)  # by file: others that lie there, such as a URDF
+    scalar: str = "<f4"  # in which type clouds hold their scalars; "<f8" keeps every digit
 
 
 def pose_columns(T: Array) -> dict[str, Array]:
@@ -97,11 +99,13 @@ def _write(folder: Path, session: SessionFiles) -> None:
     head = {"format": FORMAT, "name": session.name}
     head |= {"length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
+    for name, text in session.texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
     for file in session.copies:
         shutil.copyfile(file, folder / file.name)
     for name, cloud in session.clouds.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_ply(folder / name, cloud)
+        write_ply(folder / name, cloud, session.scalar)
     write_table(folder / "views.csv", session.views)
     for name, table in (("points.csv", session.points), ("frames.csv", session.frames)):
         if table is not None:
@@ -111,11 +115,13 @@ def _write(folder: Path, session: SessionFiles) -> None:
         write_table(folder / "targets.csv", {"target": list(session.targets), **dict(zip("xyz", xyz.T, strict=True))})
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
-    """Write one scan as binary PLY: places in double precision, its scalars in single precision."""
+def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
+    """Write one scan as binary PLY: places and normals in double precision, its scalars as `scalar` says."""
     # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
     columns = dict(zip("xyz", cloud.points.T, strict=True))
-    layout = [(axis, "<f8") for axis in columns] + [(name, "<f4") for name in cloud.scalars]
+    if cloud.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.T, strict=True))
+    layout = [(axis, "<f8") for axis in columns] + [(name, scalar) for name in cloud.scalars]
     vertex = np.empty(len(cloud.points), layout)
     for name, values in (columns | cloud.scalars).items():
         vertex[name] = values

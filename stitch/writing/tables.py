@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -45,7 +45,12 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
 
 
 def write_residuals(run: Run, path: Path) -> None:
-    """One row per residual of the model, before the register stage moves single views.
+    """Write the table of residuals as Parquet."""
+    pq.write_table(residual_table(run), path, compression="zstd")
+
+
+def residual_table(run: Run) -> Any:
+    """Return one row per residual of the model, before the register stage moves single views, as a pyarrow.Table.
 
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
     What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
@@ -62,7 +67,7 @@ def write_residuals(run: Run, path: Path) -> None:
     arrays = {
         key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()
     }
-    pq.write_table(pa.table(arrays), path, compression="zstd")
+    return pa.table(arrays)
 
 
 def _renamed(session: Session) -> Session:

@@ -2,10 +2,10 @@
 
 from rich.table import Table
 
-from stitch.cli.terminal.run_summary import hand_eye_lines
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL, RISE
+from stitch.model.hand_eye_uncertainty import hand_eye_lines
 from stitch.model.term import Term
 from stitch.runs.run import Run
 from stitch.system.console import console

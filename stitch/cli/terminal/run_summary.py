@@ -3,18 +3,15 @@
 import shlex
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.spatial.transform import Rotation
 
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_light, run_verdict
-from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import expanded
+from stitch.model.hand_eye_uncertainty import hand_eye_lines
 from stitch.runs.run import Run
 from stitch.system.console import console
-from stitch.units import METRES, known_text, length_text
+from stitch.units import length_text
 
 _FILES = ("stitched.ply", "mesh.ply", "recording.rrd", "report.html")
 
@@ -54,23 +51,6 @@ def show_light(terminal: Console, run: Run, tolerance: float | None) -> None:
     light = None if tolerance is None else run_light(run, model_history(run), tolerance)
     if light is not None:
         terminal.print(light.sentence, soft_wrap=True, style="bold")
-
-
-def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
-    """Position in mm and rotation vector in mrad with U (k = 2), both in the frame that carries the scanner."""
-    frame = "base" if mount == "eye_to_hand" else "flange"
-    to_mm = METRES[length_unit] * 1e3
-    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
-    U = expanded(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
-    position, turn = (
-        ", ".join(f"{axis} {known_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
-        for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
-    )
-    return [
-        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
-        f"  position {position} mm",
-        f"  rotation vector {turn} mrad",
-    ]
 
 
 def _unit(result: Run) -> str:

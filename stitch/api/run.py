@@ -1,0 +1,372 @@
+"""A run as people hold it: hand-eye, stitched cloud, views, residuals, and what is drawn and written of them."""
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stitch.api.session import Session, of_folder
+from stitch.errors import InputError
+from stitch.export.cloud_formats import Colours, coloured
+from stitch.frames import Array
+from stitch.measurement import session as measured
+from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
+from stitch.planning.expected_hand_eye import displacement
+from stitch.reading.session_hash import content_hash, measured_files
+from stitch.runs import run as runs
+from stitch.runs.recorder import Recorder
+from stitch.runs.run import FusedCloud, StageResult
+from stitch.units import METRES
+from stitch.writing import run_folder
+from stitch.writing.fit_report import fit_report
+from stitch.writing.recordings import recordings
+from stitch.writing.result_document import points_of
+from stitch.writing.tables import residual_table
+
+
+class AtPart(NamedTuple):
+    """How well the part is placed: expanded uncertainty U (k = 2) over all directions."""
+
+    mm: float  # of the middle of what the scanner saw
+    mrad: float
+
+
+@dataclass(frozen=True)
+class FittedHandEye:
+    """The hand-eye of a run: where the scanner sits on what carries it."""
+
+    pose: Array  # (4, 4) T_frame_scanner, length_unit
+    covariance: Array  # (6, 6) of pose·exp(ξ), scanner frame, rotation first; rad and length_unit
+    frame: str  # "base" (eye_to_hand) or "flange" (eye_in_hand)
+    length_unit: str
+    middle: Array  # (3,) of what the scanner saw, scanner frame, length_unit: where the part is
+
+    @property
+    def name(self) -> str:
+        """T_base_scanner or T_flange_scanner."""
+        return f"T_{self.frame}_scanner"
+
+    @property
+    def transform(self) -> Any:
+        """The pose as scipy's RigidTransform, length_unit.
+
+        Raises:
+            InputError: scipy is older than 1.16.
+        """
+        return rigid_transform(self.pose)
+
+    @property
+    def U(self) -> AtPart:
+        """U (k = 2) in mm and mrad at the part, for a complete model: over all directions, one number each."""
+        mm = 1e3 * METRES[self.length_unit]
+        turn = COVERAGE_FACTOR * float(np.sqrt(np.trace(self.covariance[:3, :3])))
+        return AtPart(displacement(self.covariance, self.middle) * mm, 1e3 * turn)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.array(self.pose, dtype=dtype)
+
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.5g}" for x in self.pose[:3, 3])
+        return (
+            f"FittedHandEye({self.name} at ({place}) {self.length_unit}, "
+            f"U at the part {self.U.mm:.2g} mm and {self.U.mrad:.2g} mrad)"
+        )
+
+
+@dataclass(frozen=True)
+class Stitched:
+    """The stitched cloud in the reference frame: the flange (eye_to_hand) or the base (eye_in_hand)."""
+
+    fused: FusedCloud
+    frame: str  # "flange" or "base"
+    length_unit: str
+
+    @property
+    def points(self) -> Array:
+        """(N, 3) length_unit."""
+        return self.fused.points
+
+    @property
+    def normals(self) -> Array:
+        """(N, 3) unit vectors."""
+        return self.fused.normals
+
+    @property
+    def residual(self) -> Array:
+        """(N,) rms distance of the views' surfaces from this one, length_unit; NaN where one view alone saw it."""
+        return self.fused.residual
+
+    @property
+    def count(self) -> Array:
+        """(N,) number of views that see the place."""
+        return self.fused.count
+
+    @property
+    def colours(self) -> Colours:
+        """(N, 3) bytes, by residual from dark to yellow; grey where one view alone saw it."""
+        return coloured(self.fused, self.length_unit).colours
+
+    def to_open3d(self, tensor: bool = False) -> Any:
+        """Return an Open3D PointCloud with normals and colours by residual; lengths in length_unit.
+
+        Args:
+            tensor: of Open3D's tensors, with `residual` and `count` (N, 1) beside.
+
+        Raises:
+            InputError: open3d is not installed.
+        """
+        o3d = _package("open3d")
+        if not tensor:
+            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(self.points, np.float64)))
+            cloud.normals = o3d.utility.Vector3dVector(np.array(self.normals, np.float64))
+            cloud.colors = o3d.utility.Vector3dVector(self.colours / 255)
+            return cloud
+        of_tensors = o3d.t.geometry.PointCloud(np.array(self.points, np.float64))
+        columns = {"normals": self.normals, "colors": self.colours / 255}
+        columns |= {"residual": self.residual[:, None], "count": self.count[:, None]}
+        for name, values in columns.items():
+            of_tensors.point[name] = np.array(values, np.float32)
+        return of_tensors
+
+    def to_trimesh(self) -> Any:
+        """Return a trimesh.PointCloud with colours by residual; lengths in length_unit.
+
+        Its metadata holds `normals` (N, 3), `residual` (N,) and `count` (N,).
+        """
+        import trimesh
+
+        cloud = trimesh.PointCloud(np.array(self.points), colors=self.colours)
+        cloud.metadata |= {"normals": self.normals, "residual": self.residual, "count": self.count}
+        return cloud
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        return f"Stitched({len(self):,} points in the frame of the {self.frame}, {self.length_unit})"
+
+
+@dataclass(frozen=True)
+class RunView:
+    """One view as the run puts it."""
+
+    name: str
+    pose: Array  # (4, 4) T_reference_scanner after register, length_unit
+    pose_model: Array  # (4, 4) of robot, hand-eye and effects alone
+    correction: Array  # (6,) twist in the reference frame, pose = exp(correction)·pose_model; rad and length_unit
+    rms: float  # of its distances from the others, length_unit
+    points: int  # that were scanned, with labelled ones
+
+    @property
+    def transform(self) -> Any:
+        """`pose` as scipy's RigidTransform.
+
+        Raises:
+            InputError: scipy is older than 1.16.
+        """
+        return rigid_transform(self.pose)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Run(runs.Run):
+    """Everything that a run found of one session; lengths in the session's length_unit, angles in rad.
+
+    `print(run)` writes it as one block; in a notebook the last line of a cell shows the part as report.html does.
+
+    Example:
+        >>> run
+        Run('s', 5 views, residual 0.0... mm, held-out 0.0... mm, Model(hand-eye at (...), no effects, 0 targets))
+        >>> run.hand_eye.pose.shape, run.hand_eye.covariance.shape, run.hand_eye.frame
+        ((4, 4), (6, 6), 'flange')
+        >>> run.hand_eye.U.mm < 1 and run.hand_eye.U.mrad < 1
+        True
+        >>> run.stitched.points.shape[1], run.stitched.frame
+        (3, 'base')
+        >>> run.views[0].name, run.views[0].pose.shape
+        ('v000', (4, 4))
+        >>> run.residuals.column_names[:3]
+        ['view', 'partner', 'x']
+        >>> print(run)
+        [[s]] 5 views, eye_in_hand, mm
+        ...
+    """
+
+    measured: Session | None = None  # with the views that were left out
+    watched: tuple[tuple[str, tuple[Any, ...]], ...] = ()  # what a recorder would have been told, for `save`
+
+    @property
+    def hand_eye(self) -> FittedHandEye:
+        """Where the scanner sits: pose (4, 4), covariance (6, 6), and U in mm and mrad at the part."""
+        middle = np.mean([points.mean(axis=0) for points in self.measurement.capture.point_sets], axis=0)
+        frame = "base" if self.session.mount == "eye_to_hand" else "flange"
+        return FittedHandEye(self.T_mount, self.mount_covariance, frame, self.session.length_unit, middle)
+
+    @property
+    def stitched(self) -> Stitched:
+        """The stitched cloud (N, 3) with normals and residuals, reference frame."""
+        frame = "flange" if self.session.mount == "eye_to_hand" else "base"
+        return Stitched(self.fused, frame, self.session.length_unit)
+
+    @property
+    def views(self) -> tuple[RunView, ...]:
+        """The views that were fused, in the session's order; the others stand in `left_out`."""
+        return tuple(
+            RunView(
+                name=view.name,
+                pose=self.poses[v],
+                pose_model=self.poses_model[v],
+                correction=self.corrections[v],
+                rms=float(self.view_rms[v]),
+                points=points_of(view),
+            )
+            for v, view in enumerate(self.session.views)
+        )
+
+    @property
+    def residuals(self) -> Any:
+        """A pyarrow.Table as residuals.parquet has it: a row per residual, before register moves single views.
+
+        Columns: view, partner, x, y, z, nx, ny, nz (reference frame), residual (length_unit), time_s, every covariate.
+        """
+        return residual_table(self)
+
+    def save(
+        self, folder: Path | str, *, force: bool = False, recording: bool = True, tolerance: float | None = None
+    ) -> Path:
+        """Write the run folder that `stitch run` writes of the same data, and return its path.
+
+        A session that lies in no folder is written beside it, as FOLDER-session, so that every command works on the
+        run. What a run wrote there before is replaced; other files stay.
+
+        Args:
+            force: replace the run of another session too.
+            recording: write recording.rrd.
+            tolerance: within which the views have to agree on the part, length_unit: for the page's light.
+
+        Raises:
+            InputError: the folder is no place for this run, or FOLDER-session holds another session.
+
+        Example:
+            >>> saved = run.save(folder / "runs" / "bracket", recording=False)
+            >>> sorted(path.name for path in saved.iterdir())[:3]
+            ['ledger.json', 'model.toml', 'report.html']
+        """
+        folder = Path(folder)
+        whole = self.measured or of_folder(self.session)
+        path = _saved_beside(whole, folder) if whole.in_memory else whole.path
+        own = replace(self, session=replace(self.session, path=path))
+        with run_folder.new_folder(folder, [path], force) as scratch:
+            for recorder in recordings(scratch) if recording else []:
+                for call, arguments in self.watched:
+                    getattr(recorder, call)(*arguments)
+                recorder.finish(own)
+            run_folder.write_with_page(own, scratch, tolerance)
+        return folder
+
+    def plot(self) -> Any:
+        """Return a matplotlib Figure: the part at every step of the model, coloured by how far its views disagree.
+
+        Of labelled points alone, how far each target lies off.
+
+        Raises:
+            InputError: no package that draws is installed.
+        """
+        draw = _offered("stitch.run_plots")
+        if draw is None:
+            raise InputError("run.plot: nothing that draws is installed; to fix: install stitch with its package viz")
+        return draw(self)
+
+    def _repr_html_(self) -> str:
+        """The viewer of report.html for a notebook; it asks no server. The report as text where nothing draws."""
+        show = _offered("stitch.notebook_views")
+        return f"<pre>{html.escape(str(self))}</pre>" if show is None else str(show(self))
+
+    def __str__(self) -> str:
+        return fit_report(self, self.hand_eye.U)
+
+
+class Watched:
+    """A recorder that keeps what it is told, so that a recording can be written once the run is saved."""
+
+    def __init__(self, told: Recorder | None = None) -> None:
+        self.told = told  # another recorder, which is told too
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+
+    def start(self, session: measured.Session) -> None:
+        """Begin again: a run that leaves views out starts anew with the others."""
+        self._keep("start", session)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Keep one iteration."""
+        self._keep("iteration", stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Keep the end of a stage."""
+        self._keep("stage", result, poses)
+
+    def finish(self, run: runs.Run) -> None:
+        """Pass on: who saves a run finishes its recording."""
+        if self.told is not None:
+            self.told.finish(run)
+
+    def _keep(self, call: str, *arguments: Any) -> None:
+        self.calls.append((call, arguments))
+        if self.told is not None:
+            getattr(self.told, call)(*arguments)
+
+
+def held(run: runs.Run, whole: Session | None, watched: Watched | None = None) -> Run:
+    """Return a run as people hold it.
+
+    Args:
+        whole: its session with the views that were left out; None: as the run has it.
+        watched: what was recorded of it.
+    """
+    own = {f.name: getattr(run, f.name) for f in fields(runs.Run)}
+    calls = () if watched is None else tuple(watched.calls)
+    return Run(**own | {"session": of_folder(run.session)}, measured=whole, watched=calls)
+
+
+def rigid_transform(pose: Array) -> Any:
+    """Return a pose (4, 4) as scipy's RigidTransform.
+
+    Raises:
+        InputError: scipy is older than 1.16.
+    """
+    kind = getattr(import_module("scipy.spatial.transform"), "RigidTransform", None)
+    if kind is None:
+        raise InputError("transform: scipy has no RigidTransform before 1.16; to fix: use pose, the matrix (4, 4)")
+    return kind.from_matrix(pose)
+
+
+def _saved_beside(session: Session, folder: Path) -> Path:
+    """FOLDER-session with the session in it; one that lies there already has to be the same."""
+    beside = folder.with_name(f"{folder.name}-session")
+    if not (beside / "session.toml").is_file():
+        return session.save(beside).path
+    with TemporaryDirectory(dir=beside.parent, prefix=f".{beside.name}.") as scratch:
+        again = session.save(Path(scratch) / beside.name).path
+        same = content_hash(again, measured_files(again)) == content_hash(beside, measured_files(beside))
+    if not same:
+        raise InputError(
+            f"{beside}: holds another session; to fix: save the run elsewhere, or run what session.save(FOLDER) returns"
+        )
+    return beside
+
+
+def _offered(group: str) -> Callable[[runs.Run], Any] | None:
+    """What another package offers under an entry-point group; None where there is none."""
+    return next((entry.load() for entry in entry_points(group=group)), None)
+
+
+def _package(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(f"to_{name}: {name} cannot be imported ({error}); to fix: pip install {name}") from None

@@ -1,0 +1,496 @@
+"""What was measured, from a folder or from arrays in memory, checked alike; and back into a folder."""
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from stitch.api.arrays import cloud_of, per_view, poses_of, sighting_of
+from stitch.calibrate.robot_table import repeatability_table, robot_toml
+from stitch.errors import InputError, NoResultError, StitchError
+from stitch.frames import Array
+from stitch.intake.cloud_pairs import pairings
+from stitch.intake.doctor import decide
+from stitch.intake.first_session import all_readings, capture_of
+from stitch.intake.one_frame import require_own_frames
+from stitch.intake.raw_poses import RawPoses
+from stitch.intake.stated import StatedFolder
+from stitch.intake.ways import MM
+from stitch.integrity.refusals import refuse_whole
+from stitch.integrity.relative_scans import relative_scans
+from stitch.measurement import session as measured
+from stitch.measurement.cloud import Cloud
+from stitch.measurement.robot import Robot, forward
+from stitch.measurement.session import Mount, Scanner, StatedRepeatability, View
+from stitch.measurement.thinning import ENOUGH
+from stitch.reading import scanner_toml, session_folder, session_toml
+from stitch.reading.names import require_folder_name, require_name
+from stitch.reading.plausible import check_scale
+from stitch.reading.reported_pose import require_agreement
+from stitch.reading.session_scans import checked_scan
+from stitch.reading.toml_file import choice
+from stitch.system.threads import parallel
+from stitch.units import METRES
+from stitch.writing.session_files import SessionFiles, pose_columns, table_text, write_session
+from stitch.writing.urdf_file import to_urdf
+
+# Two motions, the fewest that tell a reading.
+_FEWEST = 3
+# Names of views that can be those of files.
+_PLAIN = re.compile(r"[\w+-][\w.+-]*")
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Session(measured.Session):
+    """What was measured: views with a scan each, their poses, the scanner and the robot.
+
+    Lengths in `length_unit`, angles in rad. Scans lie in the scanner frame; a view's `T_base_flange` (4, 4) maps flange
+    to base. `stitch.load_session` makes one of a folder, `stitch.Session.from_arrays` of arrays in memory.
+
+    Example:
+        >>> session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", name="bracket")
+        >>> session
+        Session('bracket', eye_in_hand, 5 views of clouds)
+        >>> session.views[0].name, session.views[0].cloud.points.shape[1], session.views[0].T_base_flange.shape
+        ('v000', 3, (4, 4))
+    """
+
+    @classmethod
+    def from_arrays(
+        cls,
+        clouds: Sequence[Any] | Mapping[str, Any] | None,
+        poses: Any,
+        *,
+        mount: str,
+        joints: Any = None,
+        robot: Robot | Mapping[str, Any] | Path | str | None = None,
+        times: Any = None,
+        covariates: Mapping[str, Any] | None = None,
+        scanner: Scanner | Mapping[str, Any] | None = None,
+        points: Sequence[Any] | None = None,
+        unit: str = "mm",
+        cloud_unit: str | None = None,
+        name: str = "session",
+        check: bool = True,
+    ) -> "Session":
+        """Return the session of scans and poses in memory, checked as `stitch init` and `stitch check` check a folder.
+
+        The scans tell whether the poses are what they are said to be; a reading of them that brings the scans together
+        where the stated one does not is refused, with the sentence of `stitch check --deep`. Arrays are not copied
+        where a scan is large: leave them as they are until the run has ended.
+
+        Args:
+            clouds: one scan a view, scanner frame: (N, 3) or (H, W, 3) arrays, mappings such as {"points": (N, 3),
+                "normals": (N, 3), "colors": (N, 3), "intensity": (N,)}, `trimesh.PointCloud`, Open3D's PointCloud,
+                legacy or of tensors, or (depth image or RGBD image, intrinsics). A mapping names the views. None for
+                labelled points alone.
+            poses: T_base_flange of every view: (V, 4, 4), scipy's RigidTransform, (Rotation, (V, 3)), or a list of
+                one a view. None where joints and robot give them.
+            mount: "eye_to_hand", scanner fixed and part on the flange, or "eye_in_hand", scanner on the flange.
+            joints: (V, n) rad.
+            robot: a `Robot`, the [robot] table of session.toml as a mapping, or the path of a URDF.
+            times: (V,) s, not falling.
+            covariates: by name (V,) numbers that errors may follow, such as scanner_temperature_c; NaN: not known.
+            scanner: a `Scanner`, or the [scanner] table of session.toml as a mapping: pose (4, 4), noise, standoff.
+            points: one mapping a view from a target's name to its place (3,), sensor frame, or None.
+            unit: "mm" or "m", of all lengths.
+            cloud_unit: of the scans, where it is another.
+            name: of the session, for messages and folders.
+            check: False leaves the convention of the poses to the run, for views in their thousands.
+
+        Raises:
+            InputError: arrays that do not fit, sizes of another unit, or poses of another convention than stated.
+
+        Example:
+            >>> session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", unit="mm")
+            >>> inverted = np.linalg.inv(poses)
+            >>> try:
+            ...     stitch.Session.from_arrays(clouds, inverted, mount="eye_in_hand")
+            ... except stitch.InputError as error:
+            ...     print(str(error)[:92])
+            <session>: the poses contradict what was measured: inverse: the poses are T_flange_base: inv
+        """
+        toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
+        with _named(toml.parent.name):
+            known = _stated(toml, unit=unit, cloud_unit=cloud_unit, mount=mount, robot=robot, scanner=scanner)
+            names, scans = _views_of(clouds, poses, joints, points)
+            T, q = _arm(known, names, poses, joints)
+            rows = _rows(known, names, scans, points)
+            views = _described(rows, T, q, times, covariates or {})
+            session = cls(
+                path=toml.parent,
+                name=name,
+                length_unit=unit,
+                mount=cast(Mount, mount),
+                scanner=known.scanner,
+                robot=known.robot,
+                sphere_radius=None,
+                cad=None,
+                cad_unit=None,
+                views=views,
+                repeatability=known.repeatability,
+            )
+            check_scale(session, known.cloud_unit)
+            if check:
+                _check_convention(session)
+        return session
+
+    @property
+    def in_memory(self) -> bool:
+        """True if the session lies in no folder."""
+        return not (self.path / "session.toml").is_file()
+
+    def save(self, folder: Path | str) -> "Session":
+        """Write the session into a new folder, whole or not at all, and return it as it lies there.
+
+        `stitch run FOLDER` then does with it what `stitch.run(session)` does. Rotations are written as quaternions,
+        whose last digit may differ.
+
+        Raises:
+            InputError: the folder exists and is not empty.
+
+        Example:
+            >>> session.save(folder / "bracket").in_memory
+            False
+            >>> sorted(path.name for path in (folder / "bracket").iterdir())
+            ['clouds', 'session.toml', 'views.csv']
+        """
+        folder = Path(folder)
+        write_session(folder, _files_of(self))
+        return replace(self, path=folder)
+
+
+def load_session(
+    path: Path | str,
+    scans: bool = True,
+    start: Array | None = None,
+    at_most: int | None = ENOUGH,
+    memory: float | None = None,
+) -> Session:
+    """Read and check a session folder.
+
+    Args:
+        scans: False reads neither clouds nor labelled points, for questions about the arm alone.
+        at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
+        memory: bytes within which a run of the session has to stay; may be less than `at_most` asks for.
+        start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
+
+    Raises:
+        InputError: anything missing, contradictory or implausible; names file, line or view, and how to fix it.
+
+    Example:
+        >>> stitch.load_session(session_folder)
+        Session('s', eye_in_hand, 5 views of clouds)
+    """
+    return of_folder(session_folder.load_session(path, scans, start, at_most, memory))
+
+
+def of_folder(session: measured.Session) -> Session:
+    """Return a session that was read as the one that people hold."""
+    if isinstance(session, Session):
+        return session
+    return Session(**{f.name: getattr(session, f.name) for f in fields(measured.Session)})
+
+
+@dataclass(frozen=True)
+class _Stated:
+    """What was said of the cell, checked."""
+
+    unit: str
+    cloud_unit: str
+    scanner: Scanner
+    robot: Robot | None
+    repeatability: StatedRepeatability
+
+    @property
+    def scale(self) -> float:
+        """Turns the unit of the scans into the session's."""
+        return METRES[self.cloud_unit] / METRES[self.unit]
+
+
+def _stated(
+    toml: Path,
+    *,
+    unit: str,
+    cloud_unit: str | None,
+    mount: str,
+    robot: Any,
+    scanner: Scanner | Mapping[str, Any] | None,
+) -> _Stated:
+    """As a session.toml with the same entries is read."""
+    cloud_unit = cloud_unit or unit
+    for key, value, known in (
+        ("unit", unit, tuple(METRES)),
+        ("cloud_unit", cloud_unit, tuple(METRES)),
+        ("mount", mount, get_args(Mount)),
+    ):
+        choice(toml, {key: value}, key, known)
+    if not isinstance(scanner, Scanner):
+        scanner = scanner_toml.scanner(toml, dict(scanner or {}))
+    if robot is None or isinstance(robot, Robot):
+        return _Stated(unit, cloud_unit, scanner, robot, StatedRepeatability())
+    table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
+    stated = session_toml.repeatability(toml, table)
+    return _Stated(unit, cloud_unit, scanner, session_toml.robot(toml, table, unit), stated)
+
+
+def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
+    """Names of the views, and their scans; None where there are none."""
+    if isinstance(clouds, Mapping):
+        names = [require_name("clouds", str(key), "view") for key in clouds]
+        return names, list(clouds.values())
+    given = [x for x in (clouds, points, joints, poses) if x is not None]
+    if not given or (clouds is None and points is None):
+        raise InputError("clouds: none, and no labelled points; to fix: pass one of the two, one a view")
+    scans = list(clouds) if clouds is not None else [None] * len(given[0])
+    return [f"v{i:03d}" for i in range(len(scans))], scans
+
+
+def _arm(known: _Stated, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:
+    """T_base_flange (V, 4, 4) and joint angles (V, n) rad, which agree."""
+    count = len(names)
+    q = None if joints is None else per_view(joints, count, "joints", 2)
+    if q is not None and known.robot is not None and q.shape[1] != known.robot.n_joints:
+        raise InputError(f"joints: {q.shape[1]} a view, the robot has {known.robot.n_joints}; to fix: pass one a joint")
+    if q is not None and not np.isfinite(q).all():
+        raise InputError("joints: some are not finite; to fix: leave those views out")
+    from_joints = None if q is None or known.robot is None else forward(known.robot, q)
+    if poses is None:
+        if from_joints is None:
+            raise InputError("poses: none; to fix: pass them, or joints with the robot")
+        return from_joints, q
+    T = poses_of(poses, "poses")
+    if len(T) != count:
+        raise InputError(f"poses: {len(T)} for {count} views; to fix: pass one a view, in the same order")
+    if from_joints is not None:
+        for name, reported, own in zip(names, T, from_joints, strict=True):
+            require_agreement(f"view {name}", reported, own, METRES[known.unit])
+    return T, q
+
+
+def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> list[View]:
+    """Views with what was seen, at no pose yet."""
+    if points is not None and len(points) != len(names):
+        raise InputError(f"points: {len(points)} for {len(names)} views; to fix: pass one mapping a view, or None")
+
+    def scan(at: int) -> Cloud | None:
+        if scans[at] is None:
+            return None
+        where = f"view {names[at]}"
+        read = partial(cloud_of, scans[at], where, known.scale)
+        metres = METRES[known.unit]
+        return checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=ENOUGH)
+
+    seen = parallel(scan, range(len(names)), "reading scans")
+    return [
+        View(
+            name=view,
+            cloud=cloud,
+            T_base_flange=np.eye(4),
+            joints=None,
+            approach=None,
+            time_s=None,
+            covariates={},
+            sighting=None if points is None else sighting_of(points[v], f"view {view}"),
+        )
+        for v, (view, cloud) in enumerate(zip(names, seen, strict=True))
+    ]
+
+
+def _described(
+    rows: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
+) -> tuple[View, ...]:
+    """The views with poses, times and covariates."""
+    count = len(rows)
+    time = None if times is None else per_view(times, count, "times")
+    if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
+        raise InputError(
+            "times: not finite, or a later view stands before an earlier one; to fix: sort the views by time"
+        )
+    columns = {str(key): per_view(values, count, f"covariates {key}") for key, values in covariates.items()}
+    # As in views.csv: the sign of the difference to the view before.
+    approach = None if q is None else np.sign(np.diff(q, axis=0, prepend=q[:1]))
+    return tuple(
+        replace(
+            row,
+            T_base_flange=T[v],
+            joints=None if q is None else q[v],
+            approach=None if approach is None else approach[v],
+            time_s=None if time is None else float(time[v]),
+            covariates={key: float(x[v]) for key, x in columns.items() if np.isfinite(x[v])},
+        )
+        for v, row in enumerate(rows)
+    )
+
+
+def _check_convention(session: Session) -> None:
+    """Refuse poses that the scans contradict, tried in both directions and in other orders as `stitch init` does.
+
+    Raises:
+        InputError: another reading of the poses brings the scans together, or they lie in one frame already.
+    """
+    if session.has_clouds and _told_as_stated(session):
+        return
+    # That nothing overlaps under any reading is for the run to say, which names the mistakes that it knows.
+    with suppress(NoResultError):
+        refuse_whole(session)
+
+
+def _told_as_stated(session: Session) -> bool:
+    """True if the scans tell one reading of the poses from all others, and it is the one that was stated."""
+    T = np.array([view.T_base_flange for view in session.views])
+    if len(T) < _FEWEST:
+        return False
+    clouds = [view.cloud for view in session.views if view.cloud is not None]
+    raw = RawPoses(str(session.path), None, T.reshape(-1, 16), ((),) * len(T), "an array")
+    stated = StatedFolder(length_unit=session.length_unit)
+    capture = capture_of(clouds, METRES[session.length_unit] / MM)
+    motions = cache(lambda: relative_scans(capture))
+    pairs = pairings([Path("scan")] * len(T), raw.labels)
+    decided = decide(capture, motions, all_readings(raw, None, stated), pairs, [session.length_unit])
+    require_own_frames(session.path, motions, decided)
+    way = decided.best.way
+    in_order = way.pairing.rows == tuple(range(len(T)))
+    return decided.told and in_order and way.carries == (session.mount == "eye_in_hand")
+
+
+@contextmanager
+def _named(path: str) -> Iterator[None]:
+    """Say of a session in memory what is said of one in a folder, without the files that it does not have."""
+    try:
+        yield
+    except StitchError as error:
+        text = str(error)
+        for file in ("/session.toml", "/views.csv"):
+            text = text.replace(f"{path}{file}", path)
+        raise type(error)(text) from None
+
+
+class _WholeClouds(Mapping[str, Cloud]):
+    """Every point of every scan by its file, in memory one scan after the other."""
+
+    def __init__(self, clouds: dict[str, Cloud]) -> None:
+        self.clouds = clouds
+
+    def __getitem__(self, file: str) -> Cloud:
+        cloud = self.clouds[file]
+        return cloud if cloud.whole is None else cloud.whole.read()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.clouds)
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+
+def _files_of(session: measured.Session) -> SessionFiles:
+    """Everything that a folder of the session holds."""
+    plain = all(_PLAIN.fullmatch(name) for name in session.names)
+    files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
+    clouds = {file: view.cloud for file, view in zip(files, session.views, strict=True) if view.cloud is not None}
+    points, probes = _seen(session)
+    tables, texts = _tables(session)
+    if session.nominal is not None:
+        own = session.nominal
+        columns = {"target": list(own.targets), **dict(zip("xyz", map(_digits, own.points.T), strict=True))}
+        known = {"sigma": [_cell(x) for x in own.sigma]} if np.isfinite(own.sigma).any() else {}
+        texts["targets.csv"] = table_text(columns | known)
+    return SessionFiles(
+        name=session.name,
+        length_unit=session.length_unit,
+        mount=session.mount,
+        views=_view_columns(session, files if clouds else None),
+        tables=tables,
+        clouds=_WholeClouds(clouds),
+        points=points,
+        frames=probes,
+        copies=() if session.cad is None else (session.cad,),
+        texts=texts,
+        scalar="<f8",
+    )
+
+
+def _view_columns(session: measured.Session, files: list[str] | None) -> dict[str, list[str]]:
+    """views.csv with all digits; an empty cell where nothing is known."""
+    views = session.views
+    columns: dict[str, list[str]] = {"view": session.names}
+    if files is not None:
+        columns["cloud"] = [file if view.cloud else "" for file, view in zip(files, views, strict=True)]
+    if any(view.time_s is not None for view in views):
+        columns["time_s"] = [_cell(view.time_s) for view in views]
+    count = next((len(view.joints) for view in views if view.joints is not None), 0)
+    for i in range(count):
+        columns[f"j{i + 1}_deg"] = [_cell(None if v.joints is None else float(np.degrees(v.joints[i]))) for v in views]
+    columns |= {name: _digits(x) for name, x in pose_columns(np.array([v.T_base_flange for v in views])).items()}
+    for i in range(count):
+        columns[f"j{i + 1}_approach"] = ["" if v.approach is None else f"{v.approach[i]:.0f}" for v in views]
+    names = dict.fromkeys(name for view in views for name in view.covariates)
+    return columns | {name: [_cell(view.covariates.get(name)) for view in views] for name in names}
+
+
+def _seen(session: measured.Session) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
+    """Columns of points.csv, or of frames.csv where views show a probe."""
+    rows = [(view.name, view.sighting) for view in session.views if view.sighting is not None]
+    if not rows:
+        return None, None
+    if all(sighting.rotation is None for _, sighting in rows):
+        table = [
+            [name, target, *_digits(place), _cell(sigma)]
+            for name, own in rows
+            for target, place, sigma in zip(own.targets, own.points, own.sigma, strict=True)
+        ]
+        return _columns(("view", "target", "x", "y", "z", "sigma"), table), None
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    for v, (_, own) in enumerate(rows):
+        T[v, :3, 3] = own.points[0]
+        T[v, :3, :3] = np.eye(3) if own.rotation is None else own.rotation
+    columns = {"view": [name for name, _ in rows], **{key: _digits(x) for key, x in pose_columns(T).items()}}
+    columns["sigma"] = [_cell(own.sigma[0]) for _, own in rows]
+    columns["sigma_deg"] = [_cell(float(np.degrees(own.sigma_rotation))) for _, own in rows]
+    return None, columns
+
+
+def _columns(names: Sequence[str], rows: list[list[str]]) -> dict[str, list[str]]:
+    """Columns of a table; one in which nothing stands is left out."""
+    columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+    return {name: column for name, column in columns.items() if any(column)}
+
+
+def _tables(session: measured.Session) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Tables of session.toml beside its head, and texts that lie beside it."""
+    own, texts = session.scanner, dict[str, str]()
+    scanner: dict[str, Any] = {"optical_axis": "-z" if own.optical_axis[2] < 0 else "+z"}
+    scanner |= {} if own.T_mount is None else {"pose": own.T_mount.tolist()}
+    known = (("noise", own.noise), ("standoff", own.standoff), ("kind", own.kind))
+    scanner |= {key: value for key, value in known if value is not None}
+    tables: dict[str, dict[str, Any]] = {"scanner": scanner}
+    if session.robot is not None:
+        told = robot_toml(session.robot)
+        if told is None:
+            texts["robot.urdf"] = to_urdf(session.robot)
+            links = {"urdf": "robot.urdf", "base_link": "base_link", "flange_link": "flange"}
+            tables["robot"] = {**links, "gravity": session.robot.gravity.tolist()}
+        else:
+            tables |= tomllib.loads(told)
+    if stated := repeatability_table(session.repeatability):
+        tables.setdefault("robot", {})["repeatability"] = stated
+    if session.sphere_radius is not None:
+        tables["sphere"] = {"radius": session.sphere_radius}
+    if session.cad is not None:
+        tables["part"] = {"cad": session.cad.name, "cad_unit": session.cad_unit or session.length_unit}
+    return tables, texts
+
+
+def _digits(values: Array) -> list[str]:
+    """Numbers that read back as they are."""
+    return [repr(float(x)) for x in values]
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None or not np.isfinite(value) else repr(float(value))

@@ -1,0 +1,380 @@
+"""What the commands do, from Python: run, diagnose, add, drop, compare, explain, plan, export."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch import pipeline, revision
+from stitch.api.run import Run, Watched, held
+from stitch.api.session import Session, of_folder
+from stitch.comparison.compare_surfaces import compare as compare_surfaces
+from stitch.comparison.compare_targets import compare_targets
+from stitch.comparison.tables import Comparison
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.effects.in_session import known, require
+from stitch.errors import InputError
+from stitch.explanation import explain as explanation
+from stitch.explanation.explain import NAME, Explanation
+from stitch.export.arm_formats import ARM_FORMATS
+from stitch.export.arm_model import arm_from
+from stitch.export.cloud_formats import CLOUD_FORMATS, coloured
+from stitch.export.hand_eye import hand_eye_from
+from stitch.export.hand_eye_formats import FORMATS
+from stitch.frames import Array
+from stitch.measurement import session as measured
+from stitch.model.arm import kept_arm
+from stitch.model.model_toml import ModelFile
+from stitch.planning import plan as planning
+from stitch.planning.cells import PlannedCell, cell_of_session, cell_of_state
+from stitch.planning.plan import Plan, Wanted
+from stitch.runs import run as runs
+from stitch.runs.recorder import Recorder
+from stitch.runs.state import State, state_of
+from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import stored_run
+from stitch.system.whole_file import whole
+from stitch.writing.diagnosis_document import diagnosis_document
+from stitch.writing.result_document import model_of, result_document
+
+
+def run(
+    session: measured.Session,
+    model: ModelFile | runs.Run | None = None,
+    recorder: Recorder | None = None,
+    effects: Sequence[str] = (),
+    keep: bool = False,
+    arm: ModelFile | runs.Run | None = None,
+) -> Run:
+    """Stitch one session: correct the hand-eye from the scans, register, fuse.
+
+    Args:
+        model: a run, or a model that was read, whose hand-eye and effects are used as they are.
+        recorder: is told of every stage.
+        effects: names of effects to fit together with the hand-eye.
+        keep: fuse also the views that do not belong.
+        arm: a run, or a model, of whose joints and links the effects stay as they are, while all else is fitted.
+
+    Returns:
+        The run: hand-eye (4, 4) in the mount frame, poses (V, 4, 4) and cloud (N, 3) in the reference frame; lengths in
+        the session's length_unit, angles in rad.
+
+    Raises:
+        InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
+        NoResultError: no hand-eye was found, or the views do not overlap.
+
+    Example:
+        >>> run = stitch.run(session)
+        >>> run.hand_eye.pose.shape
+        (4, 4)
+    """
+    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm)[0]
+
+
+def run_rig(
+    sessions: Sequence[measured.Session],
+    model: ModelFile | runs.Run | None = None,
+    recorders: Sequence[Recorder] | None = None,
+    effects: Sequence[str] = (),
+    keep: bool = False,
+    arm: ModelFile | runs.Run | None = None,
+) -> list[Run]:
+    """Stitch several sessions of one rig with one common hand-eye and common effects; one run a session.
+
+    Args:
+        sessions: of one scanner on one mount, in one length_unit.
+        model, recorders, effects, keep, arm: as `stitch.run` takes them, a recorder a session.
+
+    Returns:
+        A run a session, shapes and frames as of `stitch.run`; their hand-eyes (4, 4) are the same.
+
+    Raises:
+        InputError: sessions of different rigs, and as `stitch.run`.
+        NoResultError: as `stitch.run`.
+
+    Example:
+        >>> runs = stitch.run_rig([session, replace(other, name="other")])
+        >>> bool((runs[0].T_mount == runs[1].T_mount).all())
+        True
+    """
+    told: Sequence[Recorder | None] = recorders or [None] * len(sessions)
+    watched = [Watched(recorder) for recorder in told]
+    stated = None if arm is None else kept_arm(_model(arm)) if isinstance(arm, runs.Run) else arm
+    found = pipeline.run_rig(sessions, None if model is None else _model(model), watched, _names(effects), keep, stated)
+    return [held(own, of_folder(session), w) for own, session, w in zip(found, sessions, watched, strict=True)]
+
+
+def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool = False) -> Run:
+    """Read a run folder; its session is read again and nothing is fitted.
+
+    Args:
+        effects_file: Python file of effects, in place of the one that the model names.
+        trust: run the file that the model names.
+
+    Returns:
+        The run with the numbers of its files, shapes and frames as of `stitch.run`; its residuals are found anew.
+
+    Raises:
+        InputError: no run folder, a damaged one, or its session has gone.
+
+    Example:
+        >>> saved = run.save(folder / "again", recording=False)
+        >>> again = stitch.load_run(saved)
+        >>> bool((again.T_mount == run.T_mount).all())
+        True
+    """
+    folder = Path(folder)
+    state = load_state(folder, effects_file, trust=trust)
+    return held(stored_run(folder, state), None)
+
+
+def diagnose(run: runs.Run | State) -> Diagnosis:
+    """Say which effect is missing in the model of a run, as `stitch diagnose` does.
+
+    Args:
+        run: a run, or the state of one.
+
+    Returns:
+        Verdict, sentence and candidates; sizes in rad and in the session's length_unit, of the flange's poses.
+
+    Raises:
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> found = stitch.diagnose(run)
+        >>> found.verdict in ("adequate", "missing_effect", "cannot_tell", "unknown_effect")
+        True
+    """
+    return pipeline.diagnose(run)
+
+
+def add(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Return the run with further effects in its model, hand-eye and all effects fitted anew.
+
+    Args:
+        effects: names of the library, such as those that a diagnosis has in `effects`.
+        recorder: is told of every stage.
+
+    Returns:
+        A new run, shapes and frames as of `stitch.run`; its `ledger` has one step more.
+
+    Raises:
+        InputError: an effect that is not known, that the session cannot have, or that is in the model already.
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> better = stitch.add(run, "mount_thermal_drift" if "mount_temperature_c" in known else "range_scale")
+        >>> len(better.ledger)
+        2
+    """
+    state = _state(run)
+    for name in effects:
+        require(state.measurement, known(name))
+        if name in state.model.effects:
+            raise InputError(f"{name} is in the model of {state.session.name} already; to fix: leave it out")
+    return _changed(run, [*state.model.effects, *effects], recorder)
+
+
+def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Return the run without some effects, hand-eye and the rest fitted anew.
+
+    Args:
+        effects: names of effects that are in the model.
+        recorder: is told of every stage.
+
+    Returns:
+        A new run, shapes and frames as of `stitch.run`; its `ledger` has one step more.
+
+    Raises:
+        InputError: an effect that is not in the model.
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> stitch.drop(better, *better.effects).effects
+        []
+    """
+    used = _state(run).model.effects
+    for name in effects:
+        if name not in used:
+            where = _state(run).session.name
+            raise InputError(f"{name} is not in the model of {where}; in it are {', '.join(used) or 'none'}")
+    return _changed(run, [name for name in used if name not in effects], recorder)
+
+
+def compare(run: runs.Run | State) -> Comparison:
+    """Set the residuals of a run against everything that is known of its views, as `stitch compare` does.
+
+    Returns:
+        Tables by view, pair, joint, place on the part (reference frame), field, time; lengths in length_unit.
+
+    Raises:
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> found = stitch.compare(run)
+        >>> found.rms > 0, len(found.table("view").label)
+        (True, 5)
+    """
+    state = _state(run)
+    return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
+
+
+def explain(run: runs.Run | State) -> Explanation:
+    """Look for a formula of what the model of a run leaves, as `stitch explain` does.
+
+    Returns:
+        `found`, `why` in a sentence, `formula` in rad and length_unit, and `source`, a Python file of effects.
+
+    Raises:
+        InputError: a formula of such a search is in the model already.
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> stitch.explain(run).found
+        False
+    """
+    state = _state(run)
+    if NAME in state.model.effects:
+        raise InputError(
+            f"{state.session.name}: has an effect {NAME!r} in its model; to fix: give it another name in its file, "
+            "and add that"
+        )
+    return explanation.explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
+
+
+def plan(
+    cell: measured.Session | runs.Run,
+    *,
+    views: int | None = None,
+    split: tuple[str, str] | None = None,
+    halve: bool = False,
+    feature: Any = None,
+    part: Path | str | None = None,
+    size: float | None = None,
+    field: float | None = None,
+) -> Plan:
+    """Say what views would tell before they are taken, and which further ones bring most, as `stitch plan` does.
+
+    Args:
+        cell: a run, which knows its cell, or a session whose views are planned.
+        views: at most so many further ones.
+        split: two effects that they are to tell apart.
+        halve: they are to halve the uncertainty of the hand-eye and nothing else.
+        feature: (3,) at which the uncertainty counts, reference frame, length_unit.
+        part: mesh, or cloud with normals, of a session's part.
+        size: its longest side, mm, where nothing else is known.
+        field: full angle of the scanner's field, degrees.
+
+    Returns:
+        `now`, `proposed` with joints (n,) in rad and T_base_flange (4, 4) in length_unit, and `after`.
+
+    Raises:
+        InputError: an effect that is not known, or a cell of which too little is.
+
+    Example:
+        >>> outlook = stitch.plan(run, views=2).now
+        >>> outlook.views
+        5
+    """
+    for name in split or ():
+        known(name)
+    at = None if feature is None else np.asarray(feature, float).reshape(3)
+    wanted = Wanted(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
+    if isinstance(cell, runs.Run):
+        return planning.plan(cell.session, _cell_of(cell), wanted)
+    planned = cell_of_session(cell, None if part is None else Path(part), size, field)
+    return planning.plan(cell, planned, wanted)
+
+
+def export_run(
+    run: runs.Run,
+    to: str,
+    file: Path | str | None = None,
+    *,
+    parent: str | None = None,
+    child: str = "scanner",
+    diagnosis: Diagnosis | None = None,
+) -> str | None:
+    """Give what a run found to other programs, as `stitch export RUN --to` does.
+
+    It is not called `stitch.export`, which is the package that does it.
+
+    Args:
+        to: ros, urdf, opencv, zivid, kuka, fanuc, abb or ur for the hand-eye; arm-dh or arm-urdf; ply, pcd, las, laz,
+            e57 or glb for the stitched cloud.
+        file: is written, whole or not at all; a cloud needs one.
+        parent, child: names of the frames that carry the scanner and are the scanner's own.
+        diagnosis: of the run; what is written says what it found.
+
+    Returns:
+        The text, with lengths in the unit of the format and T_parent_child as its frames; None of a cloud.
+
+    Raises:
+        InputError: a format that is not known, no file for a cloud, or a run that has no such thing.
+
+    Example:
+        >>> "T_flange_scanner" in stitch.export_run(run, "ros")
+        True
+        >>> stitch.export_run(run, "ply", folder / "cloud.ply")
+    """
+    path = None if file is None else Path(file)
+    if to in CLOUD_FORMATS:
+        _cloud(run, to, path)
+        return None
+    if to in ARM_FORMATS:
+        session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
+        text = ARM_FORMATS[to](arm_from(session, model_of(run)))
+    elif to in FORMATS:
+        told = {} if diagnosis is None else diagnosis_document(diagnosis)
+        text = FORMATS[to](hand_eye_from(result_document(run), model_of(run), told, parent, child))
+    else:
+        raise InputError(f"{to}: no such format; to fix: one of {', '.join((*FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}")
+    if path is not None:
+        with whole(path) as out:
+            out.write_text(text, encoding="utf-8")
+    return text
+
+
+def _cloud(run: runs.Run, to: str, file: Path | None) -> None:
+    """Write the stitched cloud; precision as of stitched.ply, which holds it in a run folder."""
+    if file is None or file.suffix.lower() != f".{to}":
+        raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
+    if not len(run.fused.points):
+        raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
+    names = ("points", "normals", "residual")
+    fused = replace(run.fused, **{name: _single(getattr(run.fused, name)) for name in names})
+    with whole(file) as out:
+        CLOUD_FORMATS[to][0](coloured(fused, run.session.length_unit), out)
+
+
+def _single(values: Array) -> Array:
+    """Numbers with the digits that a file of single precision keeps."""
+    return np.asarray(values, np.float32).astype(np.float64)
+
+
+def _model(model: ModelFile | runs.Run) -> ModelFile:
+    return model_of(model) if isinstance(model, runs.Run) else model
+
+
+def _names(effects: Sequence[str]) -> list[str]:
+    """Names of effects, each of which is known."""
+    return [known(name).name for name in effects]
+
+
+def _state(run: runs.Run | State) -> State:
+    return state_of(run) if isinstance(run, runs.Run) else run
+
+
+def _changed(run: runs.Run | State, effects: Sequence[str], recorder: Recorder | None) -> Run:
+    watched = Watched(recorder)
+    whole_session: Session | None = run.measured if isinstance(run, Run) else None
+    return held(revision.change(_state(run), effects, watched), whole_session, watched)
+
+
+def _cell_of(run: runs.Run) -> PlannedCell:
+    if not run.session.has_clouds:
+        raise InputError(f"{run.session.name}: a run of labelled points; plans are made for scans; to fix: diagnose it")
+    return cell_of_state(state_of(run), _single(run.fused.points), _single(run.fused.normals))

@@ -1,0 +1,63 @@
+"""A run as one block of text: what was found, how well, what is in the model and what is not."""
+
+from collections.abc import Sequence
+
+from stitch.comparison.model_history import change_of, model_history
+from stitch.comparison.run_verdict import run_verdict
+from stitch.model.hand_eye_uncertainty import hand_eye_lines
+from stitch.runs.run import Run
+from stitch.units import angle_text, length_text, uncertainty_text
+
+
+def fit_report(run: Run, at_part: tuple[float, float]) -> str:
+    """Return the block, as lmfit's fit_report has it: a heading in double brackets, and its lines.
+
+    Args:
+        at_part: U (k = 2) of the hand-eye at the part, mm and mrad.
+    """
+    session = run.session
+    left = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
+    head = f"[[{session.name}]] {len(session.views)}{left} views, {session.mount}, {session.length_unit}"
+    name, *numbers = hand_eye_lines(run.T_mount, run.mount_covariance, session.mount, session.length_unit)
+    place, turn = (uncertainty_text(x) if x > 0 else "–" for x in at_part)
+    parts = [
+        [head, f"  {run_verdict(run, model_history(run))}"],
+        [f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}", *numbers, f"  U at the part {place} mm and {turn} mrad"],
+        ["[[Errors]]", *_errors(run)],
+        _part("Effects", _effects(run)),
+        _part("History", _history(run)),
+        _part("Not observable", run.unobservable),
+        _part("Left out", [f"{item.view}: {item.why}" for item in run.left_out]),
+        _part("Notes", run.notes),
+    ]
+    return "\n".join(line for part in parts for line in part)
+
+
+def _part(heading: str, lines: Sequence[str]) -> list[str]:
+    return [f"[[{heading}]]", *(f"  {line}" for line in lines)] if lines else []
+
+
+def _errors(run: Run) -> list[str]:
+    """Residuals, noise and the scatter of the poses, one a line."""
+    unit, scatter = run.session.length_unit, run.repeatability
+    rows = [
+        ("on views left out", length_text(run.heldout_rms, unit)),
+        ("in the fit", length_text(run.residual_rms, unit)),
+        ("noise floor", length_text(run.noise_floor, unit)),
+        ("scatter of the robot's poses", f"{length_text(scatter.translation, unit)}, {angle_text(scatter.rotation)}"),
+    ]
+    return [f"  {name + ':':<30}{text}" for name, text in rows]
+
+
+def _effects(run: Run) -> list[str]:
+    """Parameters that were fitted or tried."""
+    known = [(term.name, p) for term in run.terms for p in term.parameters if p.fitted or p.grid]
+    return [f"{f'{effect}.{p.name}:':<30}{p.told}" for effect, p in known]
+
+
+def _history(run: Run) -> list[str]:
+    """Every step of the model, where there are several, with its error on views left out."""
+    unit = run.session.length_unit
+    if len(run.ledger) < 2:
+        return []
+    return [f"{change_of(run.ledger, i) + ':':<30}{length_text(s.heldout_rms, unit)}" for i, s in enumerate(run.ledger)]
