@@ -362,13 +362,13 @@ def _told_as_stated(session: Session) -> bool:
 
 @contextmanager
 def _named(path: str) -> Iterator[None]:
-    """Say of a session in memory what is said of one in a folder, without the files that it does not have."""
+    """Say of a session in memory what is said of one in a folder: arguments in place of the files and keys there."""
     try:
         yield
     except StitchError as error:
         text = str(error)
-        for file in ("/session.toml", "/views.csv"):
-            text = text.replace(f"{path}{file}", path)
+        for there, here in ((f"{path}/session.toml", path), (" in session.toml", ""), ("length_unit", "unit")):
+            text = text.replace(there, here)
         raise type(error)(text) from None
 
 

@@ -26,7 +26,9 @@ from stitch.export.hand_eye import hand_eye_from
 from stitch.export.hand_eye_formats import FORMATS
 from stitch.frames import Array
 from stitch.measurement import session as measured
+from stitch.measurement.capture import part_size
 from stitch.model.arm import kept_arm
+from stitch.model.forward import corrected
 from stitch.model.model_toml import ModelFile
 from stitch.planning import plan as planning
 from stitch.planning.cells import PlannedCell, cell_of_session, cell_of_state
@@ -34,8 +36,10 @@ from stitch.planning.plan import Plan, Wanted
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
 from stitch.runs.state import State, state_of
+from stitch.stages.reuse import REUSE_GATE, converged_gate
 from stitch.stored.load_state import load_state
 from stitch.stored.stored_run import stored_run
+from stitch.system.threads import library_threads_off
 from stitch.system.whole_file import whole
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.result_document import model_of, result_document
@@ -96,7 +100,7 @@ def run_rig(
         NoResultError: as `stitch.run`.
 
     Example:
-        >>> runs = stitch.run_rig([session, replace(other, name="other")])
+        >>> runs = stitch.run_rig([session, other])
         >>> bool((runs[0].T_mount == runs[1].T_mount).all())
         True
     """
@@ -115,7 +119,8 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
         trust: run the file that the model names.
 
     Returns:
-        The run with the numbers of its files, shapes and frames as of `stitch.run`; its residuals are found anew.
+        The run with the numbers of its files: hand-eye (4, 4), poses (V, 4, 4) and cloud (N, 3) as of `stitch.run`. Its
+        residuals are found anew.
 
     Raises:
         InputError: no run folder, a damaged one, or its session has gone.
@@ -148,7 +153,7 @@ def diagnose(run: runs.Run | State) -> Diagnosis:
         >>> found.verdict in ("adequate", "missing_effect", "cannot_tell", "unknown_effect")
         True
     """
-    return pipeline.diagnose(run)
+    return pipeline.diagnose(_state(run))
 
 
 def add(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -159,23 +164,23 @@ def add(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) 
         recorder: is told of every stage.
 
     Returns:
-        A new run, shapes and frames as of `stitch.run`; its `ledger` has one step more.
+        A new run: hand-eye (4, 4), poses (V, 4, 4) and cloud (N, 3) as of `stitch.run`; its `ledger` has a step more.
 
     Raises:
         InputError: an effect that is not known, that the session cannot have, or that is in the model already.
         NoResultError: no two views overlap.
 
     Example:
-        >>> better = stitch.add(run, "mount_thermal_drift" if "mount_temperature_c" in known else "range_scale")
-        >>> len(better.ledger)
-        2
+        >>> better = stitch.add(run, "range_scale")
+        >>> better.effects, len(better.ledger)
+        (['range_scale'], 2)
     """
     state = _state(run)
     for name in effects:
         require(state.measurement, known(name))
         if name in state.model.effects:
             raise InputError(f"{name} is in the model of {state.session.name} already; to fix: leave it out")
-    return _changed(run, [*state.model.effects, *effects], recorder)
+    return _changed(run, state, [*state.model.effects, *effects], recorder)
 
 
 def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -186,7 +191,7 @@ def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None)
         recorder: is told of every stage.
 
     Returns:
-        A new run, shapes and frames as of `stitch.run`; its `ledger` has one step more.
+        A new run: hand-eye (4, 4), poses (V, 4, 4) and cloud (N, 3) as of `stitch.run`; its `ledger` has a step more.
 
     Raises:
         InputError: an effect that is not in the model.
@@ -196,12 +201,14 @@ def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None)
         >>> stitch.drop(better, *better.effects).effects
         []
     """
-    used = _state(run).model.effects
+    state = _state(run)
+    used = state.model.effects
     for name in effects:
         if name not in used:
-            where = _state(run).session.name
-            raise InputError(f"{name} is not in the model of {where}; in it are {', '.join(used) or 'none'}")
-    return _changed(run, [name for name in used if name not in effects], recorder)
+            raise InputError(
+                f"{name} is not in the model of {state.session.name}; in it are {', '.join(used) or 'none'}"
+            )
+    return _changed(run, state, [name for name in used if name not in effects], recorder)
 
 
 def compare(run: runs.Run | State) -> Comparison:
@@ -310,7 +317,8 @@ def export_run(
         diagnosis: of the run; what is written says what it found.
 
     Returns:
-        The text, with lengths in the unit of the format and T_parent_child as its frames; None of a cloud.
+        The text, of T_parent_child (4, 4) in the unit that it states, U beside it; None of a cloud, which is written in
+        the reference frame.
 
     Raises:
         InputError: a format that is not known, no file for a cloud, or a run that has no such thing.
@@ -365,16 +373,25 @@ def _names(effects: Sequence[str]) -> list[str]:
 
 
 def _state(run: runs.Run | State) -> State:
-    return state_of(run) if isinstance(run, runs.Run) else run
+    """What a command would read of the run's folder: partners are looked for within the gate of the model alone."""
+    if not isinstance(run, runs.Run):
+        return run
+    state = state_of(run)
+    own = corrected(state.measurement, state.model)
+    if not own.scans:
+        return state
+    with library_threads_off():
+        gate = converged_gate(own, state.model.T_mount, REUSE_GATE * part_size([own]))
+    return replace(state, gate=gate)
 
 
-def _changed(run: runs.Run | State, effects: Sequence[str], recorder: Recorder | None) -> Run:
+def _changed(run: runs.Run | State, state: State, effects: Sequence[str], recorder: Recorder | None) -> Run:
     watched = Watched(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return held(revision.change(_state(run), effects, watched), whole_session, watched)
+    return held(revision.change(state, effects, watched), whole_session, watched)
 
 
 def _cell_of(run: runs.Run) -> PlannedCell:
     if not run.session.has_clouds:
         raise InputError(f"{run.session.name}: a run of labelled points; plans are made for scans; to fix: diagnose it")
-    return cell_of_state(state_of(run), _single(run.fused.points), _single(run.fused.normals))
+    return cell_of_state(_state(run), _single(run.fused.points), _single(run.fused.normals))

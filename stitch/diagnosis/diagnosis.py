@@ -38,7 +38,15 @@ class CandidateEffect:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Verdict, candidate effects, what the rest depends on, what to measure next."""
+    """Verdict, candidate effects, what the rest depends on, what to measure next.
+
+    Example:
+        >>> found = stitch.diagnose(run)
+        >>> print(found.sentence)
+        The model is adequate: ...
+        >>> found.candidates[0].name in found.missing
+        False
+    """
 
     verdict: str
     effects: tuple[str, ...]

@@ -21,7 +21,12 @@ class Target:
 
 @dataclass(frozen=True)
 class Model:
-    """Fitted parameters of a cell: hand-eye, effects, targets. Lengths in the session's length_unit, angles in rad."""
+    """Fitted parameters of a cell: hand-eye, effects, targets. Lengths in the session's length_unit, angles in rad.
+
+    Example:
+        >>> run.model.T_mount.shape, run.model.covariance.shape, run.model.effects
+        ((4, 4), (6, 6), [])
+    """
 
     T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
     terms: tuple[Term, ...] = ()

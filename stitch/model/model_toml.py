@@ -62,12 +62,22 @@ def write_model(model: ModelFile, path: Path) -> None:
     path.write_text(header + tomli_w.dumps(document), encoding="utf-8")
 
 
-def read_model(path: Path) -> ModelFile:
+def read_model(path: Path | str) -> ModelFile:
     """Read `model.toml`, or that of a run folder.
+
+    Returns:
+        The hand-eye T_mount (4, 4) in the mount frame, covariance (6, 6) in the scanner frame, and the parameters of
+        the effects; lengths in its length_unit, angles in rad. `stitch.run` takes it as `model`.
 
     Raises:
         InputError: the file is missing, not a model, or a value cannot be: a hand-eye that is not a rigid motion.
+
+    Example:
+        >>> model = stitch.read_model(run.save(folder / "saved", recording=False))
+        >>> bool((model.T_mount == run.T_mount).all()), model.length_unit
+        (True, 'mm')
     """
+    path = Path(path)
     path = path / "model.toml" if path.is_dir() else path
     document = read_toml(path, "name a run folder that `stitch run` wrote")
     if document.get("format") != FORMAT:

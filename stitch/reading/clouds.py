@@ -76,7 +76,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise InputError(f"{where}: no column {', '.join(missing)}; a cloud needs x, y, z")
-    points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64)
+    points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64, copy=False)
     if not len(points):
         raise InputError(f"{where}: no points; leave this view out of views.csv or scan it again")
     if not np.isfinite(points).all():

@@ -1,0 +1,236 @@
+"""A run as people hold it: its parts, its report, its cell in a notebook, and the folder that the command writes."""
+
+import html
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+from matplotlib.figure import Figure
+from scipy.spatial.transform import RigidTransform
+
+import stitch
+from stitch import frames
+from stitch.api import run as api_run
+from stitch.comparison.tables import comparison_document
+from stitch.errors import InputError
+from stitch.reading.clouds import read_cloud
+from stitch.writing.diagnosis_document import diagnosis_document
+from stitch.writing.json_file import to_json
+from tests.api.conftest import taken
+
+FILES = ("model.toml", "ledger.json", "stitched.ply", "residuals.parquet")
+
+
+def result_of(folder):
+    """result.json without times and paths."""
+    document = json.loads((folder / "result.json").read_text())
+    del document["session"]
+    return document | {"stages": [{**stage, "seconds": None} for stage in document["stages"]]}
+
+
+def same_folder(a, b):
+    """True if two run folders hold the same but for times and paths."""
+    return result_of(a) == result_of(b) and all((a / f).read_bytes() == (b / f).read_bytes() for f in FILES)
+
+
+def test_the_hand_eye_as_an_object(found):
+    eye = found.hand_eye
+    assert np.array_equal(np.asarray(eye), found.T_mount) and (eye.name, eye.frame) == ("T_flange_scanner", "flange")
+    assert isinstance(eye.transform, RigidTransform) and np.allclose(eye.transform.as_matrix(), found.T_mount)
+    # Against nature: so many draws of the hand-eye, and how far they put the middle of the scans from where it is.
+    xi = np.random.default_rng(0).multivariate_normal(np.zeros(6), eye.covariance, 20_000)
+    moved = frames.transform(frames.exp(xi), eye.middle[None])[:, 0] - eye.middle
+    assert np.isclose(eye.U.mm, 2 * np.sqrt((moved**2).sum(axis=1).mean()), rtol=0.03)
+    assert np.isclose(eye.U.mrad, 2e3 * np.sqrt((xi[:, :3] ** 2).sum(axis=1).mean()), rtol=0.03)
+    assert "T_flange_scanner" in repr(eye) and "U at the part" in repr(eye)
+
+
+def test_u_is_in_millimetres_whatever_the_unit(found):
+    eye, scale = found.hand_eye, np.repeat([1.0, 1e-3], 3)
+    pose = frames.make(eye.pose[:3, :3], eye.pose[:3, 3] / 1e3)
+    covariance = eye.covariance * np.outer(scale, scale)
+    metres = replace(eye, pose=pose, covariance=covariance, middle=eye.middle / 1e3, length_unit="m")
+    assert np.allclose(metres.U, eye.U)
+
+
+def test_without_a_rigid_transform_the_matrix_is_named(found, monkeypatch):
+    monkeypatch.delattr("scipy.spatial.transform.RigidTransform")
+    with pytest.raises(InputError, match="to fix: use pose"):
+        _ = found.views[0].transform
+
+
+def test_the_views_are_where_the_run_puts_them(found):
+    assert [view.name for view in found.views] == found.session.names
+    for v, view in enumerate(found.views):
+        assert np.array_equal(view.pose, found.poses[v])
+        assert np.allclose(frames.exp(view.correction) @ view.pose_model, view.pose)
+        assert np.allclose(view.transform.as_matrix(), view.pose)
+    assert sum(view.points for view in found.views) == sum(v.cloud.count for v in found.session.views)
+
+
+def test_residuals_are_those_of_the_file(found, tmp_path):
+    found.save(tmp_path / "run", recording=False)
+    assert found.residuals.equals(pq.read_table(tmp_path / "run" / "residuals.parquet"))
+
+
+def test_the_stitched_cloud_for_trimesh(found):
+    cloud = found.stitched.to_trimesh()
+    assert isinstance(cloud, trimesh.PointCloud) and np.array_equal(cloud.vertices, found.stitched.points)
+    assert np.array_equal(cloud.colors[:, :3], found.stitched.colours)
+    assert cloud.metadata["residual"].shape == (len(found.stitched),)
+
+
+def test_the_stitched_cloud_for_open3d_and_back(found):
+    try:
+        pytest.importorskip("open3d", reason="open3d is not installed: its clouds are tried where it is")
+    except OSError as error:
+        pytest.skip(f"open3d cannot be imported: {error}")
+    legacy = found.stitched.to_open3d()
+    assert np.array_equal(np.asarray(legacy.points), found.stitched.points) and legacy.has_normals()
+    tensor = found.stitched.to_open3d(tensor=True)
+    assert tensor.point["residual"].shape[0] == len(found.stitched)
+
+
+def test_a_package_that_is_missing_is_named(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(InputError, match="to fix: pip install open3d"):
+        found.stitched.to_open3d()
+
+
+def test_the_report_has_every_part_once(found):
+    text = str(found)
+    assert re.findall(r"^\[\[(.+?)\]\]", text, re.MULTILINE)[:3] == ["s", "Hand-eye", "Errors"]
+    assert f"{found.hand_eye.U.mm:.2g} mm" in text and max(map(len, text.splitlines()[2:])) < 110
+    better = stitch.add(found, "range_scale")
+    added = str(better)
+    assert "[[Effects]]\n  range_scale.s:" in added and "+ range_scale:" in added
+    assert repr(better).startswith("Run('s', 5 views")
+
+
+def test_a_cell_of_a_notebook_asks_no_server_and_holds_the_viewer(found):
+    cell = found._repr_html_()
+    page = html.unescape(re.search(r'srcdoc="([^"]*)"', cell)[1])
+    assert page.startswith("<!doctype html>") and 'id="part-data"' in page and "showPart" in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page) and "fetch(" not in page
+    assert isinstance(found.plot(), Figure)
+
+
+def test_where_nothing_draws_the_cell_is_the_report(found, monkeypatch):
+    monkeypatch.setattr(api_run, "entry_points", lambda group: ())
+    assert found._repr_html_() == f"<pre>{html.escape(str(found))}</pre>"
+    with pytest.raises(InputError, match="nothing that draws"):
+        found.plot()
+
+
+def test_a_viewer_in_the_cell_is_drawn_by_a_browser(found, browser):
+    page = browser.new_page()
+    page.set_content(found._repr_html_())
+    frame = page.frame_locator("iframe")
+    frame.locator(".part.live canvas").wait_for(timeout=20_000)
+    assert "the views disagree by" in frame.locator("[data-title]").inner_text()
+    page.close()
+
+
+def test_a_saved_run_is_what_the_command_writes(loaded, cell_folder, tmp_path, stitch_command):
+    stitch_command("run", cell_folder, "-o", tmp_path / "command")
+    from_arrays = stitch.run(stitch.Session.from_arrays(**taken(loaded)))
+    from_arrays.save(tmp_path / "arrays")
+    assert same_folder(tmp_path / "command", tmp_path / "arrays")
+    names = [sorted(path.name for path in (tmp_path / own).iterdir()) for own in ("command", "arrays")]
+    assert names[0] == names[1]
+    a, b = ((tmp_path / own / "recording.rrd").stat().st_size for own in ("command", "arrays"))
+    assert abs(a - b) < 0.01 * a
+    # Every command works on it, since its session lies beside it; a second time it is the same session.
+    stitch_command("add", tmp_path / "arrays", "range_scale", "--no-recording")
+    better, added = stitch.add(from_arrays, "range_scale"), stitch.load_run(tmp_path / "arrays")
+    assert np.allclose(added.T_mount, better.T_mount, atol=1e-9) and added.effects == better.effects
+    from_arrays.save(tmp_path / "arrays", recording=False)
+    assert same_folder(tmp_path / "command", tmp_path / "arrays")
+
+
+def test_what_is_added_and_dropped_is_what_the_commands_write(found, cell_folder, tmp_path, stitch_command):
+    command, python = tmp_path / "command", tmp_path / "python"
+    stitch_command("run", cell_folder, "-o", command, "--no-recording")
+    stitch_command("add", command, "range_scale", "--no-recording")
+    better = stitch.add(found, "range_scale")
+    better.save(python, recording=False)
+    assert same_folder(command, python)
+    stitch_command("drop", command, "range_scale", "--no-recording")
+    stitch.drop(better, "range_scale").save(python, recording=False)
+    assert same_folder(command, python)
+
+
+def test_effects_fitted_at_once_are_what_the_command_writes(loaded, cell_folder, tmp_path, stitch_command):
+    stitch_command("run", cell_folder, "-o", tmp_path / "command", "--no-recording", "--effects", "range_scale")
+    stitch.run(loaded, effects=["range_scale"]).save(tmp_path / "python", recording=False)
+    assert same_folder(tmp_path / "command", tmp_path / "python")
+
+
+def test_a_diagnosis_and_a_comparison_are_those_of_the_commands(found, tmp_path, stitch_command):
+    folder = found.save(tmp_path / "run", recording=False)
+    diagnosis = json.loads(stitch_command("diagnose", folder, "--json"))
+    assert json.loads(to_json(diagnosis_document(stitch.diagnose(found)))) == diagnosis
+    comparison = json.loads(stitch_command("compare", folder, "--json"))
+    assert json.loads(to_json(comparison_document(stitch.compare(found)))) == comparison
+
+
+def test_another_session_beside_the_run_is_kept(arrays, found, tmp_path):
+    clouds, poses = arrays
+    first = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=False)
+    replace(first, name="other").save(tmp_path / "run-session")
+    held = replace(found, session=first, measured=first)
+    with pytest.raises(InputError, match="holds another session"):
+        held.save(tmp_path / "run", recording=False)
+
+
+def test_a_run_of_views_that_were_left_out_keeps_them_in_its_session(loaded, tmp_path):
+    """One pose is wrong by far: its view does not belong, and stays in what was measured."""
+    given = taken(loaded)
+    T = given["poses"].copy()
+    T[2, :3, 3] += [40.0, 0, 0]
+    session = stitch.Session.from_arrays(**given | {"poses": T, "joints": None, "robot": None, "check": False})
+    run = stitch.run(session)
+    assert [item.view for item in run.left_out] == ["v002"] and len(run.views) == 4
+    run.save(tmp_path / "run", recording=False)
+    assert len(stitch.load_session(tmp_path / "run-session").views) == 5
+    assert "[[Left out]]\n  v002: " in str(run)
+
+
+def test_exports_are_those_of_the_command(found, tmp_path, stitch_command):
+    folder = found.save(tmp_path / "run", recording=False)
+    for to in ("ros", "kuka", "arm-dh"):
+        assert stitch.export_run(found, to) == stitch_command("export", folder, "--to", to)
+    stitch_command("export", folder, "--to", "ply", "-o", tmp_path / "a.ply")
+    assert stitch.export_run(found, "ply", tmp_path / "b.ply") is None
+    assert np.array_equal(read_cloud(tmp_path / "a.ply").points, read_cloud(tmp_path / "b.ply").points)
+    for to, says in (("dxf", "no such format"), ("ply", "where to")):
+        with pytest.raises(InputError, match=says):
+            stitch.export_run(found, to)
+
+
+def test_effects_are_asked_for_by_name(found):
+    for call, says in (
+        (lambda: stitch.add(found, "no_such"), "no_such"),
+        (lambda: stitch.drop(found, "range_scale"), "is not in the model of s"),
+        (lambda: stitch.add(stitch.add(found, "range_scale"), "range_scale"), "in the model of s already"),
+        (lambda: stitch.run(found.session, effects=["no_such"]), "no_such"),
+    ):
+        with pytest.raises(InputError, match=says):
+            call()
+
+
+def test_the_model_of_a_run_serves_another_session(found, loaded):
+    again = stitch.run(loaded, model=found)
+    assert np.array_equal(again.T_mount, found.T_mount)
+
+
+def test_import_takes_a_moment():
+    code = "import time; t = time.perf_counter(); import stitch; print(time.perf_counter() - t)"
+    seconds = min(float(subprocess.check_output([sys.executable, "-c", code])) for _ in range(3))
+    assert seconds <= 0.15
