@@ -1,6 +1,6 @@
-"""The notebook of the docs: run as plain Python, written with what its cells print and draw, shown as a page.
+"""The notebooks of the docs: run as plain Python, written with what their cells print and draw, shown as pages.
 
-Run: python -m bench.docs.notebook_page (writes the outputs into docs/error-falls.ipynb, and its picture for README.md)
+Run: python -m bench.docs.notebook_page (writes the outputs into docs/*.ipynb, and the picture of one for README.md)
 """
 
 import ast
@@ -16,6 +16,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOK, PICTURE = ROOT / "docs" / "error-falls.ipynb", ROOT / "docs" / "pictures" / "error-falls.png"
+NOTEBOOKS = (NOTEBOOK, ROOT / "docs" / "from-arrays.ipynb")
 _DPI, _COLOURS = 110, 256
 
 
@@ -78,12 +79,13 @@ def _outputs(count: int, text: str, value: Any) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Write the outputs into the notebook."""
-    document = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
-    code = [cell for cell in document["cells"] if cell["cell_type"] == "code"]
-    for i, (cell, (text, value)) in enumerate(zip(code, run_cells(NOTEBOOK), strict=True)):
-        cell["execution_count"], cell["outputs"] = i + 1, _outputs(i + 1, text, value)
-    NOTEBOOK.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    """Write the outputs into the notebooks."""
+    for file in NOTEBOOKS:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        code = [cell for cell in document["cells"] if cell["cell_type"] == "code"]
+        for i, (cell, (text, value)) in enumerate(zip(code, run_cells(file), strict=True)):
+            cell["execution_count"], cell["outputs"] = i + 1, _outputs(i + 1, text, value)
+        file.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def python_page() -> str:
     """What `import stitch` offers."""
     names = "\n\n".join(f"::: {module}.{name}" for name, module in MODULES.items())
     told = "Made from the docstrings of what `import stitch` offers; frames and units: [glossary](glossary.md)."
-    return f"# Python\n\n{told}\n\n{names}\n"
+    return f"# Every name of Python\n\n{told} How they work together: [python](python.md).\n\n{names}\n"
 
 
 def _sizes(effect: stitch.effects.contract.Effect) -> str:

@@ -9,13 +9,14 @@ import re
 import shutil
 from pathlib import Path
 
-from bench.docs.notebook_page import notebook_page
+from bench.docs.notebook_page import NOTEBOOKS, notebook_page
 from bench.docs.reference_pages import commands_page, effects_page, python_page
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "build" / "docs"
 # Pages whose place in the project is another one than in the site.
-MOVED = {"README.md": "index.md", "CHANGELOG.md": "changes.md", "docs/error-falls.ipynb": "error-falls.ipynb.md"}
+MOVED = {"README.md": "index.md", "CHANGELOG.md": "changes.md"}
+MOVED |= {file.relative_to(ROOT).as_posix(): f"{file.name}.md" for file in NOTEBOOKS}
 _LINK = re.compile(r'(?<=\]\()([^)\s#:]+)(#[^)\s]*)?(?=\))|(?<=src=")([^":]+)(?=")')
 _LANGUAGES = {".py": "python", ".toml": "toml"}
 
@@ -25,11 +26,11 @@ def pages() -> dict[str, str]:
     made = {
         "index.md": _in_docs(ROOT / "README.md"),
         "changes.md": _in_docs(ROOT / "CHANGELOG.md"),
-        "error-falls.ipynb.md": notebook_page(ROOT / "docs" / "error-falls.ipynb"),
         "cli.md": commands_page(),
         "effects-table.md": effects_page(),
-        "python.md": python_page(),
+        "python-reference.md": python_page(),
     }
+    made |= {f"{file.name}.md": notebook_page(file) for file in NOTEBOOKS}
     made |= {page.name: _in_docs(page) for page in sorted((ROOT / "docs").glob("*.md"))}
     linked = sorted({path for text in made.values() for path in re.findall(r"\(source/([^)#]+)\.md\)", text)})
     sources = {f"source/{path}.md": _source_page(ROOT / path) for path in linked}

@@ -11,7 +11,7 @@ from stitch.measurement.cloud import Cloud
 from stitch.reading.clouds import read_cloud
 
 RNG = np.random.default_rng(0)
-POINTS = RNG.normal(size=(60, 3)) + [0, 0, 500]
+POINTS = RNG.normal(size=(60, 3)) + np.array([0, 0, 500.0])
 NORMALS = np.tile([0.0, 0.0, -1.0], (60, 1))
 COLOURS = RNG.integers(0, 256, (60, 3), dtype=np.uint8)
 INTENSITY = RNG.uniform(0, 1, 60)
@@ -187,6 +187,6 @@ def test_a_thinned_cloud_gives_all_of_its_points():
     from stitch.measurement.session import Scanner
     from stitch.measurement.thinning import thinned_cloud
 
-    dense = RNG.normal(size=(500, 3)) + [0, 0, 500]
+    dense = RNG.normal(size=(500, 3)) + np.array([0, 0, 500.0])
     thin = thinned_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))
     assert len(thin.points) == 100 and np.array_equal(cloud_of(thin, "v").points, dense)

@@ -48,4 +48,4 @@ def test_the_reference_has_every_command_effect_and_function(site):
     commands = typer.main.get_command(build()).commands
     assert not [name for name in commands if f"## `stitch {name}`" not in site["cli.md"]]
     assert not [name for name in EFFECTS if f"| `{name}` |" not in site["effects-table.md"]]
-    assert not [name for name in stitch.__all__ if f".{name}\n" not in site["python.md"]]
+    assert not [name for name in stitch.__all__ if f".{name}\n" not in site["python-reference.md"]]
