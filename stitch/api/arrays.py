@@ -47,11 +47,19 @@ def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
     Raises:
         InputError: a kind that is not known, another shape, no points, or points that are not finite.
     """
+    if scale == 1.0 and _is_plain(item):
+        return Cloud(item)
     return cloud_of_columns(where, _columns(item, where), scale)
 
 
+def _is_plain(item: Any) -> bool:
+    """Return True of points of which nothing is changed or left out: they need no copy."""
+    fits = isinstance(item, np.ndarray) and item.ndim == 2 and item.shape[1:] == (3,) and item.dtype == np.float64
+    return fits and len(item) > 0 and bool(np.isfinite(item).all()) and bool(item.any(axis=1).all())
+
+
 def _columns(item: Any, where: str) -> Columns:
-    """Columns (N,) by name."""
+    """Return columns (N,) by name."""
     if isinstance(item, Cloud):
         return _of_cloud(item if item.whole is None else item.whole.read())
     if isinstance(item, Mapping):
@@ -76,7 +84,7 @@ def _of_cloud(cloud: Cloud) -> Columns:
 
 
 def _points(points: Array, where: str) -> Columns:
-    """Columns x, y, z of (N, 3), or of (H, W, 3) whose pixels without a measurement are NaN."""
+    """Return columns x, y, z of (N, 3), or of (H, W, 3) whose pixels without a measurement are NaN."""
     if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
         raise InputError(f"{where}: {_shown(points)} is no cloud that is known; to fix: pass {_KNOWN}")
     columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
@@ -84,7 +92,7 @@ def _points(points: Array, where: str) -> Columns:
 
 
 def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
-    """points, normals and colors by three columns each, the rest by one; pixels without a measurement go from all."""
+    """Return columns of a mapping: points, normals and colors are three each, every other entry is one."""
     rest = {str(name): np.asarray(values) for name, values in item.items()}
     points = rest.pop("points", None)
     columns = {} if points is None else _points_all(points, where)
@@ -100,7 +108,7 @@ def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
 
 
 def _points_all(points: Array, where: str) -> Columns:
-    """Every pixel, measured or not, so that other columns stay beside it."""
+    """Return every pixel, measured or not, so that other columns stay beside it."""
     if points.ndim == 3 and points.shape[-1] == 3:
         points = points.reshape(-1, 3)
     return _points(points, where)
@@ -129,7 +137,7 @@ def _any(values: Any) -> bool:
 
 
 def _of_open3d(item: Any, where: str) -> Columns:
-    """A PointCloud, legacy or of tensors."""
+    """Return the columns of a PointCloud, legacy or of tensors."""
     if hasattr(item, "depth"):
         raise InputError(f"{where}: an image has no points without its lens; to fix: pass (image, intrinsics)")
     if hasattr(item, "has_normals"):
@@ -148,7 +156,7 @@ def _of_open3d(item: Any, where: str) -> Columns:
 
 
 def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
-    """A depth image, or one with its colours, lifted through its lens; 0 where nothing was measured."""
+    """Return the columns of a depth image lifted through its lens, and its colours; 0 where nothing was measured."""
     depth = _pixels(getattr(image, "depth", image))
     colour = getattr(image, "color", None)
     if depth.ndim != 2:
@@ -165,7 +173,7 @@ def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
 
 
 def _pixels(image: Any) -> Array:
-    """(H, W) or (H, W, C) of an array or an image of Open3D."""
+    """Return (H, W) or (H, W, C) of an array or an image of Open3D."""
     for way in ("as_tensor", "cpu"):
         image = getattr(image, way)() if hasattr(image, way) else image
     values = image.numpy() if hasattr(image, "numpy") else np.asarray(image)
@@ -173,7 +181,7 @@ def _pixels(image: Any) -> Array:
 
 
 def _intrinsics(item: Any, where: str) -> Intrinsics:
-    """Of a PinholeCameraIntrinsic, a matrix (3, 3), or a mapping with fx, fy, cx, cy; pixels."""
+    """Read a PinholeCameraIntrinsic, a matrix (3, 3), or a mapping with fx, fy, cx, cy; pixels."""
     size = None
     if hasattr(item, "intrinsic_matrix"):
         size = (int(item.width), int(item.height)) if item.width > 0 else None
@@ -222,7 +230,7 @@ def poses_of(poses: Any, where: str) -> Array:
 
 
 def _matrices(poses: Any, where: str) -> Array:
-    """(V, 4, 4) of many, (4, 4) of one."""
+    """Return (V, 4, 4) of many poses, (4, 4) of one."""
     if hasattr(poses, "as_matrix") and not isinstance(poses, Rotation):
         return np.asarray(poses.as_matrix(), float)
     if isinstance(poses, tuple) and len(poses) == 2 and isinstance(poses[0], Rotation):
@@ -239,7 +247,7 @@ def _matrices(poses: Any, where: str) -> Array:
 
 
 def _is_object(pose: Any) -> bool:
-    """True of a RigidTransform, or of a rotation beside a translation."""
+    """Return True of a RigidTransform, or of a rotation beside a translation."""
     return hasattr(pose, "as_matrix") or (isinstance(pose, tuple) and isinstance(pose[0], Rotation))
 
 
@@ -255,7 +263,7 @@ def _joined(R: Rotation, t: Any, where: str) -> Array:
 
 
 def _no_motion(T: Array) -> str:
-    """Why the worst of the matrices is no rigid motion."""
+    """Say why the worst of the matrices is no rigid motion."""
     R = T[:, :3, :3]
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)
     det = np.linalg.det(R)

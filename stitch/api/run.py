@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.api.session import Session, of_folder
+from stitch.api.session import Session, public_session
 from stitch.errors import InputError
 from stitch.export.cloud_formats import Colours, coloured
 from stitch.frames import Array
@@ -198,7 +198,7 @@ class Run(runs.Run):
     """
 
     measured: Session | None = None  # with the views that were left out
-    watched: tuple[tuple[str, tuple[Any, ...]], ...] = ()  # what a recorder would have been told, for `save`
+    recorded: tuple[tuple[str, tuple[Any, ...]], ...] = ()  # calls of a recorder, replayed by `save`
 
     @property
     def hand_eye(self) -> FittedHandEye:
@@ -258,12 +258,12 @@ class Run(runs.Run):
             ['ledger.json', 'model.toml', 'report.html']
         """
         folder = Path(folder)
-        whole = self.measured or of_folder(self.session)
+        whole = self.measured or public_session(self.session)
         path = _saved_beside(whole, folder) if whole.in_memory else whole.path
         own = replace(self, session=replace(self.session, path=path))
         with run_folder.new_folder(folder, [path], force) as scratch:
             for recorder in recordings(scratch) if recording else []:
-                for call, arguments in self.watched:
+                for call, arguments in self.recorded:
                     getattr(recorder, call)(*arguments)
                 recorder.finish(own)
             run_folder.write_with_page(own, scratch, tolerance)
@@ -277,29 +277,29 @@ class Run(runs.Run):
         Raises:
             InputError: no package that draws is installed.
         """
-        draw = _offered("stitch.run_plots")
+        draw = _entry_point("stitch.run_plots")
         if draw is None:
             raise InputError("run.plot: nothing that draws is installed; to fix: install stitch with its package viz")
         return draw(self)
 
     def _repr_html_(self) -> str:
         """The viewer of report.html for a notebook; it asks no server. The report as text where nothing draws."""
-        show = _offered("stitch.notebook_views")
+        show = _entry_point("stitch.notebook_views")
         return f"<pre>{html.escape(str(self))}</pre>" if show is None else str(show(self))
 
     def __str__(self) -> str:
         return fit_report(self, self.hand_eye.U)
 
 
-class Watched:
-    """A recorder that keeps what it is told, so that a recording can be written once the run is saved."""
+class ReplayRecorder:
+    """A recorder that keeps its calls, so that a recording can be written once the run is saved."""
 
-    def __init__(self, told: Recorder | None = None) -> None:
-        self.told = told  # another recorder, which is told too
+    def __init__(self, other: Recorder | None = None) -> None:
+        self.other = other  # gets every call too
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
 
     def start(self, session: measured.Session) -> None:
-        """Begin again: a run that leaves views out starts anew with the others."""
+        """Keep the session; a run that leaves views out starts anew with the others."""
         self._keep("start", session)
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
@@ -311,26 +311,26 @@ class Watched:
         self._keep("stage", result, poses)
 
     def finish(self, run: runs.Run) -> None:
-        """Pass on: who saves a run finishes its recording."""
-        if self.told is not None:
-            self.told.finish(run)
+        """Pass on alone: `Run.save` finishes the recording."""
+        if self.other is not None:
+            self.other.finish(run)
 
     def _keep(self, call: str, *arguments: Any) -> None:
         self.calls.append((call, arguments))
-        if self.told is not None:
-            getattr(self.told, call)(*arguments)
+        if self.other is not None:
+            getattr(self.other, call)(*arguments)
 
 
-def held(run: runs.Run, whole: Session | None, watched: Watched | None = None) -> Run:
+def public_run(run: runs.Run, whole: Session | None, recorder: ReplayRecorder | None = None) -> Run:
     """Return a run as people hold it.
 
     Args:
         whole: its session with the views that were left out; None: as the run has it.
-        watched: what was recorded of it.
+        recorder: was told of it.
     """
     own = {f.name: getattr(run, f.name) for f in fields(runs.Run)}
-    calls = () if watched is None else tuple(watched.calls)
-    return Run(**own | {"session": of_folder(run.session)}, measured=whole, watched=calls)
+    calls = () if recorder is None else tuple(recorder.calls)
+    return Run(**own | {"session": public_session(run.session)}, measured=whole, recorded=calls)
 
 
 def rigid_transform(pose: Array) -> Any:
@@ -346,7 +346,11 @@ def rigid_transform(pose: Array) -> Any:
 
 
 def _saved_beside(session: Session, folder: Path) -> Path:
-    """FOLDER-session with the session in it; one that lies there already has to be the same."""
+    """Write the session as FOLDER-session and return the path; one that lies there already has to be the same.
+
+    Raises:
+        InputError: it is another.
+    """
     beside = folder.with_name(f"{folder.name}-session")
     if not (beside / "session.toml").is_file():
         return session.save(beside).path
@@ -360,8 +364,8 @@ def _saved_beside(session: Session, folder: Path) -> Path:
     return beside
 
 
-def _offered(group: str) -> Callable[[runs.Run], Any] | None:
-    """What another package offers under an entry-point group; None where there is none."""
+def _entry_point(group: str) -> Callable[[runs.Run], Any] | None:
+    """Return what another package offers under an entry-point group; None where there is none."""
     return next((entry.load() for entry in entry_points(group=group)), None)
 
 

@@ -82,8 +82,8 @@ class Session(measured.Session):
         """Return the session of scans and poses in memory, checked as `stitch init` and `stitch check` check a folder.
 
         The scans tell whether the poses are what they are said to be; a reading of them that brings the scans together
-        where the stated one does not is refused, with the sentence of `stitch check --deep`. Arrays are not copied
-        where a scan is large: leave them as they are until the run has ended.
+        where the stated one does not is refused, with the sentence of `stitch check --deep`. Scans of more than 39,000
+        points are not copied: leave them as they are until the run has ended.
 
         Args:
             clouds: one scan a view, scanner frame: (N, 3) or (H, W, 3) arrays, mappings such as {"points": (N, 3),
@@ -117,7 +117,7 @@ class Session(measured.Session):
             <session>: the poses contradict what was measured: inverse: the poses are T_flange_base: inv
         """
         toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
-        with _named(toml.parent.name):
+        with _in_arguments(toml.parent.name):
             known = _stated(toml, unit=unit, cloud_unit=cloud_unit, mount=mount, robot=robot, scanner=scanner)
             names, scans = _views_of(clouds, poses, joints, points)
             T, q = _arm(known, names, poses, joints)
@@ -188,10 +188,10 @@ def load_session(
         >>> stitch.load_session(session_folder)
         Session('s', eye_in_hand, 5 views of clouds)
     """
-    return of_folder(session_folder.load_session(path, scans, start, at_most, memory))
+    return public_session(session_folder.load_session(path, scans, start, at_most, memory))
 
 
-def of_folder(session: measured.Session) -> Session:
+def public_session(session: measured.Session) -> Session:
     """Return a session that was read as the one that people hold."""
     if isinstance(session, Session):
         return session
@@ -223,7 +223,7 @@ def _stated(
     robot: Any,
     scanner: Scanner | Mapping[str, Any] | None,
 ) -> _Stated:
-    """As a session.toml with the same entries is read."""
+    """Check what is stated of the cell, as a session.toml with the same entries is checked."""
     cloud_unit = cloud_unit or unit
     for key, value, known in (
         ("unit", unit, tuple(METRES)),
@@ -241,7 +241,7 @@ def _stated(
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
-    """Names of the views, and their scans; None where there are none."""
+    """Return names of the views, and their scans; None where there are none."""
     if isinstance(clouds, Mapping):
         names = [require_name("clouds", str(key), "view") for key in clouds]
         return names, list(clouds.values())
@@ -253,7 +253,7 @@ def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[s
 
 
 def _arm(known: _Stated, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:
-    """T_base_flange (V, 4, 4) and joint angles (V, n) rad, which agree."""
+    """Return T_base_flange (V, 4, 4) and joint angles (V, n) rad, which agree."""
     count = len(names)
     q = None if joints is None else per_view(joints, count, "joints", 2)
     if q is not None and known.robot is not None and q.shape[1] != known.robot.n_joints:
@@ -275,7 +275,7 @@ def _arm(known: _Stated, names: list[str], poses: Any, joints: Any) -> tuple[Arr
 
 
 def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> list[View]:
-    """Views with what was seen, at no pose yet."""
+    """Return views with what was seen, at no pose yet."""
     if points is not None and len(points) != len(names):
         raise InputError(f"points: {len(points)} for {len(names)} views; to fix: pass one mapping a view, or None")
 
@@ -285,7 +285,9 @@ def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> li
         where = f"view {names[at]}"
         read = partial(cloud_of, scans[at], where, known.scale)
         metres = METRES[known.unit]
-        return checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=ENOUGH)
+        cloud = checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=ENOUGH)
+        # A small scan is the session's own; a large one stays with whoever holds it.
+        return replace(cloud, points=cloud.points.copy()) if cloud.points is scans[at] else cloud
 
     seen = parallel(scan, range(len(names)), "reading scans")
     return [
@@ -306,7 +308,7 @@ def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> li
 def _described(
     rows: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
 ) -> tuple[View, ...]:
-    """The views with poses, times and covariates."""
+    """Return the views with poses, times and covariates."""
     count = len(rows)
     time = None if times is None else per_view(times, count, "times")
     if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
@@ -335,15 +337,15 @@ def _check_convention(session: Session) -> None:
     Raises:
         InputError: another reading of the poses brings the scans together, or they lie in one frame already.
     """
-    if session.has_clouds and _told_as_stated(session):
+    if session.has_clouds and _scans_confirm(session):
         return
     # That nothing overlaps under any reading is for the run to say, which names the mistakes that it knows.
     with suppress(NoResultError):
         refuse_whole(session)
 
 
-def _told_as_stated(session: Session) -> bool:
-    """True if the scans tell one reading of the poses from all others, and it is the one that was stated."""
+def _scans_confirm(session: Session) -> bool:
+    """Return True if the scans tell one reading of the poses from all others, and it is the one that was stated."""
     T = np.array([view.T_base_flange for view in session.views])
     if len(T) < _FEWEST:
         return False
@@ -361,8 +363,8 @@ def _told_as_stated(session: Session) -> bool:
 
 
 @contextmanager
-def _named(path: str) -> Iterator[None]:
-    """Say of a session in memory what is said of one in a folder: arguments in place of the files and keys there."""
+def _in_arguments(path: str) -> Iterator[None]:
+    """Name arguments where messages name the files and keys of a folder; the sentences stay the same."""
     try:
         yield
     except StitchError as error:
@@ -390,11 +392,11 @@ class _WholeClouds(Mapping[str, Cloud]):
 
 
 def _files_of(session: measured.Session) -> SessionFiles:
-    """Everything that a folder of the session holds."""
+    """Return everything that a folder of the session holds."""
     plain = all(_PLAIN.fullmatch(name) for name in session.names)
     files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
     clouds = {file: view.cloud for file, view in zip(files, session.views, strict=True) if view.cloud is not None}
-    points, probes = _seen(session)
+    points, probes = _labelled_columns(session)
     tables, texts = _tables(session)
     if session.nominal is not None:
         own = session.nominal
@@ -434,7 +436,7 @@ def _view_columns(session: measured.Session, files: list[str] | None) -> dict[st
     return columns | {name: [_cell(view.covariates.get(name)) for view in views] for name in names}
 
 
-def _seen(session: measured.Session) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
+def _labelled_columns(session: measured.Session) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
     """Columns of points.csv, or of frames.csv where views show a probe."""
     rows = [(view.name, view.sighting) for view in session.views if view.sighting is not None]
     if not rows:
@@ -471,13 +473,13 @@ def _tables(session: measured.Session) -> tuple[dict[str, dict[str, Any]], dict[
     scanner |= {key: value for key, value in known if value is not None}
     tables: dict[str, dict[str, Any]] = {"scanner": scanner}
     if session.robot is not None:
-        told = robot_toml(session.robot)
-        if told is None:
+        table = robot_toml(session.robot)
+        if table is None:
             texts["robot.urdf"] = to_urdf(session.robot)
             links = {"urdf": "robot.urdf", "base_link": "base_link", "flange_link": "flange"}
             tables["robot"] = {**links, "gravity": session.robot.gravity.tolist()}
         else:
-            tables |= tomllib.loads(told)
+            tables |= tomllib.loads(table)
     if stated := repeatability_table(session.repeatability):
         tables.setdefault("robot", {})["repeatability"] = stated
     if session.sphere_radius is not None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from stitch import pipeline, revision
-from stitch.api.run import Run, Watched, held
-from stitch.api.session import Session, of_folder
+from stitch.api.run import ReplayRecorder, Run, public_run
+from stitch.api.session import Session, public_session
 from stitch.comparison.compare_surfaces import compare as compare_surfaces
 from stitch.comparison.compare_targets import compare_targets
 from stitch.comparison.tables import Comparison
@@ -104,11 +104,11 @@ def run_rig(
         >>> bool((runs[0].T_mount == runs[1].T_mount).all())
         True
     """
-    told: Sequence[Recorder | None] = recorders or [None] * len(sessions)
-    watched = [Watched(recorder) for recorder in told]
+    others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
+    replays = [ReplayRecorder(other) for other in others]
     stated = None if arm is None else kept_arm(_model(arm)) if isinstance(arm, runs.Run) else arm
-    found = pipeline.run_rig(sessions, None if model is None else _model(model), watched, _names(effects), keep, stated)
-    return [held(own, of_folder(session), w) for own, session, w in zip(found, sessions, watched, strict=True)]
+    found = pipeline.run_rig(sessions, None if model is None else _model(model), replays, _names(effects), keep, stated)
+    return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
 
 
 def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool = False) -> Run:
@@ -133,7 +133,7 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
     """
     folder = Path(folder)
     state = load_state(folder, effects_file, trust=trust)
-    return held(stored_run(folder, state), None)
+    return public_run(stored_run(folder, state), None)
 
 
 def diagnose(run: runs.Run | State) -> Diagnosis:
@@ -336,8 +336,8 @@ def export_run(
         session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
         text = ARM_FORMATS[to](arm_from(session, model_of(run)))
     elif to in FORMATS:
-        told = {} if diagnosis is None else diagnosis_document(diagnosis)
-        text = FORMATS[to](hand_eye_from(result_document(run), model_of(run), told, parent, child))
+        document = {} if diagnosis is None else diagnosis_document(diagnosis)
+        text = FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
     else:
         raise InputError(f"{to}: no such format; to fix: one of {', '.join((*FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}")
     if path is not None:
@@ -373,7 +373,7 @@ def _names(effects: Sequence[str]) -> list[str]:
 
 
 def _state(run: runs.Run | State) -> State:
-    """What a command would read of the run's folder: partners are looked for within the gate of the model alone."""
+    """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
     if not isinstance(run, runs.Run):
         return run
     state = state_of(run)
@@ -386,9 +386,9 @@ def _state(run: runs.Run | State) -> State:
 
 
 def _changed(run: runs.Run | State, state: State, effects: Sequence[str], recorder: Recorder | None) -> Run:
-    watched = Watched(recorder)
+    replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return held(revision.change(state, effects, watched), whole_session, watched)
+    return public_run(revision.change(state, effects, replay), whole_session, replay)
 
 
 def _cell_of(run: runs.Run) -> PlannedCell:

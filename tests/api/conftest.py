@@ -38,20 +38,3 @@ def loaded(cell_folder):
 def found(loaded):
     """A run of it."""
     return stitch.run(loaded)
-
-
-def taken(session):
-    """What a person holds of a session: the arguments of `from_arrays` that give the same."""
-    views = session.views
-    return {
-        "clouds": {view.name: view.cloud for view in views},
-        "poses": np.array([view.T_base_flange for view in views]),
-        "mount": session.mount,
-        "joints": session.joints,
-        "robot": session.robot,
-        "times": None if views[0].time_s is None else [view.time_s for view in views],
-        "covariates": {name: [view.covariates[name] for view in views] for name in views[0].covariates},
-        "scanner": session.scanner,
-        "unit": session.length_unit,
-        "name": session.name,
-    }

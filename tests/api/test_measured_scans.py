@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import stitch
-from tests.api.conftest import taken
-from tests.api.test_run import same_folder
+from tests.api.same import same_folder, taken
 
 # Minutes of work: `make check` runs it, `make test` does not.
 pytestmark = pytest.mark.slow

@@ -22,21 +22,7 @@ from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
-from tests.api.conftest import taken
-
-FILES = ("model.toml", "ledger.json", "stitched.ply", "residuals.parquet")
-
-
-def result_of(folder):
-    """result.json without times and paths."""
-    document = json.loads((folder / "result.json").read_text())
-    del document["session"]
-    return document | {"stages": [{**stage, "seconds": None} for stage in document["stages"]]}
-
-
-def same_folder(a, b):
-    """True if two run folders hold the same but for times and paths."""
-    return result_of(a) == result_of(b) and all((a / f).read_bytes() == (b / f).read_bytes() for f in FILES)
+from tests.api.same import same_folder, taken
 
 
 def test_the_hand_eye_as_an_object(found):

@@ -12,7 +12,7 @@ from data_synth.write import robot_table
 from stitch.errors import InputError
 from stitch.integrity.refusals import refuse_whole
 from stitch.measurement.session import View
-from tests.api.conftest import taken
+from tests.api.same import taken
 
 
 def same_view(a, b, digits=0.0):
