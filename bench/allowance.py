@@ -19,18 +19,18 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
 from stitch import frames
-from stitch.cells.window.allowance import Wanted
-from stitch.cells.window.cad import Surface, surface
-from stitch.cells.window.cad_fit import CadFit, fit
-from stitch.cells.window.joined_scans import Joined, join
+from stitch.cells.window.allowance import AllowancePrior
+from stitch.cells.window.cad import CadSurface, cad_surface
+from stitch.cells.window.cad_fit import CadFit, fit_cad
+from stitch.cells.window.joined_scans import JoinedScans, join_scans
 from stitch.frames import Array
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"
 BEGIN, END = "<!-- allowance: begin -->", "<!-- allowance: end -->"
 FIRST = 200
 _NORMAL = 1.96  # 95 % of a normal number
-FREE, VARYING = Wanted(free=True), Wanted(free=True, varying=True)
+FREE, VARYING = AllowancePrior(free=True), AllowancePrior(free=True, varying=True)
 
 
 def even(points: Array) -> Array:
@@ -42,7 +42,7 @@ def wave(points: Array) -> Array:
     return 0.3 + 0.08 * np.sin(points[:, 2] / 80) + 0.04 * points[:, 0] / 40
 
 
-CASES: tuple[tuple[str, Callable[[Array], Array], float, Wanted], ...] = (
+CASES: tuple[tuple[str, Callable[[Array], Array], float, AllowancePrior], ...] = (
     ("even 0.3, asked for even", even, 0.0, FREE),
     ("the same, asked for varying", even, 0.0, VARYING),
     ("the same with flash, asked for even", even, 0.125, FREE),
@@ -50,7 +50,7 @@ CASES: tuple[tuple[str, Callable[[Array], Array], float, Wanted], ...] = (
 )
 
 
-def casting(mesh, stock: Callable[[Array], Array], flash: float, seed: int) -> tuple[Joined, Array, Array]:
+def casting(mesh, stock: Callable[[Array], Array], flash: float, seed: int) -> tuple[JoinedScans, Array, Array]:
     """Scans in the base, true T_base_part, a start; a share `flash` of the points stands 0.02 to 0.2 further out."""
     rng = np.random.default_rng([seed, 5])
     T = frames.make(Rotation.random(rng=rng).as_matrix(), np.array([1200.0, -300.0, 800.0]))
@@ -59,13 +59,13 @@ def casting(mesh, stock: Callable[[Array], Array], flash: float, seed: int) -> t
     clouds = [scan(grown, pose, tool, window_scans.NO_FIELD, rng).points for pose in poses]
     off = frames.exp(rng.normal(size=6) * np.repeat([4e-3, 0.6], 3))
     centre = frames.make(np.eye(3), mesh.bounds.mean(axis=0))
-    seen = join([prepare_view("", c) for c in clouds], T @ poses)
+    seen = join_scans([prepare_scan("", c) for c in clouds], T @ poses)
     out = np.where(rng.random(len(seen.points)) < flash, rng.uniform(0.02, 0.2, len(seen.points)), 0.0)
     seen.points[:] += out[:, None] * seen.normals
     return seen, T, T @ centre @ off @ frames.inverse(centre)
 
 
-def numbers_of(seen: Joined, T: Array, found: CadFit, cad: Surface, stock: Callable[[Array], Array]) -> Array:
+def numbers_of(seen: JoinedScans, T: Array, found: CadFit, cad: CadSurface, stock: Callable[[Array], Array]) -> Array:
     """Error of the mean and of the field (rms), stated sigma of the mean, and z of the mean and of the pose's six."""
     assert found.allowance is not None
     places = frames.transform(frames.inverse(T), seen.points[seen.usable])
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     seeds = parser.parse_args().seeds
     mesh = build_shape("blade")
-    cad = surface(mesh)
+    cad = cad_surface(mesh)
     lines = [
         f"{seeds} blades each, µm; shares within 1.96 σ with 95 % intervals (of the pose: six numbers a blade).",
         "",
@@ -106,7 +106,7 @@ def main() -> None:
         rows = []
         for seed in range(FIRST, FIRST + seeds):
             seen, T, start = casting(mesh, stock, flash, seed)
-            rows.append(numbers_of(seen, T, fit(seen, cad, start, wanted=wanted), cad, stock))
+            rows.append(numbers_of(seen, T, fit_cad(seen, cad, start, prior=wanted), cad, stock))
         lines.append(row(name, np.array(rows)))
         print(lines[-1], flush=True)
         write(lines)

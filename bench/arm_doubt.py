@@ -20,7 +20,7 @@ from scipy.stats import binomtest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.model.arm import kept_arm
+from stitch.model.arm import keep_arm_effects
 from stitch.model.model_toml import ModelFile
 from stitch.pipeline import run
 from stitch.writing.result_document import model_of
@@ -49,7 +49,7 @@ def trials(seed: int) -> Iterator[tuple[float, bool]]:
     """Rms of the kept arm over that of the nominal one, in truth, and whether it was doubted."""
     rng = np.random.default_rng([seed, 41])
     own, other = USUAL * rng.normal(size=(2, 3, 6))
-    kept = kept_arm(model_of(run(cell(3 * seed, int(rng.choice(FIRST)), own), effects=EFFECTS)))
+    kept = keep_arm_effects(model_of(run(cell(3 * seed, int(rng.choice(FIRST)), own), effects=EFFECTS)))
     for used in (own, other, own + 0.33 * other):
         found = run(cell(3 * seed + 1, SECOND, used), arm=kept)
         further = cell(3 * seed + 2, FURTHER, used, quiet=True)

@@ -11,8 +11,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_points
-from stitch.cells.base_to_base.stand_fit import fit
+from stitch.cells.base_to_base.stand import Stand, TouchedPoints, cylinder_points
+from stitch.cells.base_to_base.stand_fit import fit_stand
 from stitch.cells.base_to_base.stand_projection import project
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
@@ -53,9 +53,9 @@ def stand_of(P: np.ndarray, R: np.ndarray, slide: float, angle: np.ndarray, leng
     touched = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
     return Stand(
         length_unit="m",
-        rail=Touched(("P1", "P2"), P, touched),
+        rail=TouchedPoints(("P1", "P2"), P, touched),
         rail_slide=np.array([np.nan, 0.0]),
-        rod=Touched(("R1", "R2"), R, touched),
+        rod=TouchedPoints(("R1", "R2"), R, touched),
         slide=np.full(2, slide),
         angle=np.asarray(angle),
         length=np.asarray(length),
@@ -110,7 +110,7 @@ def draw(experiment: int, lam: float, draws: int) -> dict[str, np.ndarray]:
     stands = [noisy(stand, JOINTS[1], lam, rng) for _ in range(draws)]
     return {
         "projection": np.array([errors(project(s).T_base1_base2, experiment) for s in stands]),
-        "least squares": np.array([errors(fit(s).T_base1_base2, experiment) for s in stands]),
+        "least squares": np.array([errors(fit_stand(s).T_base1_base2, experiment) for s in stands]),
     }
 
 
@@ -132,7 +132,10 @@ def tables(draws: int) -> str:
     for lam, points in TABLE_3.items():
         P, R = np.array(points[:2]), np.array(points[2:])
         stand = stand_of(P, R, SLIDE[1], np.array(ANGLE[1]), np.array(LENGTH[1]))
-        for name, T in (("projection", project(stand).T_base1_base2), ("least squares", fit(stand).T_base1_base2)):
+        for name, T in (
+            ("projection", project(stand).T_base1_base2),
+            ("least squares", fit_stand(stand).T_base1_base2),
+        ):
             rotation, translation = errors(T, 1)
             p = PUBLISHED[1, lam]
             lines.append(f"| {lam} | {name} | {rotation:.5f} | {translation:.5f} | {p[0]:.5f} / {p[1]:.5f} |")
@@ -150,7 +153,9 @@ def _closing(rod: int, joints: int) -> str:
     R = cylinder_points(np.array([-r, r]), np.full(2, 0.7), np.full(2, 0.3))
     stand = stand_of(P, R, SLIDE[rod], np.array(ANGLE[rod]), np.array(LENGTH[rod]))
     c = compare_distances(stand)[0]
-    found = "refused" if abs(c.difference) > 1e-3 else np.array2string(fit(stand).T_base1_base2[:3, 3], precision=4)
+    found = (
+        "refused" if abs(c.difference) > 1e-3 else np.array2string(fit_stand(stand).T_base1_base2[:3, 3], precision=4)
+    )
     return f"| {rod} | {joints} | {c.by_stand:.4f} | {c.by_robot:.4f} | {c.difference:+.4f} | {found} |"
 
 

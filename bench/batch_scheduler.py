@@ -12,7 +12,7 @@ import psutil
 from distributed import Client
 from distributed.utils import open_port
 
-from stitch.batch.job import Job
+from stitch.batch.job import BatchJob
 from stitch.batch.results import rows_from
 from stitch.batch.session_row import SessionRow
 
@@ -23,7 +23,7 @@ _SENTENCE = (
 )
 
 
-def nothing(job: Job) -> SessionRow:
+def nothing(job: BatchJob) -> SessionRow:
     """A row as large as that of a session, at once."""
     return SessionRow(
         str(job.session),
@@ -84,7 +84,7 @@ def _through(count: int, address: str, served: psutil.Process) -> str:
     own = psutil.Process()
     with Client(address, timeout=60) as client:
         client.wait_for_workers(2, timeout=60)
-        jobs = [Job(Path(f"/plant/cell-{i % 1000}/{i}"), Path(f"/plant/runs/{i}"), "f" * 32) for i in range(count)]
+        jobs = [BatchJob(Path(f"/plant/cell-{i % 1000}/{i}"), Path(f"/plant/runs/{i}"), "f" * 32) for i in range(count)]
         before, held = served.memory_info().rss, own.memory_info().rss
         spent, begun = sum(served.cpu_times()[:2]), time.perf_counter()
         most = most_own = 0

@@ -17,7 +17,7 @@ from stitch.diagnosis.form_trial import scales_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity.detectable import least_noncentrality
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import lacking
+from stitch.effects.in_session import missing_need
 from stitch.effects.user_file import load
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
@@ -100,7 +100,7 @@ def user_effect(law: str) -> str:
 
 def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float | None:
     """Factor on the parameters `true` that is detectable at the least; None where cell or belief cannot hold it."""
-    if lacking(linear.measurement, EFFECTS[effect]) or not true:
+    if missing_need(linear.measurement, EFFECTS[effect]) or not true:
         return None
     candidate = candidate_of(linear, EFFECTS[effect])
     if candidate is None:
@@ -114,7 +114,7 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
         off = np.abs(form.term.values - values)[~fitted].sum()
         if not values[fitted & ~form.keep].any():
             white = linear.residual(form.columns)
-            degrees_of_freedom = linear.satterthwaite.of(linear.in_blocks(white))
+            degrees_of_freedom = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
             least = least_noncentrality(
                 white * form.sizes,
                 float(weight),

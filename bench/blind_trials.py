@@ -34,7 +34,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.pipeline import diagnose, run
 from stitch.revision import change
 from stitch.runs.run import Run
-from stitch.runs.state import State, state_of
+from stitch.runs.state import RunState, state_of
 from stitch.stepwise import suggest
 from stitch.system.threads import library_threads_off
 
@@ -188,7 +188,7 @@ def _pair(job: Row) -> Row:
     if hidden is None:
         return {"verdict": "not shown"}
     measured = measure(job["scene"], job["seed"], hidden, chance=_chance(job))
-    state: State = state_of(run(session_of(measured)))
+    state: RunState = state_of(run(session_of(measured)))
     result, lines, last = suggest(state, 4)
     return {
         "hidden": dict(measured.hidden), "verdict": last.verdict, "named": list(last.effects),

@@ -22,12 +22,12 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import lacking
-from stitch.model.forward import corrected, moves_points
+from stitch.effects.in_session import missing_need
+from stitch.model.forward import corrected_capture, moves_points
 from stitch.model.term import term_of
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps
 from stitch.observations.surfaces.view_responses import view_responses
 from stitch.stored.load_state import load_state
 from stitch.system.threads import library_threads_off
@@ -67,16 +67,16 @@ def streamed(run: Path, correspondences: int) -> None:
     """The sums over many correspondences, in this process."""
     state = load_state(run)
     with library_threads_off():
-        own = corrected(state.measurement, state.model)
+        own = corrected_capture(state.measurement, state.model)
         poses = own.poses(state.model.T_mount)
-        few = collect(own, poses, state.gate, [sample(scan, 1000) for scan in own.scans])
+        few = collect_overlaps(own, poses, state.gate, [sample_points(scan, 1000) for scan in own.scans])
         per_view = round(1000 * correspondences / few.gram.count.sum())
-        many = collect(own, poses, state.gate, [sample(scan, per_view) for scan in own.scans])
+        many = collect_overlaps(own, poses, state.gate, [sample_points(scan, per_view) for scan in own.scans])
     before = _peak()
-    library = [term_of(state.measurement, e) for e in EFFECTS.values() if not lacking(state.measurement, e)]
+    library = [term_of(state.measurement, e) for e in EFFECTS.values() if not missing_need(state.measurement, e)]
     terms = [term for term in library if moves_points([term])]
     start = time.perf_counter()
-    freed = FreePoses(poses, np.zeros((len(poses), 6)), many)
+    freed = UnconstrainedPoses(poses, np.zeros((len(poses), 6)), many)
     found = view_responses(state.measurement, state.model, terms, freed)
     count, columns = sum(len(m.residual) for m in many.matches), sum(r.columns.shape[1] for r in found)
     print(

@@ -11,7 +11,7 @@ from data_synth.scene import Scene
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.free_poses import FreePoses, visible_step
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_step
 from stitch.observations.surfaces.gram import gram, robust_scale
 from stitch.observations.surfaces.match import Match
 
@@ -21,8 +21,8 @@ _STEPS = 8
 
 
 def with_moved_points(
-    freed: FreePoses, measurement: Measurement, scene: Scene, laws: Nature, moments: list[Moment]
-) -> FreePoses:
+    freed: UnconstrainedPoses, measurement: Measurement, scene: Scene, laws: Nature, moments: list[Moment]
+) -> UnconstrainedPoses:
     """Views that were freed with the points as they are, freed anew after the laws have moved the points.
 
     The pairs stay: laws of the sizes that are asked move points by less than the noise.
@@ -54,7 +54,9 @@ def _carried(m: Match, twists: Array, centre: Array) -> Array:
     return np.asarray(np.cross(turn, m.middle - centre) + shift)
 
 
-def _moved(v: int, freed: FreePoses, measurement: Measurement, scene: Scene, laws: Nature, moment: Moment) -> Array:
+def _moved(
+    v: int, freed: UnconstrainedPoses, measurement: Measurement, scene: Scene, laws: Nature, moment: Moment
+) -> Array:
     """(N, 3) how far the laws move the points of view v, scanner frame; 0 for points without a partner."""
     scan, seen = measurement.capture.scans[v], measurement.scan_views[v]
     at = _with_partner(v, freed)
@@ -67,7 +69,7 @@ def _moved(v: int, freed: FreePoses, measurement: Measurement, scene: Scene, law
     return out
 
 
-def _with_partner(v: int, freed: FreePoses) -> Indices:
+def _with_partner(v: int, freed: UnconstrainedPoses) -> Indices:
     """Points of view v that have a partner in any other view."""
     found = [m.index_v if m.v == v else m.index_w for m in freed.overlaps.matches if v in (m.v, m.w)]
     return np.unique(np.concatenate([np.zeros(0, np.int64), *found]))

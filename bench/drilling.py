@@ -11,11 +11,11 @@ import numpy as np
 from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import render_plate
 from stitch.cells.drilling.camera_effects import select_effects
-from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.drilling.drill_procedure import calibrate, run_group
+from stitch.cells.drilling.camera_model import HoleObservations
+from stitch.cells.drilling.drill_procedure import calibrate_sensors, run_group
 from stitch.cells.drilling.hole_frame import drive_pose
 from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
-from stitch.cells.drilling.servo import look
+from stitch.cells.drilling.servo import measure_hole
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "drilling.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
@@ -30,7 +30,7 @@ def experiment(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Errors (2, 8, 3) before and after, the largest servo step count, and the leave-one-out mean."""
     cell = DrillingCell(seed)
     xyz, uv = cell.plate()
-    seeing = calibrate(xyz, uv, *cell.plane_readings(), HEIGHT)
+    seeing = calibrate_sensors(xyz, uv, *cell.plane_readings(), HEIGHT)
     found: tuple[list, list] = ([], [])
     steps = []
     for references, targets in GROUPS.values():
@@ -38,7 +38,7 @@ def experiment(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
         steps += [placed.steps for placed in group.placed.values()]
         for name in targets:
             for rows, T in zip(found, (drive_pose(*cell.nominal[name]), group.drives[name]), strict=True):
-                seen = look(seeing, *cell.measure(name, T))
+                seen = measure_hole(seeing, *cell.measure(name, T))
                 rows.append([*cell.errors(name, T), np.hypot(*seen.offset[:2])])
     return np.array(found), np.array(steps), float(np.linalg.norm(leave_one_out(xyz[:, :2], uv), axis=1).mean())
 
@@ -92,7 +92,7 @@ def effects_row(k1: float, plate: float, seeds: int) -> str:
         cell = DrillingCell(seed, Sizes(k1=k1, plate_height=plate))
         (xyz, uv), (at, seen) = cell.plate(), cell.check_holes()
         on_plate = np.arange(len(xyz) + len(at)) < len(xyz)
-        selected = select_effects(Observations(np.vstack([xyz, at]), np.vstack([uv, seen]), on_plate, IMAGE))
+        selected = select_effects(HoleObservations(np.vstack([xyz, at]), np.vstack([uv, seen]), on_plate, IMAGE))
         named = {t.effect: t.value for t in selected.trials if t.accepted}
         at, seen = cell.check_holes((0.0,))
         errors = [to_plane(fit_homography(xyz[:, :2], uv), seen), selected.camera.plane(seen, at[:, 2])]

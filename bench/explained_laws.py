@@ -39,10 +39,10 @@ _NEAR = 1.1  # of the truth's rms on views left out
 def share_left(linear: LinearModel, column: Array) -> float:
     """Mean square on views left out, of the present model's, with one column of free size; in the fit that `add` makes,
     under the scatter of `linear`, it is what `explain` says of its formula."""
-    trial, present = linear.trial(np.column_stack([linear.design, column])), linear.present
+    trial, present = linear.trial(np.column_stack([linear.design, column])), linear.baseline_trial
     left, before = 0.0, 0.0
     for fold in linear.observation.folds():
-        touched = linear.observation.touched(fold)
+        touched = linear.observation.affected_squares(fold)
         left += trial.squares(trial.solve(fold))[touched].sum()
         before += present.squares(present.solve(fold))[touched].sum()
     return left / before

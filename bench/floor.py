@@ -14,7 +14,7 @@ from large import PAGE
 
 import stitch
 from stitch import frames
-from stitch.measurement.capture import Capture, capture
+from stitch.measurement.capture import Capture, prepare_capture
 from stitch.system.threads import library_threads_off, parallel
 
 
@@ -23,7 +23,7 @@ def floor(session: Path) -> tuple[int, float, Capture]:
     loaded = stitch.load_session(session, at_most=None)
     with library_threads_off():
         begun = time.perf_counter()
-        own = capture(loaded)
+        own = prepare_capture(loaded)
         assert loaded.scanner.T_mount is not None
         poses = own.poses(loaded.scanner.T_mount)
 

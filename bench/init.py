@@ -19,13 +19,13 @@ import numpy as np
 from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from stitch import frames
 from stitch.intake.cloud_pairs import pairings
-from stitch.intake.doctor import decide
-from stitch.intake.first_session import all_readings, capture_of, open_units
-from stitch.intake.mounting import mounting
+from stitch.intake.doctor import choose_convention
+from stitch.intake.first_session import all_readings, candidate_units, capture_of
+from stitch.intake.mounting import choose_mounting
 from stitch.intake.raw_poses import RawPoses
 from stitch.intake.stated import StatedTable
 from stitch.integrity.misread_rotations import ORDERS
-from stitch.integrity.relative_scans import relative_scans
+from stitch.integrity.relative_scans import register_scan_pairs
 from stitch.measurement.capture import Capture
 from stitch.reading.clouds import read_cloud
 
@@ -63,7 +63,7 @@ class Cell:
         T, clouds = session_poses(self.folder)
         self.T, self.clouds = T[:views], [self.folder / cloud for cloud in clouds[:views]]
         self.capture: Capture = capture_of([read_cloud(cloud) for cloud in self.clouds], 1000.0)
-        self.motions = cache(lambda: relative_scans(self.capture))
+        self.motions = cache(lambda: register_scan_pairs(self.capture))
 
     def outcome(self, convention: Convention) -> tuple[str, str]:
         """ "right", "cannot be told" or "wrong", and what was said."""
@@ -71,12 +71,12 @@ class Cell:
         raw = RawPoses("table", None, numbers, ((),) * len(numbers), "")
         found = all_readings(raw, None, StatedTable())
         pairs = pairings(self.clouds, raw.labels)
-        decided = decide(self.capture, self.motions, found, pairs, open_units(found, StatedTable()))
-        settled = mounting(decided, None, None, False)
-        way = decided.best.way
+        decided = choose_convention(self.capture, self.motions, found, pairs, candidate_units(found, StatedTable()))
+        settled = choose_mounting(decided, None, None, False)
+        way = decided.best.interpretation
         said = f"{way.reading.words}, {way.length_unit}, {settled.mount}{', inverted' * settled.inverted}"
         said += f" ({decided.best.misfit:.2f} mm, next {decided.runner_up.misfit if decided.runner_up else 0:.2f})"
-        if not (decided.told and settled.guess.told):
+        if not (decided.determined and settled.guess.determined):
             return "cannot be told", said
         T = settled.flange(way.T)
         turned = frames.angle_between(T, self.T).max() < 1e-5

@@ -13,17 +13,17 @@ from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
 from stitch.errors import StitchError
-from stitch.integrity.arm_limits import judged_by_size
+from stitch.integrity.arm_limits import apply_displacement_limits
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.snooping import Snooping, snoop
+from stitch.integrity.snooping import Snooping, snoop_views
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.measurement.capture import Capture, capture
+from stitch.measurement.capture import Capture, prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
 from stitch.model.model import Model
-from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.free_poses import unconstrained_poses
 from stitch.pipeline import run
-from stitch.stages.correct import close_in
+from stitch.stages.correct import icp_hand_eye
 
 PARTS: dict[str, dict[str, Any]] = {
     "blade": {},
@@ -59,11 +59,11 @@ def measured(
 
 def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray, Snooping]:
     """What a run would see: hand-eye corrected, views freed, tests."""
-    own = capture(session)
-    T_mount, overlaps, _ = close_in([own], T_mount, [_START_GATE])
-    freed = free_poses(own, own.poses(T_mount), overlaps[0].gate)
+    own = prepare_capture(session)
+    T_mount, overlaps, _ = icp_hand_eye([own], T_mount, [_START_GATE])
+    freed = unconstrained_poses(own, own.poses(T_mount), overlaps[0].gate)
     usual = UsualEffects(measurement_of(session, own), Model(T_mount))
-    return own, T_mount, judged_by_size(session, snoop(own, T_mount, overlaps[0].gate, freed, usual))
+    return own, T_mount, apply_displacement_limits(session, snoop_views(own, T_mount, overlaps[0].gate, freed, usual))
 
 
 def scattering(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
@@ -96,7 +96,7 @@ def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, in
     """The mistakes of the table in one session; with share (k, n) every n-th of them, from k on."""
     m = measured(part, mount, seed)
     session = session_of(m)
-    own = capture(session)
+    own = prepare_capture(session)
     table = {"nothing": Fault(lambda s: s, ())}
     table |= faults(VIEWS, np.random.default_rng([seed, 8])) | {
         "clouds in base frame": in_base_frame(own.poses(m.T_mount))

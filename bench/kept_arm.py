@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch.measurement.session import Session
-from stitch.model.arm import kept_arm
+from stitch.model.arm import keep_arm_effects
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
@@ -63,7 +63,7 @@ def main() -> None:
         session = series[name]
         ways = {
             "nominal": run(session),
-            f"of {other} (`--arm`)": run(session, arm=kept_arm(model_of(found[other]))),
+            f"of {other} (`--arm`)": run(session, arm=keep_arm_effects(model_of(found[other]))),
             f"common to both (`run A C`: {', '.join(effects)})": common[name],
             "fitted here": found[name],
         }

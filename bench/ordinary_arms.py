@@ -22,7 +22,7 @@ from ordinary_cells import SCANS_A_STOP, Cell, cell_of, erring, seen
 
 from stitch import frames
 from stitch.model.model import Model
-from stitch.observations.pose_errors import pose_errors
+from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
@@ -64,7 +64,7 @@ def trials(cell: Cell, kind: str, size: float, draws: int, alone: bool) -> Itera
     """Errors of the hand-eye (6,) and their covariances, one a draw."""
     measurement, T = cell.measurement, cell.T_mount
     centre = cell.freed.overlaps.gram.centre
-    errors = None if alone else pose_errors([measurement], Model(T), [centre])
+    errors = None if alone else prior_pose_errors([measurement], Model(T), [centre])
     for draw in range(draws):
         rng = np.random.default_rng([cell.seed, draw, round(size * 1e6), len(kind)])
         freed = seen(cell, erring(cell, kind, size, rng), rng)

@@ -14,12 +14,12 @@ from data_synth.scene import load_scene
 from data_synth.simulate import on_rail, simulate
 from stitch import frames
 from stitch.frames import Array
-from stitch.measurement.capture import capture, part_size
-from stitch.measurement.measurement import Measurement, about_part, measurement_of
-from stitch.observations.surfaces.free_poses import FreePoses, free_poses, visible_directions
-from stitch.observations.surfaces.hand_eye import scatter_of
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect, next_gate
+from stitch.measurement.capture import part_size, prepare_capture
+from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses, visible_directions
+from stitch.observations.surfaces.hand_eye import capture_repeatability
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps, next_gate
 from stitch.stages.correct import COARSE_SAMPLES
 
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm
@@ -39,7 +39,7 @@ class Cell:
     rail: Array  # (V,)
     T_mount: Array  # (4, 4) true
     measurement: Measurement
-    freed: FreePoses
+    freed: UnconstrainedPoses
     noise_factor: float
 
     @property
@@ -63,12 +63,14 @@ def cell_of(name: str, seed: int, scans_a_stop: int = 1) -> Cell:
         plan, rail = replace(plan, **of_views), rail[again]
     measured = simulate(scene_of(name), {}, seed, planned=(plan, rail))
     session, T_mount = session_of(measured), measured.T_mount
-    measurement = about_part(measurement_of(session, capture(session)), T_mount)
+    measurement = with_part_origin(measurement_of(session, prepare_capture(session)), T_mount)
     own = measurement.capture
     poses = own.poses(T_mount)
-    begun = collect(own, poses, _GATE * part_size([own]), [sample(scan, COARSE_SAMPLES) for scan in own.scans])
-    freed = free_poses(own, poses, next_gate(begun, own))
-    noise_factor = scatter_of(own, freed, T_mount).noise_factor
+    begun = collect_overlaps(
+        own, poses, _GATE * part_size([own]), [sample_points(scan, COARSE_SAMPLES) for scan in own.scans]
+    )
+    freed = unconstrained_poses(own, poses, next_gate(begun, own))
+    noise_factor = capture_repeatability(own, freed, T_mount).noise_factor
     return Cell(name, seed, plan, rail, T_mount, measurement, freed, noise_factor)
 
 
@@ -93,7 +95,7 @@ def erring(cell: Cell, kind: str, size: float, rng: np.random.Generator) -> Arra
     return T @ frames.exp(scatter * SCATTER)
 
 
-def seen(cell: Cell, T_base_flange: Array, rng: np.random.Generator) -> FreePoses:
+def seen(cell: Cell, T_base_flange: Array, rng: np.random.Generator) -> UnconstrainedPoses:
     """What the overlaps would show of these poses, with the noise that their normal equations give."""
     g = cell.freed.overlaps.gram
     left = frames.inverse(T_base_flange) if cell.measurement.eye_to_hand else T_base_flange

@@ -14,12 +14,12 @@ from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready
 from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
-from stitch.cells.panel.errors_along import along
-from stitch.cells.panel.global_model import calibrate
-from stitch.cells.panel.laser_tracker import Tracker
+from stitch.cells.panel.errors_along import errors_along_motion
+from stitch.cells.panel.global_model import calibrate_robot
+from stitch.cells.panel.laser_tracker import LaserTracker
 from stitch.cells.panel.legs import Legs, find_leg_offset, true_flanges
 from stitch.cells.panel.panel_loops import run_pose
-from stitch.cells.panel.shape_control import SHAPING
+from stitch.cells.panel.shape_control import SHAPE_AXES
 from stitch.errors import NoResultError
 from viz.cells.panel_error_figures import errors_figure, shape_figure
 
@@ -64,8 +64,8 @@ def shape_table(draws: int) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     cases = (
-        ("z and about x, y; the rest gives way", True, SHAPING),
-        ("z and about x, y; the rest is held", False, SHAPING),
+        ("z and about x, y; the rest gives way", True, SHAPE_AXES),
+        ("z and about x, y; the rest is held", False, SHAPE_AXES),
         ("all six", False, np.ones(6, bool)),
     )
     for name, compliant, axes in cases:
@@ -93,13 +93,13 @@ def leg_table(draws: int) -> list[str]:
             hidden = np.zeros((6, 6))
             hidden[2, 3] = size
             cell = PanelCell(1000 + seed, leg_offsets=hidden)
-            readings = read(cell, Tracker(cell.tracker))
+            readings = read(cell, LaserTracker(cell.tracker))
             for i, reading in enumerate(readings):
-                model = calibrate(reading)
+                model = calibrate_robot(reading)
                 o = find_leg_offset(reading, model, LEGS, 36)
-                wrong += o.found and i != 2
+                wrong += o.detected and i != 2
                 if i == 2:
-                    found, right = found + o.found, right + (o.found and o.leg == 4)
+                    found, right = found + o.detected, right + (o.detected and o.leg == 4)
                     values, sigmas = [*values, o.offset], [*sigmas, o.sigma]
                     errors.append(_base_errors(cell, reading, model, o))
         b, a = np.sqrt((np.array(errors) ** 2).mean(0))
@@ -112,9 +112,9 @@ def leg_table(draws: int) -> list[str]:
 def _base_errors(cell, reading, model, offset) -> tuple[float, float]:
     """Distance of robot C's base from the truth before and after the finding is used, mm."""
     better = model
-    if offset.found:
+    if offset.detected:
         real = true_flanges(LEGS, reading.T_base_flange, [(offset.leg, offset.offset)])
-        better = calibrate(replace(reading, T_base_flange=real))
+        better = calibrate_robot(replace(reading, T_base_flange=real))
     off = [(frames.inverse(cell.T_world_base[2]) @ m.T_world_base)[:3, 3] for m in (model, better)]
     return tuple(float(np.linalg.norm(v)) for v in off)
 
@@ -123,13 +123,13 @@ def pictures() -> None:
     PICTURES.mkdir(exist_ok=True)
     r = ready_without_panel(0)
     args = r.stage.models, r.T_base_flange, MASTER
-    shift = along(*args, np.linspace(0, 100, 11), turn=False)
-    turn = along(*args, np.radians(np.linspace(0, 2, 11)), turn=True)
+    shift = errors_along_motion(*args, np.linspace(0, 100, 11), turn=False)
+    turn = errors_along_motion(*args, np.radians(np.linspace(0, 2, 11)), turn=True)
     errors_figure(NAMES, MASTER, shift, turn).savefig(PICTURES / "panel-errors.png", dpi=110)
     try:
-        run = shape_run(0, True, SHAPING, tolerance=0.25)
+        run = shape_run(0, True, SHAPE_AXES, tolerance=0.25)
     except NoResultError:
-        run = shape_run(0, True, SHAPING)
+        run = shape_run(0, True, SHAPE_AXES)
     forces = np.array([np.linalg.norm(f[:, 3:], axis=1).max() for f in run.forces])
     shape_figure(NAMES, run.deviations, TOLERANCE, forces).savefig(PICTURES / "panel-shape.png", dpi=110)
 

@@ -7,7 +7,7 @@ import numpy as np
 from panel_ready import MASTER, ready_without_panel
 
 from stitch import frames
-from stitch.cells.panel.errors_along import along
+from stitch.cells.panel.errors_along import errors_along_motion
 from stitch.cells.panel.panel_motion import follow
 
 
@@ -28,7 +28,7 @@ def drift_table() -> list[str]:
             r.cell.sizes = replace(r.cell.sizes, leg=leg)
             r.cell.drive(r.T_base_flange)
             if seed == 0:
-                e = along(r.stage.models, r.T_base_flange, MASTER, np.array([step]), turn=turn)
+                e = errors_along_motion(r.stage.models, r.T_base_flange, MASTER, np.array([step]), turn=turn)
                 expected = [e.position.max(), np.degrees(e.angle.max())]
             bases = np.array([m.T_world_base for m in r.stage.models])
             change = np.zeros((3, 6, 6))

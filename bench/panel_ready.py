@@ -7,15 +7,15 @@ import numpy as np
 from data_synth import panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
-from stitch.cells.panel.global_model import Readings, calibrate
-from stitch.cells.panel.laser_tracker import Tracker
-from stitch.cells.panel.layout import Layout, contacts
-from stitch.cells.panel.panel_loops import ShapeRun, Stage, run_pose, run_shape
+from stitch.cells.panel.global_model import ReflectorReadings, calibrate_robot
+from stitch.cells.panel.laser_tracker import LaserTracker
+from stitch.cells.panel.layout import ClampLayout, clamp_contacts
+from stitch.cells.panel.panel_loops import PanelSetup, ShapeRun, run_pose, run_shape
 from stitch.cells.panel.panel_motion import preposition
 from stitch.cells.panel.rigid_fit import rigid_fit
 from stitch.cells.panel.shape_control import ControlPoints
 
-LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
+LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
 POSES, MASTER, TOLERANCE = 40, 1, 0.6
 
 
@@ -24,8 +24,8 @@ class Ready:
     """A cell with its panel on the clamps."""
 
     cell: PanelCell
-    stage: Stage
-    readings: list[Readings]
+    stage: PanelSetup
+    readings: list[ReflectorReadings]
     T_base_flange: np.ndarray
 
 
@@ -38,19 +38,19 @@ def ready(seed: int, **settings) -> Ready:
 
 def ready_without_panel(seed: int, **settings) -> Ready:
     cell = PanelCell(seed, **settings)
-    tracker = Tracker(cell.tracker)
+    tracker = LaserTracker(cell.tracker)
     readings = read(cell, tracker)
-    stage = Stage([calibrate(r) for r in readings], MASTER, tracker, cell.target)
+    stage = PanelSetup([calibrate_robot(r) for r in readings], MASTER, tracker, cell.target)
     base, contact = (np.array([getattr(m, n) for m in stage.models]) for n in ("T_world_base", "T_flange_contact"))
-    start = preposition(base, cell.target, contacts(LAYOUT).T_panel_contact, contact)
+    start = preposition(base, cell.target, clamp_contacts(LAYOUT).T_panel_contact, contact)
     cell.drive(start)
     return Ready(cell, stage, readings, start)
 
 
-def read(cell: PanelCell, tracker: Tracker) -> list[Readings]:
+def read(cell: PanelCell, tracker: LaserTracker) -> list[ReflectorReadings]:
     commands = panel_job.calibration_poses(POSES, cell.seed)
     seen = panel_job.calibration(cell, commands)
-    return [Readings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)]
+    return [ReflectorReadings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)]
 
 
 def pose_error(cell: PanelCell) -> np.ndarray:
@@ -65,5 +65,5 @@ def shape_run(seed: int, compliant: bool, axes: np.ndarray, tolerance: float = T
     r = ready(seed)
     stand = run_pose(r.cell, r.stage, panel_job.pose_targets(), r.T_base_flange)
     r.cell.compliant = compliant
-    control = ControlPoints(*panel_job.control_points(), contacts(LAYOUT).T_panel_contact)
+    control = ControlPoints(*panel_job.control_points(), clamp_contacts(LAYOUT).T_panel_contact)
     return run_shape(r.cell, r.stage, control, stand, tolerance=tolerance, axes=axes)

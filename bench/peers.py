@@ -24,7 +24,7 @@ from plyfile import PlyData
 from data_synth.fixtures.part_distance import off_surface
 from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch import frames
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.reading.session_folder import load_session
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ def begun(session: Path) -> Array:
     loaded = load_session(session)
     assert loaded.scanner.T_mount is not None
     poses = np.array([view.T_base_flange for view in loaded.views])
-    return place(loaded.name, (), poses, loaded.mount).poses(loaded.scanner.T_mount)
+    return build_capture(loaded.name, (), poses, loaded.mount).poses(loaded.scanner.T_mount)
 
 
 def distances(clouds: list[Array], poses: Array, truth: dict[str, list[list[float]]]) -> Array:

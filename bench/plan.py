@@ -24,22 +24,22 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.simulate import Measured
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.frames import Array
-from stitch.measurement.measurement import about_part, measurement_of
+from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.model import Model
-from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.free_poses import unconstrained_poses
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.planning.chances import DRAWS, ExpectedDiagnosis
 from stitch.planning.expected_hand_eye import expected_hand_eye
-from stitch.planning.expected_model import Cell, expected_model, seen
-from stitch.planning.expected_scan import Field
-from stitch.planning.planned_part import of_mesh
+from stitch.planning.expected_model import CellModel, expected_model, simulate_views
+from stitch.planning.expected_scan import FieldOfView
+from stitch.planning.planned_part import surface_of_mesh
 from stitch.planning.scatter import stated_scatter
-from stitch.planning.told_sizes import told_sizes, under
+from stitch.planning.told_sizes import expected_scatter, with_scatter
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]
@@ -82,19 +82,19 @@ def planned(measured: Measured, law: str | None, rng: np.random.Generator) -> Ro
     session, scene = session_of(measured), measured.scene
     half = np.tan(np.radians(scene.scanner.field_of_view / 2)) * np.ones(2)
     reach = scene.scanner.standoff
-    field = Field(half, 0.7 * reach, 1.3 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
-    part = of_mesh(measured.mesh.copy()).moved(scene.T_reference_part)
-    cell = Cell(Model(measured.T_coarse), part, field, stated_scatter(session))
-    found = seen(session, cell)
+    field = FieldOfView(half, 0.7 * reach, 1.3 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(scene.T_reference_part)
+    cell = CellModel(Model(measured.T_coarse), part, field, stated_scatter(session))
+    found = simulate_views(session, cell)
     linear = expected_model(found, cell)
-    told = told_sizes(linear, cell.scatter.noise)
-    out: Row = {"covariance": expected_hand_eye(under(linear, told.believed), found).covariance.tolist()}
+    told = expected_scatter(linear, cell.scatter.noise)
+    out: Row = {"covariance": expected_hand_eye(with_scatter(linear, told.believed), found).covariance.tolist()}
     if law is None:
         return out
     candidates, _ = candidates_of(linear, empirical=False)
     own = next(c for c in candidates if c.name == law)
     shift = np.repeat(_shift(own, measured.hidden[law])[:, None], DRAWS, axis=1)
-    chance = ExpectedDiagnosis(under(linear, told.fitted), candidates).chance(law, shift, rng)
+    chance = ExpectedDiagnosis(with_scatter(linear, told.fitted), candidates).chance(law, shift, rng)
     return out | {"detected": chance.detected, "named": chance.named, "misnamed": chance.misnamed}
 
 
@@ -110,14 +110,14 @@ def _shift(candidate: Candidate, true: dict[str, float]) -> Array:
 def diagnosed(measured: Measured, predicted: Row) -> Row:
     """The verdict about the simulated scans; of a cell with nothing hidden, the error of the hand-eye too."""
     session, capture = session_of(measured), captured(measured)
-    measurement = about_part(measurement_of(session, capture), measured.T_mount)
-    freed = free_poses(capture, capture.poses(measured.T_mount), 4 * capture.spacing)
+    measurement = with_part_origin(measurement_of(session, capture), measured.T_mount)
+    freed = unconstrained_poses(capture, capture.poses(measured.T_mount), 4 * capture.spacing)
     model = Model(measured.T_mount)
     linear = surface_model(measurement, model, capture, freed)
-    selection = concluded(linear, candidates_of(linear)[0], scatter_limit(session))
+    selection = decide(linear, candidates_of(linear)[0], scatter_limit(session))
     out: Row = {"verdict": selection.verdict, "said": [r.name for r in selection.named]}
     if not measured.hidden:
-        errors = pose_errors([measurement], model, [freed.overlaps.gram.centre])
+        errors = prior_pose_errors([measurement], model, [freed.overlaps.gram.centre])
         T_mount = fit_hand_eye([capture], [freed], measured.T_mount, errors=errors).T_mount
         xi = frames.log(frames.inverse(measured.T_mount) @ T_mount)
         out["chi_square"] = float(xi @ np.linalg.solve(np.array(predicted["covariance"]), xi))

@@ -25,11 +25,11 @@ from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.frames import Array
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.targets.target_model import target_model
@@ -84,8 +84,8 @@ def said(kind: str, size: float, seed: int, views: int) -> Selection:
     unnamed = kind if own not in LIBRARY else "dress_pack" if own != kind else NOTHING
     errors = errors_of(unnamed, size, joints, rng)
     session, T_mount, _ = labelled_cell(seed, views=views, errors=errors, **known(own, size, rng))
-    linear = target_model(measurement_of(session, capture(session)), Model(T_mount), None)
-    return concluded(linear, candidates_of(linear)[0], scatter_limit(session))
+    linear = target_model(measurement_of(session, prepare_capture(session)), Model(T_mount), None)
+    return decide(linear, candidates_of(linear)[0], scatter_limit(session))
 
 
 def share(count: int, total: int) -> str:

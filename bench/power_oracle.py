@@ -22,11 +22,11 @@ from unknown_cells import Asked, World, asked, seen
 
 from data_synth import nature
 from stitch.diagnosis.candidates import Form
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, POWER
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import lacking
+from stitch.effects.in_session import missing_need
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.variance_components import at_variances
 from stitch.system.threads import library_threads_off
@@ -47,7 +47,10 @@ def known(a: Asked) -> LinearModel:
 
 def least(a: Asked, effect: str, true: dict[str, float]) -> float | None:
     """Factor on the parameters `true` that the oracle detects in eight draws of ten; None where a cell cannot."""
-    if lacking(a.cell.measurement, EFFECTS[effect]) or (candidate := candidate_of(a.linear, EFFECTS[effect])) is None:
+    if (
+        missing_need(a.cell.measurement, EFFECTS[effect])
+        or (candidate := candidate_of(a.linear, EFFECTS[effect])) is None
+    ):
         return None
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])
@@ -78,7 +81,7 @@ def found(a: Asked, effect: str, multiple: float, k: int) -> bool | None:
         return None
     laws = nature.draw({effect: multiple * size}, 1.0, a.cell.plan, np.random.default_rng([chance_of_law, 2]))[0]
     linear = seen(a, World(laws), rng)
-    return concluded(linear, a.candidates, ScatterLimit(*IMPLAUSIBLE)).verdict != "adequate"
+    return decide(linear, a.candidates, ScatterLimit(*IMPLAUSIBLE)).verdict != "adequate"
 
 
 def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, int, float]:

@@ -13,9 +13,9 @@ from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames
-from stitch.measurement.capture import capture, part_size
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.measurement.capture import part_size, prepare_capture
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 from stitch.stages.correct import correct
@@ -79,11 +79,11 @@ def repeated(folder: Path, runs) -> None:
     print("| object | before (µm) | after (µm) |\n|---|---:|---:|")
     david = runs["david"]
     for name in ("cone", "sphere", "rubik"):
-        own = capture(load_session(folder / name))
+        own = prepare_capture(load_session(folder / name))
         model = own.poses(david.T_mount)
-        picked = [sample(scan, 3000) for scan in own.scans]
+        picked = [sample_points(scan, 3000) for scan in own.scans]
         moved = frames.exp(david.corrections) @ model
-        before, after = (collect(own, poses, 4.0, picked).gram.rms for poses in (model, moved))
+        before, after = (collect_overlaps(own, poses, 4.0, picked).gram.rms for poses in (model, moved))
         print(f"| {name} | {before * 1e3:.0f} | {after * 1e3:.0f} |")
 
 
@@ -124,7 +124,7 @@ def speed() -> None:
     found = correct([c], m.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5])), 0.35 * part_size([c]))
     marks.append(time.perf_counter())
     poses = c.poses(found.hand_eye.T_mount)
-    register(c, poses, found.hand_eye.repeatability[0], found.overlaps[0].gate, start=found.freed[0].poses)
+    register(c, poses, found.hand_eye.repeatability[0], found.overlaps[0].gate, start=found.unconstrained[0].poses)
     marks.append(time.perf_counter())
     prepare, corrected, registered = np.diff(marks)
     points = sum(len(s.points) for s in c.scans)

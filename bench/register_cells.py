@@ -104,7 +104,7 @@ def cell_of(kind: str, seed: int) -> Cell:
         capture=own,
         T_reference_scanner=measured.T_reference_scanner,
         model_poses=own.poses(T_mount),
-        start=found.freed[0].poses,
+        start=found.unconstrained[0].poses,
         scatter=found.hand_eye.repeatability[0],
         gate=found.overlaps[0].gate,
     )

@@ -20,14 +20,14 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.capture import Capture, capture, part_size
+from stitch.measurement.capture import Capture, part_size, prepare_capture
 from stitch.measurement.scan import Scan
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect_overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import coarse
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
 from stitch.stages.register import Method, Registration, normal_equations, register
 
@@ -38,7 +38,7 @@ BEGIN, END = "<!-- real: begin -->", "<!-- real: end -->"
 
 def left_out(scan: Scan) -> Indices:
     """As many points as the fit samples, none of them among its own."""
-    others = np.setdiff1d(np.flatnonzero(scan.usable), sample(scan, FINE_SAMPLES))
+    others = np.setdiff1d(np.flatnonzero(scan.usable), sample_points(scan, FINE_SAMPLES))
     return others[np.linspace(0, len(others) - 1, min(len(others), FINE_SAMPLES)).astype(int)]
 
 
@@ -65,9 +65,9 @@ def apart(found: Registration, other: Registration) -> Array:
 
 def rows_of(name: str, session: Session, T_start: Array | None) -> list[str]:
     """One line for each way to weigh."""
-    own = capture(session)
+    own = prepare_capture(session)
     if T_start is None:
-        begun = coarse([own])
+        begun = find_coarse_hand_eye([own])
         T_start, gate = begun.T_mount, begun.gate
     else:
         gate = 0.35 * part_size([own])
@@ -77,12 +77,14 @@ def rows_of(name: str, session: Session, T_start: Array | None) -> list[str]:
     lines, first, sigma = [], None, 0.0
     for weights in SHOWN:
         begun_at = time.perf_counter()
-        registered = register(own, poses, scatter, overlaps.gate, start=found.freed[0].poses, method=METHODS[weights])
+        registered = register(
+            own, poses, scatter, overlaps.gate, start=found.unconstrained[0].poses, method=METHODS[weights]
+        )
         seconds = time.perf_counter() - begun_at
         if first is None:
             first = registered
             sigma = sigma_of(spread(own, registered, poses, scatter, METHODS[weights]))
-        fresh = collect(own, registered.poses, registered.overlaps.gate, spare).gram.rms
+        fresh = collect_overlaps(own, registered.poses, registered.overlaps.gate, spare).gram.rms
         off = np.sqrt(np.mean(apart(registered, first) ** 2))
         numbers = (registered.overlaps.gram.rms, fresh, off, sigma)
         lines.append(f"| {name} | {weights} | {' | '.join(f'{1e3 * x:.1f}' for x in numbers)} | {seconds:.1f} |")

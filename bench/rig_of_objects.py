@@ -20,15 +20,15 @@ from blind_trials import pin
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.measurement.capture import Capture, capture
-from stitch.measurement.measurement import Measurement, about_part, measurement_of
+from stitch.measurement.capture import Capture, prepare_capture
+from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
 from stitch.model.model import Model
-from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEye, fit_hand_eye
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEyeFit, fit_hand_eye
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import coarse
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
@@ -44,35 +44,35 @@ class Object:
 
     measurement: Measurement
     capture: Capture
-    freed: FreePoses
+    freed: UnconstrainedPoses
     field: Array  # (6V, K) errors of the scanner that all views share
 
 
 def objects_of(folder: Path) -> tuple[dict[str, Object], Array]:
     """All objects, and the hand-eye (4, 4) of the first."""
     sessions = {name: load_session(folder / name) for name in IN_HAND}
-    captures = {name: capture(session) for name, session in sessions.items()}
-    begun = coarse([captures[IN_HAND[0]]])
+    captures = {name: prepare_capture(session) for name, session in sessions.items()}
+    begun = find_coarse_hand_eye([captures[IN_HAND[0]]])
     out, T_mount = {}, begun.T_mount
     for name, own in captures.items():
         found = correct([own], T_mount, begun.gate)
         T_mount = found.model.T_mount if name == IN_HAND[0] else T_mount
-        measurement = about_part(measurement_of(sessions[name], own), found.model.T_mount)
-        field = field_scatter(measurement, found.freed[0], None)
-        out[name] = Object(measurement, found.captures[0], found.freed[0], field)
+        measurement = with_part_origin(measurement_of(sessions[name], own), found.model.T_mount)
+        field = field_scatter(measurement, found.unconstrained[0], None)
+        out[name] = Object(measurement, found.captures[0], found.unconstrained[0], field)
     return out, T_mount
 
 
-def fitted(objects: Sequence[Object], T_mount: Array, shared: bool) -> HandEye:
+def fitted(objects: Sequence[Object], T_mount: Array, shared: bool) -> HandEyeFit:
     """The hand-eye of some objects as one rig."""
     captures = [o.capture for o in objects]
     for turn in range(_FITS):
-        freed = [o.freed.seen_from(o.capture.poses(T_mount)) for o in objects]
+        freed = [o.freed.relative_to(o.capture.poses(T_mount)) for o in objects]
         centres, errors = [f.overlaps.gram.centre for f in freed], None
         if shared and turn == _FITS - 1:
-            errors = pose_errors([o.measurement for o in objects], Model(T_mount), centres)
+            errors = prior_pose_errors([o.measurement for o in objects], Model(T_mount), centres)
         found = fit_hand_eye(
-            captures, freed, T_mount, repeating={SCANNER_FIELD: [o.field for o in objects]}, errors=errors
+            captures, freed, T_mount, scanner_errors={SCANNER_FIELD: [o.field for o in objects]}, errors=errors
         )
         T_mount = found.T_mount
     return found
@@ -97,7 +97,7 @@ def table(objects: dict[str, Object], T_mount: Array) -> list[str]:
     return rows
 
 
-def _chi_square(a: HandEye, b: HandEye) -> float:
+def _chi_square(a: HandEyeFit, b: HandEyeFit) -> float:
     xi = frames.log(frames.inverse(a.T_mount) @ b.T_mount)
     return float(xi @ np.linalg.solve(a.covariance + b.covariance, xi))
 

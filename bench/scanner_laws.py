@@ -96,9 +96,9 @@ def said(m: Measured, law: Law) -> dict[str, Any]:
     except StitchError as error:
         return {"verdict": "refused", "names": [], "said": str(error)}
     kept = {
-        "field": found.of_field or found.smooth is not None,
-        "changing": found.smooth is not None and found.smooth.by_view,
-        "within": bool(found.within),
+        "field": found.follows_field or found.scanner_error is not None,
+        "changing": found.scanner_error is not None and found.scanner_error.by_view,
+        "within": bool(found.overlap_misfit),
         "rms": found.residual_rms,
         "noise": found.noise_floor,
     }

@@ -17,8 +17,8 @@ from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.frames import Array
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
-from stitch.observations.surfaces.surface_model import Surfaces, surface_model
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_directions
+from stitch.observations.surfaces.surface_model import SurfaceObservation, surface_model
 from stitch.statistics.variance_components import fit_variances
 
 
@@ -74,18 +74,18 @@ def seen(asked: Asked, world: World, rng: np.random.Generator) -> LinearModel:
 
 def with_overlaps_of(asked: Asked, world: World, linear: LinearModel) -> LinearModel:
     """The same twists, but overlaps in which only the laws of this world have moved points."""
-    assert isinstance(linear.observation, Surfaces)
+    assert isinstance(linear.observation, SurfaceObservation)
     moved = with_moved_points(asked.cell.freed, asked.cell.measurement, asked.scene, world.laws, asked.moments)
-    freed = replace(linear.observation.freed, overlaps=moved.overlaps)
-    return replace(linear, observation=replace(linear.observation, freed=freed))
+    freed = replace(linear.observation.unconstrained, overlaps=moved.overlaps)
+    return replace(linear, observation=replace(linear.observation, unconstrained=freed))
 
 
-def _with_freed(linear: LinearModel, freed: FreePoses) -> LinearModel:
-    assert isinstance(linear.observation, Surfaces)
-    channel = linear.observation.channel
+def _with_freed(linear: LinearModel, freed: UnconstrainedPoses) -> LinearModel:
+    assert isinstance(linear.observation, SurfaceObservation)
+    channel = linear.observation.reduced_poses
     z = channel.reduction @ freed.twists.ravel()
     mixed = replace(linear.mixed, z=z[None])
-    observation = replace(linear.observation, channel=replace(channel, z=z), freed=freed)
+    observation = replace(linear.observation, reduced_poses=replace(channel, z=z), unconstrained=freed)
     return replace(linear, observation=observation, mixed=mixed, null=fit_variances(mixed, both_starts=True))
 
 
@@ -109,9 +109,9 @@ def true_poses(asked: Asked, world: World, rng: np.random.Generator) -> Array:
 
 def true_column(a: Asked, world: World) -> Array:
     """(6V,) twists of the views that the law alone makes."""
-    assert isinstance(a.linear.observation, Surfaces)
+    assert isinstance(a.linear.observation, SurfaceObservation)
     still = np.random.default_rng(0)
     bare = replace(world, joint_errors=0.0, flange_errors=0.0, scatter=np.zeros((len(a.moments), 6)))
     with_it, without = (true_poses(a, w, still) for w in (replace(world, scatter=bare.scatter), bare))
-    to_centre = frames.make(np.eye(3), -a.linear.observation.freed.overlaps.gram.centre)
+    to_centre = frames.make(np.eye(3), -a.linear.observation.unconstrained.overlaps.gram.centre)
     return np.asarray(frames.log(to_centre @ with_it @ frames.inverse(to_centre @ without)).ravel())

@@ -20,11 +20,11 @@ from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import MULTIPLES, PARTS
 
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
@@ -52,15 +52,15 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
             continue  # these views do not show it at any size
         linear, begun = seen(a, world, rng), time.process_time()
         linear = linear.scatter_only if as_before else linear
-        found = concluded(linear, a.candidates, USUAL)
+        found = decide(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
         then, group = named_after(a, world, linear, found) if part in AGAIN else ((), ())
         also = () if world.arm is None else OF_THE_ARM
         cell = f"{a.cell.scene} {a.cell.seed}"
-        follows = unnamed_errors(linear) if found.verdict == "unknown_effect" else ()
+        follows = find_repeating_errors(linear) if found.verdict == "unknown_effect" else ()
         words = ", ".join(u.words for u in follows)
         seconds = time.process_time() - begun
-        certain = found.over_nothing > ODDS
+        certain = found.log_odds_over_nothing > ODDS
         yield Trial(cell, hidden, found.verdict, also, names, then, group, words, seconds, certain)
 
 
@@ -77,7 +77,7 @@ def named_after(
         world = replace(world, laws=world.laws.without(name))
         linear = with_overlaps_of(asked, world, linear).conditioned_on(form.columns, form.sizes)
         candidates = [c for c in candidates if c.name != name]
-        found = concluded(linear, candidates, USUAL)
+        found = decide(linear, candidates, USUAL)
         then += [found.named[0].name] if found.verdict == "missing_effect" else []
     return tuple(then), tuple(r.name for r in found.named) if found.verdict == "cannot_tell" else ()
 

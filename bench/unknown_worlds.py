@@ -147,7 +147,7 @@ def _least(a: Asked, world: World) -> float:
     """Factor on the errors of a world at which one test for them, of as many as there are effects, finds them."""
     plain = a.linear.scatter_only
     seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
-    scatter = plain.satterthwaite.of(plain.in_blocks(seen))
+    scatter = plain.satterthwaite.degrees_of_freedom(plain.in_blocks(seen))
     return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter)) / np.linalg.norm(seen))
 
 

@@ -9,9 +9,9 @@ from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_histor
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
 from stitch.watch.cell_assessment import cell_report
-from stitch.watch.cell_course import cell_course
+from stitch.watch.cell_course import cell_trend
 from stitch.watch.cell_report import CellReport
-from stitch.watch.history import opened
+from stitch.watch.history import open_history
 
 CELLS = 8
 _Z95 = 1.96
@@ -38,10 +38,10 @@ def months() -> list[str]:
 def one(seed: int, plan: CellPlan) -> dict[str, float]:
     """What is said of one cell after its month."""
     cell = cell_history(seed, plan)
-    with tempfile.TemporaryDirectory() as folder, opened(Path(folder) / "cell", new=True) as history:
+    with tempfile.TemporaryDirectory() as folder, open_history(Path(folder) / "cell", new=True) as history:
         append_runs(history, list(records_of(cell)))
         report = cell_report(history)
-        course = cell_course(history, report)
+        course = cell_trend(history, report)
     truth = cell.truth.copy()
     truth[:, : len(HAND_EYE)] -= cell.found[0, : len(HAND_EYE)]
     off = course.smoothed - truth

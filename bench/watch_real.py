@@ -20,7 +20,7 @@ from stitch.units import length_text
 from stitch.watch.append import append_runs
 from stitch.watch.cell_assessment import cell_report
 from stitch.watch.cell_report import CellReport
-from stitch.watch.history import opened
+from stitch.watch.history import open_history
 from stitch.watch.read_record import read_record
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
@@ -62,7 +62,7 @@ def real() -> list[str]:
             out = Path(folder) / f"b{k:02d}"
             out.mkdir()
             write_run(found, out)
-        with opened(Path(folder) / "ur10", new=True) as history:
+        with open_history(Path(folder) / "ur10", new=True) as history:
             records = []
             for k, index in enumerate(parts):
                 record = read_record(Path(folder) / f"b{k:02d}", at=1.6e9 + float(times[index].mean()))

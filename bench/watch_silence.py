@@ -5,10 +5,10 @@ from scipy.stats import chi2
 
 from data_synth.cell_history import CellPlan, cell_history
 from stitch.watch.append import RUN_LENGTH
-from stitch.watch.control_charts import beyond, charted, limits, no_charts, odds_limit
-from stitch.watch.regressors import DAY, believed, regressors
+from stitch.watch.control_charts import chart_limits, empty_charts, limit_shares, odds_limit, updated_charts
+from stitch.watch.regressors import DAY_SECONDS, regressor_prior_sigmas, regressors
 from stitch.watch.slope_odds import STEADY, STILL, slope_odds
-from stitch.watch.state_bank import MEMBERS, empty_bank, predicted, updated, with_parameters
+from stitch.watch.state_bank import MEMBERS, empty_bank, predicted_bank, updated_bank, with_parameters
 
 HALLS, CELLS = 100, 50
 _PARAMETERS = 12
@@ -39,16 +39,18 @@ def alarms_of_hall(hall: int, thermal: float) -> int:
     found, sigma = np.hstack([c.found for c in cells]), np.concatenate([c.sigma for c in cells])
     covariates = regressors(times, (air - air[0])[:, None], _CHANNELS)
     still = (MEMBERS[STILL], MEMBERS[STEADY])
-    bank = with_parameters(empty_bank(covariates.shape[1], still), found[0], sigma, believed(_CHANNELS), still)
-    charts, limit, alarms = no_charts(found.shape[1]), limits(RUN_LENGTH, _PARAMETERS), 0
+    bank = with_parameters(
+        empty_bank(covariates.shape[1], still), found[0], sigma, regressor_prior_sigmas(_CHANNELS), still
+    )
+    charts, limit, alarms = empty_charts(found.shape[1]), chart_limits(RUN_LENGTH, _PARAMETERS), 0
     sloped = np.zeros(found.shape[1], bool)
-    days = np.diff(times, prepend=times[0]) / DAY
+    days = np.diff(times, prepend=times[0]) / DAY_SECONDS
     for k in range(len(times)):
-        bank, innovations = updated(predicted(bank, days[k]), found[k], sigma, covariates[k])
-        charts = charted(charts, innovations)
+        bank, innovations = updated_bank(predicted_bank(bank, days[k]), found[k], sigma, covariates[k])
+        charts = updated_charts(charts, innovations)
         odds = slope_odds(bank, 0, 1) / odds_limit(_PARAMETERS)
         new, sloped = (odds >= 1) & ~sloped, sloped | (odds >= 1)
-        hit = (beyond(charts, limit).max(axis=1) >= 1) | new
+        hit = (limit_shares(charts, limit).max(axis=1) >= 1) | new
         alarms += int(hit.reshape(CELLS, -1).any(axis=1).sum())
         charts = type(charts)(np.where(hit[:, None, None], 0.0, charts.cusums), np.where(hit, 0.0, charts.ewma))
     return alarms

@@ -11,8 +11,8 @@ from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
 from stitch.watch.cell_assessment import cell_report
-from stitch.watch.cell_course import cell_course
-from stitch.watch.history import FILE, opened
+from stitch.watch.cell_course import cell_trend
+from stitch.watch.history import HISTORY_FILE, open_history
 from viz.watch.cell_page import write_page
 
 SIZES = (100, 1_000, 10_000)
@@ -32,7 +32,7 @@ def size() -> list[str]:
 def _row(sessions: int) -> str:
     plan = CellPlan(days=(sessions + _MORE) // 20, knock_day=None, growth=0.0)
     records = [replace(r, run_hash=f"{r.run_hash} of {sessions}") for r in records_of(cell_history(1, plan))]
-    with tempfile.TemporaryDirectory() as folder, opened(Path(folder) / "cell", new=True) as history:
+    with tempfile.TemporaryDirectory() as folder, open_history(Path(folder) / "cell", new=True) as history:
         append_runs(history, records[:sessions])
         cost = []
         for record in records[sessions:]:
@@ -42,9 +42,9 @@ def _row(sessions: int) -> str:
         begun = time.process_time()
         report = cell_report(history)
         reported = time.process_time() - begun
-        write_page(cell_course(history, report), Path(folder) / "watch.html")
+        write_page(cell_trend(history, report), Path(folder) / "watch.html")
         page = time.process_time() - begun
         history.sql("PRAGMA wal_checkpoint(TRUNCATE)")
-        large = (Path(folder) / "cell" / FILE).stat().st_size / 1e6
+        large = (Path(folder) / "cell" / HISTORY_FILE).stat().st_size / 1e6
     told = f"{np.median(cost):.0f}, {max(cost):.0f}"
     return f"| {sessions:,} | {told} | {reported:.2f} | {page:.2f} | {large:.1f} |"

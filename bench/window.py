@@ -15,14 +15,14 @@ from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window_scans import Weld, warp
 from stitch import frames
-from stitch.cells.window.cad import surface
-from stitch.cells.window.cad_fit import fit
-from stitch.cells.window.cad_start import find_start
-from stitch.cells.window.deviation import deviations
-from stitch.cells.window.joined_scans import join
+from stitch.cells.window.cad import cad_surface
+from stitch.cells.window.cad_fit import fit_cad
+from stitch.cells.window.cad_start import find_cad_start
+from stitch.cells.window.deviation import measure_deviations
+from stitch.cells.window.joined_scans import join_scans
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.seam import Limits, Station, measure_seam
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 from viz.cells.window_fit_figures import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,7 +37,7 @@ def truth(seed: int) -> np.ndarray:
 
 
 def joined(clouds, poses):
-    return join([prepare_view("", points) for points in clouds], poses)
+    return join_scans([prepare_scan("", points) for points in clouds], poses)
 
 
 def scanned(mesh, kind: str, T: np.ndarray, seed: int, part: slice = slice(None), edges: slice = slice(None)):
@@ -66,7 +66,7 @@ def fit_table(door, pane, draws: int) -> list[str]:
         ("the same, window frame expected", "door", badly_bulged, everything, upper),
     ]
     cad_meshes = {"pane": pane, "door": door}
-    surfaces = {kind: surface(mesh) for kind, mesh in cad_meshes.items()}
+    surfaces = {kind: cad_surface(mesh) for kind, mesh in cad_meshes.items()}
     lines = [
         f"Furthest that the pose's error moves any point of the part, {draws} turns of it; noise {NOISE} mm.",
         "",
@@ -78,8 +78,8 @@ def fit_table(door, pane, draws: int) -> list[str]:
         for seed in range(draws):
             T = truth(seed)
             scan = scanned(mesh, kind, T, seed, part, edges)
-            start = find_start(scan, surfaces[kind]).T_base_part
-            found = fit(scan, surfaces[kind], start, regions)
+            start = find_cad_start(scan, surfaces[kind]).T_base_part
+            found = fit_cad(scan, surfaces[kind], start, regions)
             off = (furthest(pose, T, cad_meshes[kind]) for pose in (start, found.T_base_part))
             rows.append([*off, found.rms, found.inliers])
             if name.startswith("door, welding bulge 3") and seed == 0:
@@ -92,7 +92,7 @@ def fit_table(door, pane, draws: int) -> list[str]:
 
 
 def write_map(scan, cad, T) -> None:
-    figure = deviation_map(deviations(scan, cad, T, 0.5, cad.size / 60), "mm")
+    figure = deviation_map(measure_deviations(scan, cad, T, 0.5, cad.size / 60), "mm")
     path = PICTURES / "window-map.png"
     figure.savefig(path, dpi=100)
     Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)

@@ -21,7 +21,7 @@ from data_synth.window_line_job import write_line, write_seam
 from data_synth.window_scans import true_seam
 from stitch import frames
 from stitch.cells.csv_table import read_columns
-from stitch.cells.pose_table import from_columns
+from stitch.cells.pose_table import poses_from_columns
 from stitch.cells.window.seam import Station
 from stitch.cli.main import main as stitch
 
@@ -83,7 +83,7 @@ def command(*arguments: object) -> None:
 
 def last_pose(path: Path) -> np.ndarray:
     """(4, 4) where a path ends."""
-    return from_columns(read_columns(path, "name", "x y z a_deg b_deg c_deg"))[-1]
+    return poses_from_columns(read_columns(path, "name", "x y z a_deg b_deg c_deg"))[-1]
 
 
 def judge(folder: Path, line: WindowLine, T_cell_window: np.ndarray) -> Outcome:

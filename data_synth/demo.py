@@ -31,8 +31,8 @@ def demo(
     from data_synth.commands import reveal
     from data_synth.made_session import make, truth_path
     from data_synth.write import write_session, write_truth
-    from stitch.cli.actions.changed_run import add_chosen
-    from stitch.cli.actions.diagnosed_run import diagnosed_run
+    from stitch.cli.actions.changed_run import add_diagnosed
+    from stitch.cli.actions.diagnosed_run import run_diagnose
     from stitch.cli.actions.run_sessions import run_sessions
     from stitch.cli.change import AT_MOST
     from stitch.cli.run_options import RunOptions
@@ -49,9 +49,9 @@ def demo(
     _say("\nstitch run: correct the hand-eye, register, fuse")
     run_sessions([session], RunOptions(output=folder / "run", recording=False, says_next=False))
     _say("\nstitch diagnose: what is missing?")
-    diagnosed_run(folder / "run", None, trust=False, as_json=False, says_next=False)
+    run_diagnose(folder / "run", None, trust=False, as_json=False, says_next=False)
     _say("\nstitch add --suggested: add it, fit everything anew, ask again")
-    add_chosen(folder / "run", AT_MOST, says_next=False)
+    add_diagnosed(folder / "run", AT_MOST, says_next=False)
     _say("\nstitch reveal: what was hidden")
     reveal(folder / "run", truth_path(session))
     for name in ("stitched.ply", "recording.rrd", "report.html"):

@@ -9,7 +9,7 @@ import numpy as np
 from data_synth.nature import LAWS
 from stitch import frames
 from stitch.errors import InputError
-from stitch.units import amount
+from stitch.units import format_amount
 
 
 def judge(run: Path, truth: Path) -> dict[str, Any]:
@@ -47,7 +47,10 @@ def judge(run: Path, truth: Path) -> dict[str, Any]:
         for name, value in parameters.items():
             got = fitted.get(effect, {}).get(name)
             if got:
-                found, true = amount(got["value"], got["sigma"], got["unit"]), amount(value, None, got["unit"])
+                found, true = (
+                    format_amount(got["value"], got["sigma"], got["unit"]),
+                    format_amount(value, None, got["unit"]),
+                )
                 judged[f"{effect}.{name}"] = f"{found}, true {true}"
     return judged
 

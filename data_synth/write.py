@@ -15,7 +15,7 @@ from data_synth.shapes import write_mesh
 from data_synth.simulate import Measured
 from stitch.measurement.cloud import Cloud
 from stitch.writing import session_files
-from stitch.writing.session_files import Columns, SessionFiles, pose_columns
+from stitch.writing.session_files import SessionFiles, TableColumns, pose_columns
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def robot_table(arm: Arm) -> dict[str, Any]:
     return robot
 
 
-def _views(measured: Measured) -> Columns:
+def _views(measured: Measured) -> TableColumns:
     """Columns of views.csv. A rail is no joint of the arm: such a session states flange poses and no joints."""
     scene, plan = measured.scene, measured.plan
     joints = [] if scene.rail else [f"j{i + 1}" for i in range(scene.arm.joints)]
@@ -118,7 +118,7 @@ def _views(measured: Measured) -> Columns:
     return columns | ({"rail_mm": measured.rail} if scene.rail else {})
 
 
-def _points(measured: Measured) -> Columns:
+def _points(measured: Measured) -> TableColumns:
     """Columns of points.csv: every target in every view that saw it."""
     seen = [
         (f"v{v:03d}", name, *(f"{x:.6f}" for x in places[v]), f"{measured.scene.part.sigma:g}")

@@ -19,35 +19,35 @@ def length_text(value: float, length_unit: str, digits: int = 3, zeros: bool = F
     um = value * MICROMETRES[length_unit]
     # 999.7 µm would be printed as 1000.
     if abs(float(f"{um:.{digits}g}")) >= 1e3:
-        return f"{_plain(um / 1e3, digits, zeros)} mm"
-    return f"{_plain(um, digits, zeros)} µm"
+        return f"{_plain_decimal(um / 1e3, digits, zeros)} mm"
+    return f"{_plain_decimal(um, digits, zeros)} µm"
 
 
 def angle_text(value: float, digits: int = 3) -> str:
     """An angle in rad for people: 0.033 mrad; a dash where nothing was measured."""
-    return f"{_plain(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
+    return f"{_plain_decimal(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
 
 
 def duration_text(seconds: float) -> str:
     """Seconds, minutes or hours, whichever leaves a number below a hundred or so."""
     size, unit = next((own for own in ((1, "s"), (60, "min")) if seconds < 120 * own[0]), (3600, "h"))
-    return f"{_plain(seconds / size, 2)} {unit}"
+    return f"{_plain_decimal(seconds / size, 2)} {unit}"
 
 
-def known_text(value: float, U: float) -> str:
+def value_uncertainty_text(value: float, U: float) -> str:
     """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
     if not np.isfinite(U) or U <= 0:
-        return f"{_plain(value, 6)} ± –"
+        return f"{_plain_decimal(value, 6)} ± –"
     told = uncertainty_text(U)
     return f"{value:.{len(told.partition('.')[2])}f} ± {told}"
 
 
 def uncertainty_text(U: float) -> str:
     """An expanded uncertainty above zero with the two digits that it is worth: 0.087."""
-    return _plain(U, 2, zeros=True)
+    return _plain_decimal(U, 2, zeros=True)
 
 
-def _plain(value: float, digits: int, zeros: bool = False) -> str:
+def _plain_decimal(value: float, digits: int, zeros: bool = False) -> str:
     """So many digits that count, more where there are more before the point; never an exponent."""
     digits = max(digits, len(str(int(abs(value)))))
     keep = zeros and value != 0
@@ -63,10 +63,10 @@ def rounded(value: float, sigma: float) -> str:
         return f"{value:.4g}"
     place = int(np.floor(np.log10(sigma)))
     value = round(value, -place)
-    return _short(value, max(int(np.floor(np.log10(abs(value)))) - place + 1, 1)) if value else "0"
+    return _significant_digits(value, max(int(np.floor(np.log10(abs(value)))) - place + 1, 1)) if value else "0"
 
 
-def told_in(unit: str) -> tuple[float, str]:
+def display_unit(unit: str) -> tuple[float, str]:
     """Factor and unit in which numbers are read: mrad, µrad per something, ppm of growth, mm for m."""
     if unit.startswith("rad/"):
         return 1e6, f"µ{unit}"
@@ -91,20 +91,20 @@ class Amount(NamedTuple):
         return f"{self.value}{known}{'' if self.unit in ('', '1') else f' {self.unit}'}"
 
 
-def amount(value: float, sigma: float | None, unit: str) -> Amount:
+def format_amount(value: float, sigma: float | None, unit: str) -> Amount:
     """A value to the first digit of its sigma, angles in mrad, angles per something in µrad: 0.63 ± 0.04 µrad/(N m);
     growth in millionths: 11.5 ± 0.3 ppm/°C.
 
     Args:
         unit: that of value and sigma, with angles in rad.
     """
-    factor, told = told_in(unit)
+    factor, told = display_unit(unit)
     known = sigma is not None and np.isfinite(sigma) and sigma > 0
     size = factor * sigma if sigma is not None and known else np.nan
-    return Amount(rounded(factor * value, size), _short(size, 1) if known else "–", told)
+    return Amount(rounded(factor * value, size), _significant_digits(size, 1) if known else "–", told)
 
 
-def _short(value: float, digits: int) -> str:
+def _significant_digits(value: float, digits: int) -> str:
     """So many digits; an exponent for the very small alone."""
     text = f"{value:.{digits}g}"
-    return _plain(float(text), digits) if abs(value) >= 1 else text
+    return _plain_decimal(float(text), digits) if abs(value) >= 1 else text

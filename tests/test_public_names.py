@@ -74,4 +74,4 @@ def test_the_example_of_the_package_runs(tmp_path, few_effects, capsys):
         exec(compile(code, "the docstring of stitch", "exec"), found)
     assert capsys.readouterr().out.strip()
     assert found["run"].effects == ["joint_compliance"]
-    assert stitch.drop(found["run"], "joint_compliance").effects == []
+    assert stitch.drop_views(found["run"], "joint_compliance").effects == []

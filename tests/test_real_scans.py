@@ -9,10 +9,10 @@ import pytest
 
 from stitch import frames
 from stitch.cli.main import main
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.model.model_toml import read_model
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps
 from stitch.pipeline import diagnose, run, run_rig
 from stitch.reading.session_folder import load_session
 
@@ -66,12 +66,12 @@ def test_together_they_give_one_hand_eye(reghec, runs):
 @pytest.mark.parametrize("name", ["cone", "sphere"])
 def test_pose_errors_learned_on_one_object_repeat_on_another(reghec, runs, name):
     """Corrections of david's views, applied to the same robot poses before another object: to a tenth."""
-    own = capture(load_session(reghec(name)))
+    own = prepare_capture(load_session(reghec(name)))
     david = runs["david"]
     model = own.poses(david.T_mount)
-    picked = [sample(scan, 3000) for scan in own.scans]
-    before = collect(own, model, 4.0, picked).gram.rms
-    after = collect(own, frames.exp(david.corrections) @ model, 4.0, picked).gram.rms
+    picked = [sample_points(scan, 3000) for scan in own.scans]
+    before = collect_overlaps(own, model, 4.0, picked).gram.rms
+    after = collect_overlaps(own, frames.exp(david.corrections) @ model, 4.0, picked).gram.rms
     assert after < 0.1 * before
 
 

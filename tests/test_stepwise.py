@@ -48,7 +48,7 @@ def test_what_has_a_name_is_no_group(first):
 
 
 def test_what_is_less_likely_than_chance_is_not_added(first, monkeypatch):
-    found = replace(diagnose(state_of(first)), over_nothing=-0.1)
+    found = replace(diagnose(state_of(first)), log_odds_over_nothing=-0.1)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     result, lines, _ = stepwise.suggest(state_of(first), at_most=3)
     assert result is None and lines[-1].startswith("joint_offset was not added: that it is chance is likelier.")

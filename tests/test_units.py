@@ -2,7 +2,7 @@
 
 import pytest
 
-from stitch.units import amount, angle_text, known_text, length_text, rounded
+from stitch.units import angle_text, format_amount, length_text, rounded, value_uncertainty_text
 
 
 def test_numbers_end_where_their_sigma_begins():
@@ -29,7 +29,7 @@ def test_numbers_end_where_their_sigma_begins():
     ],
 )
 def test_parameters_of_effects_are_in_mrad(value, sigma, unit, told):
-    assert str(amount(value, sigma, unit)) == told
+    assert str(format_amount(value, sigma, unit)) == told
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_columns_keep_their_zeros():
     ],
 )
 def test_values_have_two_digits_of_their_uncertainty(value, U, told):
-    assert known_text(value, U) == told
+    assert value_uncertainty_text(value, U) == told
 
 
 def test_angles_are_in_mrad():

@@ -5,8 +5,8 @@ from os.path import relpath
 from pathlib import Path
 
 from stitch.batch.session_row import SessionRow
-from stitch.batch.summary import sentence
-from stitch.system.whole_file import whole
+from stitch.batch.summary import batch_sentence
+from stitch.system.whole_file import whole_file
 from stitch.units import length_text
 from viz.filled_templates import render
 
@@ -14,8 +14,8 @@ from viz.filled_templates import render
 def write_page(rows: Sequence[SessionRow], path: Path) -> None:
     """Write the page of the sessions of a batch; its links hold wherever the folder of the runs is copied."""
     shown = [_row(row, path.parent) for row in sorted(rows, key=SessionRow.urgency)]
-    with whole(path) as file:
-        file.write_text(render("batch.html.j2", rows=shown, sentence=sentence(rows)), encoding="utf-8")
+    with whole_file(path) as file:
+        file.write_text(render("batch.html.j2", rows=shown, sentence=batch_sentence(rows)), encoding="utf-8")
 
 
 def _row(row: SessionRow, folder: Path) -> dict[str, object]:

@@ -6,7 +6,7 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import numpy as np
 import rerun.blueprint as rrb
 
-from stitch.comparison.model_history import change_of
+from stitch.comparison.model_history import effect_changes
 from stitch.frames import Array
 from stitch.runs.run import Run
 from viz.colour_bar import HIGH, WIDE
@@ -127,7 +127,7 @@ def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
 
     A single model stands in words beside the part; a bar alone says nothing.
     """
-    models = ", ".join(f"{i} {change_of(run.ledger, i)}" for i in range(len(run.ledger)))
+    models = ", ".join(f"{i} {effect_changes(run.ledger, i)}" for i in range(len(run.ledger)))
     fell = [
         _bars("steps/residual_rms", f"Rms of each model in the fit (µm): {models}"),
         _bars("steps/heldout_rms", "The same on views left out (µm)"),

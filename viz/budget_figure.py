@@ -8,7 +8,7 @@ from matplotlib.patches import Patch
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.variance_budget import NOT_REPEATING, BudgetLine
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.error_sources import OTHERS, error_sources, share_text
+from stitch.writing.error_sources import OTHER_SOURCES, largest_error_sources, share_text
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, plain
 
@@ -23,7 +23,7 @@ _MISSING, _CORRECTED, _REPEATS, _CHANCE = (
 
 def budget(found: Diagnosis, length_unit: str) -> Figure:
     """A bar for each source of what the poses leave, in per cent of the variance, with its size beside it."""
-    told = error_sources(found.budget)
+    told = largest_error_sources(found.budget)
     if not told:
         return mean_squares(found, length_unit)
     figure = Figure(figsize=(7, 0.95 + 0.3 * len(told)), layout=ConstrainedLayoutEngine(w_pad=0.12))
@@ -51,7 +51,7 @@ def _kind(found: Diagnosis, line: BudgetLine) -> tuple[str, str]:
         return _MISSING
     if line.source in {term.name for term in found.linear.model.terms}:
         return _CORRECTED
-    return _CHANCE if line.source in (*NOT_REPEATING, OTHERS) else _REPEATS
+    return _CHANCE if line.source in (*NOT_REPEATING, OTHER_SOURCES) else _REPEATS
 
 
 def mean_squares(found: Diagnosis, length_unit: str) -> Figure:

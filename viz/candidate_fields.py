@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from stitch.comparison.disagreement_field import Field
+from stitch.comparison.disagreement_field import DisagreementField
 from stitch.comparison.patches import Patches, patches_of
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.predicted_distances import predicted_distances
-from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.units import MICROMETRES
 from viz.packed_numbers import packed_floats, packed_values
 
@@ -20,18 +20,18 @@ class CandidateFields:
     """The field as it is, and as it would be with each of the best candidate effects."""
 
     patches: Patches
-    present: Field
-    if_added: dict[str, Field]
+    present: DisagreementField
+    if_added: dict[str, DisagreementField]
 
 
 def candidate_fields(found: Diagnosis) -> CandidateFields | None:
     """None without clouds."""
     linear = found.linear
     present = predicted_distances(linear)
-    if present is None or not isinstance(linear.observation, Surfaces):
+    if present is None or not isinstance(linear.observation, SurfaceObservation):
         return None
-    overlaps = linear.observation.freed.overlaps
-    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, shown=present)
+    overlaps = linear.observation.unconstrained.overlaps
+    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
     worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted][:_SHOWN]
     added = {}
     for candidate in worth:

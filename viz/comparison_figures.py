@@ -4,14 +4,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.comparison.table import Table
-from stitch.comparison.tables import Comparison
+from stitch.comparison.table import ResidualTable
+from stitch.comparison.tables import ResidualTables
 from stitch.units import MICROMETRES
 from viz.colours import BLUE
 from viz.drawing import plain
 
 
-def comparison(found: Comparison, length_unit: str, at_most: int = 9) -> Figure:
+def comparison(found: ResidualTables, length_unit: str, at_most: int = 9) -> Figure:
     """Signed mean of the distance between the views against the clearest properties, with ± 2 sigma."""
     um = MICROMETRES[length_unit]
     shown = found.places[:at_most]
@@ -27,7 +27,7 @@ def comparison(found: Comparison, length_unit: str, at_most: int = 9) -> Figure:
     return plain(figure)
 
 
-def _against(ax: Axes, table: Table, um: float) -> None:
+def _against(ax: Axes, table: ResidualTable, um: float) -> None:
     x = (table.low + table.high) / 2
     ax.errorbar(x, table.mean * um, 2 * table.mean_sigma * um, color=BLUE, marker="o", ms=3, lw=1, capsize=2)
     ax.axhline(0, color="k", lw=0.6)

@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.unknown.joint_curves import JointCurve
-from stitch.diagnosis.unknown.time_curve import MOVED, TURNED, TimeCurve
+from stitch.diagnosis.unknown.time_curve import ROTATION_PART, TRANSLATION_PART, TimeCurve
 from stitch.frames import Array
-from stitch.observations.flange_errors import in_steps
+from stitch.observations.flange_errors import time_in_steps
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN, ORANGE
 from viz.drawing import above, covariate, plain
@@ -37,10 +37,10 @@ def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
 def _along(c: JointCurve) -> tuple[str, Array, Array]:
     """The axis of a joint's course, where the course is told and where the views stood along it."""
     if c.covariate != "time_s":
-        return covariate(c.covariate), c.at, c.stood
-    first = float(c.stood.min())
-    unit, of_second = _unit_of(float(np.ptp(c.stood)))
-    return unit, (c.at - first) * of_second, (c.stood - first) * of_second
+        return covariate(c.covariate), c.at, c.view_values
+    first = float(c.view_values.min())
+    unit, of_second = _unit_of(float(np.ptp(c.view_values)))
+    return unit, (c.at - first) * of_second, (c.view_values - first) * of_second
 
 
 def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
@@ -48,8 +48,8 @@ def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
     unit, of_step = _times(curve)
-    stood = in_steps(found.linear.measurement)
-    for ax, of, factor in ((axes[0], TURNED, 1e3), (axes[1], MOVED, MICROMETRES[length_unit])):
+    stood = time_in_steps(found.linear.measurement)
+    for ax, of, factor in ((axes[0], ROTATION_PART, 1e3), (axes[1], TRANSLATION_PART, MICROMETRES[length_unit])):
         _banded(ax, (curve.steps - curve.steps[0]) * of_step, factor * curve.error[:, of], factor * curve.sigma[:, of])
         ax.plot((stood - stood.min()) * of_step, np.zeros(len(stood)), "|", color="k", ms=8)
         ax.axhline(0, color="k", lw=0.6)

@@ -49,7 +49,7 @@ def added_variable(found: Diagnosis, at_most: int = 3) -> Figure | None:
 def _added(ax: Axes, found: Diagnosis, candidate: CandidateEffect) -> None:
     s = candidate.ranked.score
     # Among what every arm may do wrong the effect itself would count as scatter.
-    linear = s.beside or found.linear
+    linear = s.base_model or found.linear
     predicted = linear.residual(s.form.columns) @ s.values
     ax.scatter(predicted, linear.white_residual, s=6, color=BLUE, alpha=0.7, lw=0)
     ax.axline((0, 0), slope=1, color=ORANGE, lw=1)
@@ -94,7 +94,7 @@ def shape(found: Diagnosis, length_unit: str, at_most: int = 3) -> Figure:
 def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
     """How far every view sits from where the model puts it."""
     um = MICROMETRES[length_unit]
-    moved = found.linear.displaced() * um
+    moved = found.linear.view_displacements() * um
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots()
     for i, (axis, colour, marker) in enumerate(zip("xyz", (ORANGE, GREEN, BLUE), "osv", strict=True)):

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.diagnosis.course_sentences import course_texts
+from stitch.diagnosis.course_sentences import curve_sentences
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.sentences import amounts_of
-from stitch.system.whole_file import whole
+from stitch.diagnosis.sentences import fitted_amounts
+from stitch.system.whole_file import whole_file
 from stitch.units import MICROMETRES
-from stitch.writing.plain_effects import in_words, what_it_is
-from stitch.writing.plain_finding import next_step, plain_finding
+from stitch.writing.plain_effects import effect_description, effect_in_words
+from stitch.writing.plain_finding import plain_finding, suggested_command
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
 from viz.recorded_words import words
@@ -39,7 +39,7 @@ def add_diagnosis(found: Diagnosis, fields: CandidateFields | None, length_unit:
         file = RecordingFile("stitch", own, id_of(found.linear.measurement.capture.name))
         log_diagnosis(file.stream, found, fields, length_unit)
         file.write()
-        with whole(path) as scratch:
+        with whole_file(path) as scratch:
             subprocess.run(
                 [rerun_program(), "rrd", "merge", str(path), str(own), "-o", str(scratch)],
                 env=os.environ | {"RERUN_ANALYTICS": "off"},
@@ -59,21 +59,21 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFi
     on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
     plain = plain_finding(found, length_unit)
     rec.log("diagnosis/plain", words(plain), static=True)
-    courses = [line for told in course_texts(found, length_unit) for line in (told, "")]
-    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{next_step(found, 'RUN')}", ""]
+    courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]
+    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{suggested_command(found, 'RUN')}", ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
         "|---:|---|---:|---:|---:|---|",
     ]
     lines += [
         f"| {i} | {c.name} | {c.ranked.adjusted:.1g} | {c.ranked.posterior:.2f} | {on_part.get(c.name, '–')} "
-        f"| {amounts_of(c.ranked).replace('-', '−')} |"
+        f"| {fitted_amounts(c.ranked).replace('-', '−')} |"
         for i, c in enumerate(shown)
     ]
-    lines += ["", *(f"- {in_words(c.name)}" for c in shown if what_it_is(c.name))]
+    lines += ["", *(f"- {effect_in_words(c.name)}" for c in shown if effect_description(c.name))]
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     rec.log("diagnosis/verdict", words("\n".join(lines)), static=True)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
-    moved = np.linalg.norm(found.linear.displaced(), axis=1) * um
+    moved = np.linalg.norm(found.linear.view_displacements(), axis=1) * um
     rec.log("diagnosis/displaced", rr.BarChart(moved, color=COLOURS_OF_FEW[0]), static=True)

@@ -7,8 +7,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import full_colour
-from stitch.comparison.model_history import change_of, model_history
+from stitch.comparison.disagreement_field import full_colour_distance
+from stitch.comparison.model_history import effect_changes, model_history
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
@@ -29,7 +29,7 @@ def error_falling(run: Run) -> Figure:
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     seen = visible(surface, camera)
-    limit = full_colour(history.models[0].field) * um
+    limit = full_colour_distance(history.models[0].field) * um
     count = len(history.models)
     figure = Figure(figsize=(1.9 * count + 4.0, 3.6), layout="constrained")
     parts, right = figure.subfigures(1, 2, width_ratios=[1.9 * count, 3.6])
@@ -56,7 +56,7 @@ def _bars(axes: Axes, run: Run, um: float) -> None:
         axes.bar_label(bars, fmt="%.0f", fontsize=9, padding=2)
     floor = run.ledger[-1].noise_floor * um
     axes.axhline(floor, color="k", ls="--", lw=1.2, label=f"noise of the sensor, {floor:.0f} µm")
-    axes.set_xticks(place, [change_of(run.ledger, i) for i in place])
+    axes.set_xticks(place, [effect_changes(run.ledger, i) for i in place])
     axes.set_ylabel("rms between views (µm)")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0))

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from stitch.comparison.model_history import change_of
+from stitch.comparison.model_history import effect_changes
 from stitch.runs.run import LedgerStep, Run
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN
@@ -25,7 +25,7 @@ def waterfall(ledger: tuple[LedgerStep, ...], length_unit: str) -> Figure:
         axes.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
     floors = np.array([s.noise_floor * um for s in ledger])
     axes.hlines(floors, place - 0.45, place + 0.45, color="k", ls="--", lw=1.2, label="noise floor of the sensor")
-    changes = [change_of(ledger, i).replace(", ", "\n") for i in place]
+    changes = [effect_changes(ledger, i).replace(", ", "\n") for i in place]
     # Of many steps a name is wider than its bars.
     narrow = len(ledger) > _SIDE_BY_SIDE
     axes.set_xticks(place, [name.replace("_", "_\n") if narrow else name for name in changes], fontsize=8)

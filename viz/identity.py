@@ -7,7 +7,7 @@ from importlib.metadata import version
 from stitch.measurement.session import Session
 from stitch.reading.session_hash import session_hash
 from stitch.runs.run import Run
-from stitch.writing.plain_effects import in_words
+from stitch.writing.plain_effects import effect_in_words
 
 Row = tuple[str, str]
 
@@ -26,7 +26,7 @@ def identity(run: Run) -> list[Row]:
         page_written(),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
         ("Scanner", scanner + stated),
-        ("Model", ", ".join(["hand-eye", *map(in_words, run.effects)])),
+        ("Model", ", ".join(["hand-eye", *map(effect_in_words, run.effects)])),
         versions(),
         ("SHA-256 of the session", session_hash(session)),
     ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.disagreement_field import full_colour_distance
 from stitch.comparison.model_history import ModelHistory, ModelStep
 from stitch.frames import Array
 from stitch.runs.run import Run
@@ -57,7 +57,7 @@ def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Arr
         surface=surface,
         names=tuple(run.session.names),
         um=MICROMETRES[run.session.length_unit],
-        limit=full_colour(first),
+        limit=full_colour_distance(first),
         centre=centre,
         twists=twists,
         magnified=factors,

@@ -4,7 +4,7 @@ import html
 
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.disagreement_field import full_colour_distance
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
@@ -44,4 +44,4 @@ def plot(run: Run) -> Figure:
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in history.steps[1:]]
-    return part_picture(surface, camera, shown[-_STEPS:], full_colour(history.models[0].field) * um, DISAGREE)
+    return part_picture(surface, camera, shown[-_STEPS:], full_colour_distance(history.models[0].field) * um, DISAGREE)

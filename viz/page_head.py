@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stitch.comparison.plain_verdict import Judged
-from stitch.system.whole_file import whole
+from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.system.whole_file import whole_file
 from viz.filled_templates import render
 
 
@@ -25,7 +25,7 @@ class Head:
     title: str
     verdict: str
     subjects: Sequence[Subject]
-    lights: Sequence[Judged] = ()  # against what is allowed, where somebody said what is
+    lights: Sequence[ToleranceVerdict] = ()  # against what is allowed, where somebody said what is
     evidence: str = ""
     notes: Sequence[str] = ()
     doubts: Sequence[str] = ()  # in full, of which the verdict has the beginnings
@@ -34,5 +34,5 @@ class Head:
 def write_page(path: Path, template: str, head: Head, **content: object) -> None:
     """Fill in a template that extends `page.html.j2`, whole or not at all; it needs nothing beside it."""
     page = render(template, head=head, **content)
-    with whole(path) as file:
+    with whole_file(path) as file:
         file.write_text(page, encoding="utf-8")

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.comparison.model_history import ModelHistory, change_of
-from stitch.model.hand_eye_uncertainty import expanded
+from stitch.comparison.model_history import ModelHistory, effect_changes
+from stitch.model.hand_eye_uncertainty import expanded_uncertainty
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, known_text
+from stitch.units import MICROMETRES, value_uncertainty_text
 from viz.run_figures import shown_points, view_shifts
 
 # Of more views than this the page lists those to look at first.
@@ -45,7 +45,7 @@ def target_rows(run: Run) -> list[dict[str, object]]:
     if run.targets is None or sightings is None:
         return []
     um = MICROMETRES[run.session.length_unit]
-    columns = (sightings.targets, sightings.seen, run.targets.target_rms, run.targets.landmarks.positions)
+    columns = (sightings.targets, sightings.view_counts, run.targets.target_rms, run.targets.landmarks.positions)
     return [
         {"name": name, "seen": int(n), "rms": rms * um, "position": position}
         for name, n, rms, position in zip(*columns, strict=True)
@@ -65,7 +65,7 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
-        for told in [p.told]
+        for told in [p.formatted]
     ]
 
 
@@ -73,7 +73,7 @@ def note_rows(run: Run) -> list[dict[str, str]]:
     """What reviewers remarked on the steps of the ledger."""
     return [
         {
-            "step": change_of(run.ledger, i),
+            "step": effect_changes(run.ledger, i),
             "text": note.text,
             "signed": ", ".join(x for x in (note.by, note.at[:10]) if x),
         }
@@ -88,7 +88,7 @@ def hand_eye_rows(run: Run) -> list[dict[str, str]]:
     values = []
     for T in (run.T_mount_coarse, run.T_mount):
         values.append([*(T[:3, 3] * mm), *(Rotation.from_matrix(T[:3, :3]).as_rotvec() * 1e3)])
-    U = expanded(run.T_mount, run.mount_covariance)
+    U = expanded_uncertainty(run.T_mount, run.mount_covariance)
     units = [*(U[3:] * mm), *(U[:3] * 1e3)]
     names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "mrad") for axis in "xyz"]
     return [
@@ -99,7 +99,7 @@ def hand_eye_rows(run: Run) -> list[dict[str, str]]:
 
 def _told(coarse: float, corrected: float, U: float) -> dict[str, str]:
     """Three numbers with the digits that U knows, as the terminal has them."""
-    value, _, U_text = known_text(corrected, U).partition(" ± ")
+    value, _, U_text = value_uncertainty_text(corrected, U).partition(" ± ")
     begun = f"{coarse:.{len(value.partition('.')[2])}f}"
     return {name: text.replace("-", "−") for name, text in (("coarse", begun), ("corrected", value), ("U", U_text))}
 

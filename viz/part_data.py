@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import colormaps
 
-from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.disagreement_field import full_colour_distance
 from stitch.comparison.model_history import ModelHistory
 from stitch.frames import Array
 from stitch.units import MICROMETRES
@@ -72,8 +72,8 @@ def part_data(
             {"name": names[v], "means": [_mean_abs(x[v]) for x in own], "steps": [packed_values(x[v]) for x in own]}
             for v in sorted(int(v) for v in worst)
         ],
-        "full": full_colour(first) * um,
-        "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour(first) * um),
+        "full": full_colour_distance(first) * um,
+        "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour_distance(first) * um),
         "colours": colour_stops(),
         "unseen": bool(np.isnan(first.overall).any()),
         "radius": f"{history.patches.radius:.3g} {length_unit}",

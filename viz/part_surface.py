@@ -11,7 +11,7 @@ from stitch.comparison.patches import Patches
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.runs.run import FusedCloud
-from stitch.system.mapped_file import release
+from stitch.system.mapped_file import release_mapped
 from stitch.writing.mesh import TriangleMesh, mesh_of
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
@@ -97,7 +97,7 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
 def _of(some: Indices, values: Array) -> Array:
     """Some rows; what was read for them of a cloud that is held in a file is given back."""
     out = values[some]
-    release(values)
+    release_mapped(values)
     return np.asarray(out)
 
 

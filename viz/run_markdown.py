@@ -4,7 +4,7 @@ from stitch.comparison.model_history import ModelHistory
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import length_text
-from stitch.writing.plain_effects import in_words
+from stitch.writing.plain_effects import effect_in_words
 
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
@@ -13,7 +13,7 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
     for doubt in run.doubts:
         lines += [doubt, ""]
     if run.effects:
-        lines += [f"In the model: {', '.join(map(in_words, run.effects))}.", ""]
+        lines += [f"In the model: {', '.join(map(effect_in_words, run.effects))}.", ""]
     lines += [run.verdict, ""]
     if history is not None:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]

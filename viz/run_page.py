@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from stitch.comparison.disagreement_field import full_colour
+from stitch.comparison.disagreement_field import full_colour_distance
 from stitch.comparison.model_history import ModelHistory, model_history
 from stitch.comparison.run_verdict import run_headline, run_light
-from stitch.model.hand_eye_uncertainty import stands_for
+from stitch.model.hand_eye_uncertainty import uncertainty_scope
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures
@@ -62,7 +62,7 @@ def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
         "first": rows[:_FIRST],
         "rest": rows[_FIRST:],
         "hand_eye": hand_eye_rows(run),
-        "uncertainty": stands_for(None),
+        "uncertainty": uncertainty_scope(None),
         "hand_eye_matrix": matrix(run),
         "mount_frame": "base" if run.session.mount == "eye_to_hand" else "flange",
         "effects": effect_rows(run),
@@ -88,7 +88,7 @@ def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
     data = part_data(surface, camera, history, names, run.session.length_unit)
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in steps[1:]]
-    still = part_picture(surface, camera, shown[-4:], full_colour(history.models[0].field) * um, DISAGREE)
+    still = part_picture(surface, camera, shown[-4:], full_colour_distance(history.models[0].field) * um, DISAGREE)
     words = {"title": "Where the views disagree", "caption": captions.FIELD, "handling": captions.HANDLING}
     words |= {"alt": "The part, coloured by how far the views disagree, at every step of the model"}
     return {"data": script_json(data), "still": png(still, 110), **words}

@@ -8,16 +8,16 @@ from typing import NamedTuple
 from markupsafe import escape
 from matplotlib.figure import Figure
 
-from stitch.comparison.tables import Comparison
+from stitch.comparison.tables import ResidualTables
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.sentences import amounts_of
-from stitch.model.hand_eye_uncertainty import stands_for
+from stitch.diagnosis.sentences import fitted_amounts
+from stitch.model.hand_eye_uncertainty import uncertainty_scope
 from stitch.stored.load_state import State
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.error_sources import error_sources
-from stitch.writing.plain_effects import what_it_is
-from stitch.writing.plain_finding import next_step, plain_finding
+from stitch.writing.error_sources import largest_error_sources
+from stitch.writing.plain_effects import effect_description
+from stitch.writing.plain_finding import plain_finding, suggested_command
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.budget_figure import budget
@@ -52,10 +52,10 @@ def write_diagnosis(found: Diagnosis, state: State, folder: Path) -> None:
         pictures=[(pictures[name].title, address, pictures[name].caption) for name, address in addresses.items()],
     )
     _insert(folder / "report.html", "diagnosis", html)
-    why, command = next_step(found, "RUN").rsplit(": ", 1)
+    why, command = suggested_command(found, "RUN").rsplit(": ", 1)
     then = f'<p class="evidence">{escape(why)}: <code>{escape(command)}</code>, RUN the folder of this page.</p>'
     _insert(folder / "report.html", "finding", f'<p class="finding">{escape(unbroken(plain))}</p>{then}')
-    _insert(folder / "report.html", "uncertainty", f'<p class="soft">{stands_for(found.verdict)}</p>')
+    _insert(folder / "report.html", "uncertainty", f'<p class="soft">{uncertainty_scope(found.verdict)}</p>')
     add_diagnosis(found, fields, unit, folder / "recording.rrd")
 
 
@@ -85,7 +85,10 @@ def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
 
 def _field_map(found: Diagnosis, unit: str) -> _Picture:
     """Where the scanner itself errs, where that is found."""
-    title, shown = "How the scanner errs over its field", None if found.smooth is None else found.smooth.map
+    title, shown = (
+        "How the scanner errs over its field",
+        None if found.scanner_error is None else found.scanner_error.map,
+    )
     if shown is None:
         return _Picture(title, None, "")
     size, sigma = (length_text(x, unit, 2) for x in (shown.rms, shown.uncertainty))
@@ -93,7 +96,7 @@ def _field_map(found: Diagnosis, unit: str) -> _Picture:
 
 
 def _of_budget(found: Diagnosis) -> str:
-    return captions.BUDGET if error_sources(found.budget) else captions.MEAN_SQUARES
+    return captions.BUDGET if largest_error_sources(found.budget) else captions.MEAN_SQUARES
 
 
 def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[dict[str, str]]:
@@ -105,7 +108,7 @@ def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[d
             "name": s.name,
             "p": f"{s.ranked.adjusted:.1g}".replace("-", "−"),
             "posterior": f"{s.ranked.posterior:.2f}",
-            "told": "; ".join(filter(None, [what_it_is(s.name), amounts_of(s.ranked).replace("-", "−")])),
+            "told": "; ".join(filter(None, [effect_description(s.name), fitted_amounts(s.ranked).replace("-", "−")])),
             "rms_if_added": _rms(found, s, 0, um),
             "heldout": _rms(found, s, 1, um),
             "on_part": on_part.get(s.name, "–"),
@@ -121,7 +124,7 @@ def _rms(found: Diagnosis, candidate: CandidateEffect, which: int, um: float) ->
     return "–" if validation is None else f"{um * found.rms_if_added(validation)[which]:.1f}"
 
 
-def write_comparison(found: Comparison, state: State, folder: Path) -> None:
+def write_comparison(found: ResidualTables, state: State, folder: Path) -> None:
     """Section of report.html and pictures/compare.*."""
     figure = comparison(found, state.session.length_unit)
     picture = _save(folder / "pictures", {"compare": figure})["compare"]
@@ -140,7 +143,7 @@ def _insert(page: Path, name: str, html: str) -> None:
     begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
     text = page.read_text(encoding="utf-8")
     new = re.sub(f"{begin}.*?{end}", lambda _: begin + html + end, text, flags=re.S)
-    with whole(page) as file:
+    with whole_file(page) as file:
         file.write_text(new, encoding="utf-8")
 
 
@@ -155,9 +158,9 @@ def _save(folder: Path, figures: Mapping[str, Figure | None]) -> dict[str, str]:
             continue
         text = svg_text(figure)
         figure.set_layout_engine("none")  # found once; it takes half of the time of a drawing
-        with whole(folder / f"{name}.png") as file:
+        with whole_file(folder / f"{name}.png") as file:
             figure.savefig(file, format="png", dpi=120)
-        with whole(folder / f"{name}.svg") as file:
+        with whole_file(folder / f"{name}.svg") as file:
             file.write_text(text, encoding="utf-8")
         addresses[name] = svg_address(text)
     return addresses

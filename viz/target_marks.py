@@ -51,7 +51,7 @@ def marks_of(run: Run) -> Marks:
         k = s.target[v, slot]
         found = Marks([shape] * len(v), run.measurement.T_base_flange[v] @ places[k], v, k)
         return _with_fixed(found, {"scanner": run.T_mount, "base": np.eye(4)})
-    k = np.flatnonzero(np.isfinite(places[:, :3, 3]).all(axis=1) & (s.seen > 0))
+    k = np.flatnonzero(np.isfinite(places[:, :3, 3]).all(axis=1) & (s.view_counts > 0))
     v = np.flatnonzero(s.used.any(axis=1))
     v = v[:: -(-len(v) // _MOST)]
     found = Marks(

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from stitch.comparison.disagreement_field import full_colour
-from stitch.comparison.plain_verdict import Judged
+from stitch.comparison.disagreement_field import full_colour_distance
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from stitch.comparison.run_verdict import run_light, run_verdict
-from stitch.comparison.two_runs import Side, TwoRuns, sentence
+from stitch.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
 from stitch.units import MICROMETRES, length_text
 from viz import captions
 from viz.filled_templates import script_json
@@ -39,7 +39,7 @@ def _head(both: TwoRuns, tolerance: float | None) -> Head:
     letters = (("A", both.a), ("B", both.b))
     return Head(
         title=f"A: {both.a.name} · B: {both.b.name}",
-        verdict=sentence(both),
+        verdict=comparison_sentence(both),
         lights=[light for letter, side in letters for light in _light(letter, side, tolerance)],
         evidence="Both read the same data: what differs is the models' doing."
         if both.same_data
@@ -48,14 +48,14 @@ def _head(both: TwoRuns, tolerance: float | None) -> Head:
     )
 
 
-def _light(letter: str, side: Side, tolerance: float | None) -> list[Judged]:
+def _light(letter: str, side: ComparedRun, tolerance: float | None) -> list[ToleranceVerdict]:
     own = None if tolerance is None else run_light(side.run, side.history, tolerance)
     if own is None:
         return []
     return [own._replace(sentence=f"{letter}: {own.sentence}")]
 
 
-def _found(side: Side) -> list[str]:
+def _found(side: ComparedRun) -> list[str]:
     """The verdict of one run, for everybody and with its evidence."""
     return [run_verdict(side.run, side.history), side.run.verdict]
 
@@ -110,7 +110,7 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
         part_data(surface, camera, own, side.run.session.names, side.run.session.length_unit, extent)
         for surface, camera, own, side, extent in zip(surfaces, cameras, histories, sides, extents, strict=True)
     ]
-    limit = max(full_colour(own.models[0].field) for own in histories) * um
+    limit = max(full_colour_distance(own.models[0].field) for own in histories) * um
     signed = max(own["fullSigned"] for own in data)
     out = []
     for i, letter in enumerate("AB"):

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.comparison.two_runs import Side, TwoRuns
+from stitch.comparison.two_runs import ComparedRun, TwoRuns
 from stitch.frames import Array
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, known_text, length_text
+from stitch.units import MICROMETRES, length_text, value_uncertainty_text
 
 
 class Fact(NamedTuple):
@@ -29,7 +29,7 @@ def facts(both: TwoRuns) -> list[Fact]:
     return sorted(rows, key=lambda row: not row.differs)
 
 
-def _facts(side: Side) -> dict[str, str]:
+def _facts(side: ComparedRun) -> dict[str, str]:
     run, unit = side.run, side.run.session.length_unit
     session, stated = run.session, run.session.repeatability
     position = "position not stated" if stated.position is None else f"position {length_text(stated.position, unit)}"
@@ -65,7 +65,7 @@ def error_rows(both: TwoRuns) -> list[dict[str, Any]]:
     ]
 
 
-def _errors(side: Side) -> dict[str, float]:
+def _errors(side: ComparedRun) -> dict[str, float]:
     run, um = side.run, MICROMETRES[side.run.session.length_unit]
     out = {}
     if side.history is not None:
@@ -91,7 +91,12 @@ def hand_eye_change_rows(both: TwoRuns) -> list[dict[str, Any]]:
     names = [(f"turn about {axis}", "mrad") for axis in "xyz"] + [(f"shift along {axis}", "µm") for axis in "xyz"]
     rows = zip(names, change.twist * sizes, change.U * sizes, strict=True)
     return [
-        {"name": name, "unit": unit, "value": known_text(x, U), "ratio": abs(x) / U if U > 0 else float("nan")}
+        {
+            "name": name,
+            "unit": unit,
+            "value": value_uncertainty_text(x, U),
+            "ratio": abs(x) / U if U > 0 else float("nan"),
+        }
         for (name, unit), x, U in rows
     ]
 
@@ -112,7 +117,7 @@ def _parameters(run: Run) -> dict[tuple[str, str, str], str]:
         for term in run.terms
         for p in term.parameters
         if p.fitted or p.grid
-        for told in [p.told]
+        for told in [p.formatted]
     }
 
 
@@ -138,11 +143,11 @@ def view_change_rows(both: TwoRuns) -> list[dict[str, Any]]:
     return [row | {"share": 100 * np.nan_to_num(abs(row["change"])) / most} for row in rows]
 
 
-def _by_view(side: Side, values: Array) -> dict[str, float]:
+def _by_view(side: ComparedRun, values: Array) -> dict[str, float]:
     um = MICROMETRES[side.run.session.length_unit]
     return {view.name: float(x) * um for view, x in zip(side.run.session.views, values, strict=True)}
 
 
-def _apart(side: Side) -> Array:
+def _apart(side: ComparedRun) -> Array:
     """(V,) how far each view is off the others under the model: mean on the part, or its rms without clouds."""
     return side.run.view_rms if side.history is None else side.history.models[-1].field.by_view

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 
 from bench.docs.report_pictures import call, shot
 from stitch.cells.base_to_base.stand_file import read_stand
-from stitch.cells.base_to_base.stand_solution import solve
-from stitch.cells.drilling.drill_job import read_job as read_drilling
-from stitch.cells.drilling.drill_solution import solve_job as solve_drilling
-from stitch.cells.panel.panel_job import read_job as read_panel
-from stitch.cells.panel.panel_solution import solve_job as solve_panel
+from stitch.cells.base_to_base.stand_solution import solve_stand
+from stitch.cells.drilling.drill_job import read_drill_job as read_drilling
+from stitch.cells.drilling.drill_solution import solve_drill_job as solve_drilling
+from stitch.cells.panel.panel_job import read_panel_job as read_panel
+from stitch.cells.panel.panel_solution import solve_panel_job as solve_panel
 from stitch.cells.window.window_jobs import read_seam_job
 from stitch.cells.window.window_solution import solve_seam
 from viz.cells import base_to_base_figures, drilling_figures, panel_figures, window_seam
@@ -28,7 +28,7 @@ def figures() -> dict[str, Figure]:
     stand, drilling = read_stand(EXAMPLES / "base_to_base.toml"), read_drilling(EXAMPLES / "drilling" / "job.toml")
     panel, seam = read_panel(EXAMPLES / "panel" / "job.toml"), read_seam_job(EXAMPLES / "window" / "seam.toml")
     return {
-        "base-to-base": base_to_base_figures.plan(stand, solve(stand)),
+        "base-to-base": base_to_base_figures.plan(stand, solve_stand(stand)),
         "drilling": drilling_figures.holes(drilling, solve_drilling(drilling)),
         "panel-clamps": panel_figures.shape(panel, solve_panel(panel)),
         "window-seam": window_seam.cuts(seam, solve_seam(seam)),

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.layouts import layouts
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import RawPoses
 from stitch.intake.readings import readings
 from stitch.measurement.cloud import Cloud
@@ -21,7 +21,7 @@ from stitch.measurement.labelled_points import Sighting
 from stitch.reading.clouds import cloud_of_columns
 from stitch.reading.depth_image import lifted
 from stitch.reading.intrinsics import Intrinsics
-from stitch.reading.organised import measured
+from stitch.reading.organised import measured_pixels
 
 Columns = dict[str, Array]
 _KNOWN = (
@@ -88,7 +88,7 @@ def _points(points: Array, where: str) -> Columns:
     if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
         raise InputError(f"{where}: {_shown(points)} is no cloud that is known; to fix: pass {_KNOWN}")
     columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
-    return measured(columns) if points.ndim == 3 else columns
+    return measured_pixels(columns) if points.ndim == 3 else columns
 
 
 def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
@@ -104,7 +104,7 @@ def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
     odd = next((name for name, column in columns.items() if len(column) != (count or len(columns[name]))), None)
     if odd is not None:
         raise InputError(f"{where}: {odd} has {len(columns[odd])} values for {count} points; to fix: pass one a point")
-    return measured(columns)
+    return measured_pixels(columns)
 
 
 def _points_all(points: Array, where: str) -> Columns:
@@ -219,7 +219,7 @@ def poses_of(poses: Any, where: str) -> Array:
         bad = int((~np.isfinite(T).all(axis=(1, 2))).argmax())
         raise InputError(f"{where}: pose {bad} is not finite; to fix: leave that view out")
     try:
-        (layout, *_) = layouts(RawPoses(where, None, T.reshape(-1, 16), ((),) * len(T), "an array"))
+        (layout, *_) = possible_layouts(RawPoses(where, None, T.reshape(-1, 16), ((),) * len(T), "an array"))
     except InputError:
         raise InputError(f"{where}: {_no_motion(T)}; write a rotation, and 0 0 0 1 in the last row") from None
     (reading, *_) = readings(layout)

@@ -16,25 +16,25 @@ from stitch.calibrate.robot_table import repeatability_table, robot_toml
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import pairings
-from stitch.intake.doctor import decide
+from stitch.intake.doctor import choose_convention
 from stitch.intake.first_session import all_readings, capture_of
 from stitch.intake.one_frame import require_own_frames
 from stitch.intake.raw_poses import RawPoses
 from stitch.intake.stated import StatedFolder
 from stitch.intake.ways import MM
 from stitch.integrity.refusals import refuse_whole
-from stitch.integrity.relative_scans import relative_scans
+from stitch.integrity.relative_scans import register_scan_pairs
 from stitch.measurement import session as measured
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.robot import Robot, forward
 from stitch.measurement.session import Mount, Scanner, StatedRepeatability, View
-from stitch.measurement.thinning import ENOUGH
+from stitch.measurement.thinning import MAX_POINTS
 from stitch.reading import scanner_toml, session_folder, session_toml
 from stitch.reading.names import require_folder_name, require_name
 from stitch.reading.plausible import check_scale
 from stitch.reading.reported_pose import require_agreement
 from stitch.reading.session_scans import checked_scan
-from stitch.reading.toml_file import choice
+from stitch.reading.toml_file import table_choice
 from stitch.system.threads import parallel
 from stitch.units import METRES
 from stitch.writing.session_files import SessionFiles, pose_columns, table_text, write_session
@@ -170,7 +170,7 @@ def load_session(
     path: Path | str,
     scans: bool = True,
     start: Array | None = None,
-    at_most: int | None = ENOUGH,
+    at_most: int | None = MAX_POINTS,
     memory: float | None = None,
 ) -> Session:
     """Read and check a session folder.
@@ -230,14 +230,14 @@ def _stated(
         ("cloud_unit", cloud_unit, tuple(METRES)),
         ("mount", mount, get_args(Mount)),
     ):
-        choice(toml, {key: value}, key, known)
+        table_choice(toml, {key: value}, key, known)
     if not isinstance(scanner, Scanner):
-        scanner = scanner_toml.scanner(toml, dict(scanner or {}))
+        scanner = scanner_toml.read_scanner(toml, dict(scanner or {}))
     if robot is None or isinstance(robot, Robot):
         return _Stated(unit, cloud_unit, scanner, robot, StatedRepeatability())
     table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
-    stated = session_toml.repeatability(toml, table)
-    return _Stated(unit, cloud_unit, scanner, session_toml.robot(toml, table, unit), stated)
+    stated = session_toml.read_repeatability(toml, table)
+    return _Stated(unit, cloud_unit, scanner, session_toml.read_robot(toml, table, unit), stated)
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
@@ -285,7 +285,7 @@ def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> li
         where = f"view {names[at]}"
         read = partial(cloud_of, scans[at], where, known.scale)
         metres = METRES[known.unit]
-        cloud = checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=ENOUGH)
+        cloud = checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=MAX_POINTS)
         # A small scan is the session's own; a large one stays with whoever holds it.
         return replace(cloud, points=cloud.points.copy()) if cloud.points is scans[at] else cloud
 
@@ -353,11 +353,11 @@ def _scans_confirm(session: Session) -> bool:
     raw = RawPoses(str(session.path), None, T.reshape(-1, 16), ((),) * len(T), "an array")
     stated = StatedFolder(length_unit=session.length_unit)
     capture = capture_of(clouds, METRES[session.length_unit] / MM)
-    motions = cache(lambda: relative_scans(capture))
+    motions = cache(lambda: register_scan_pairs(capture))
     pairs = pairings([Path("scan")] * len(T), raw.labels)
-    decided = decide(capture, motions, all_readings(raw, None, stated), pairs, [session.length_unit])
+    decided = choose_convention(capture, motions, all_readings(raw, None, stated), pairs, [session.length_unit])
     require_own_frames(session.path, motions, decided)
-    way = decided.best.way
+    way = decided.best.interpretation
     in_order = way.pairing.rows == tuple(range(len(T)))
     return decided.told and in_order and way.carries == (session.mount == "eye_in_hand")
 

@@ -10,37 +10,37 @@ import numpy as np
 from stitch import pipeline, revision
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
-from stitch.comparison.compare_surfaces import compare as compare_surfaces
+from stitch.comparison.compare_surfaces import compare_surfaces
 from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.tables import Comparison
+from stitch.comparison.tables import ResidualTables
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.effects.in_session import known, require
+from stitch.effects.in_session import find_effect, require_available
 from stitch.errors import InputError
 from stitch.explanation import explain as explanation
-from stitch.explanation.explain import NAME, Explanation
+from stitch.explanation.explain import EFFECT_NAME, Explanation
 from stitch.export.arm_formats import ARM_FORMATS
 from stitch.export.arm_model import arm_from
 from stitch.export.cloud_formats import CLOUD_FORMATS, coloured
 from stitch.export.hand_eye import hand_eye_from
-from stitch.export.hand_eye_formats import FORMATS
+from stitch.export.hand_eye_formats import HAND_EYE_FORMATS
 from stitch.frames import Array
 from stitch.measurement import session as measured
 from stitch.measurement.capture import part_size
-from stitch.model.arm import kept_arm
-from stitch.model.forward import corrected
+from stitch.model.arm import keep_arm_effects
+from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile
 from stitch.planning import plan as planning
 from stitch.planning.cells import PlannedCell, cell_of_session, cell_of_state
-from stitch.planning.plan import Plan, Wanted
+from stitch.planning.plan import Plan, PlanRequest
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
-from stitch.runs.state import State, state_of
+from stitch.runs.state import RunState, state_of
 from stitch.stages.reuse import REUSE_GATE, converged_gate
 from stitch.stored.load_state import load_state
 from stitch.stored.stored_run import stored_run
 from stitch.system.threads import library_threads_off
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.result_document import model_of, result_document
 
@@ -106,7 +106,7 @@ def run_rig(
     """
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
     replays = [ReplayRecorder(other) for other in others]
-    stated = None if arm is None else kept_arm(_model(arm)) if isinstance(arm, runs.Run) else arm
+    stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, runs.Run) else arm
     found = pipeline.run_rig(sessions, None if model is None else _model(model), replays, _names(effects), keep, stated)
     return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
 
@@ -136,7 +136,7 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
     return public_run(stored_run(folder, state), None)
 
 
-def diagnose(run: runs.Run | State) -> Diagnosis:
+def diagnose(run: runs.Run | RunState) -> Diagnosis:
     """Say which effect is missing in the model of a run, as `stitch diagnose` does.
 
     Args:
@@ -156,7 +156,7 @@ def diagnose(run: runs.Run | State) -> Diagnosis:
     return pipeline.diagnose(_state(run))
 
 
-def add(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+def add(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run with further effects in its model, hand-eye and all effects fitted anew.
 
     Args:
@@ -177,13 +177,13 @@ def add(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) 
     """
     state = _state(run)
     for name in effects:
-        require(state.measurement, known(name))
+        require_available(state.measurement, find_effect(name))
         if name in state.model.effects:
             raise InputError(f"{name} is in the model of {state.session.name} already; to fix: leave it out")
     return _changed(run, state, [*state.model.effects, *effects], recorder)
 
 
-def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None) -> Run:
+def drop(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run without some effects, hand-eye and the rest fitted anew.
 
     Args:
@@ -211,7 +211,7 @@ def drop(run: runs.Run | State, *effects: str, recorder: Recorder | None = None)
     return _changed(run, state, [name for name in used if name not in effects], recorder)
 
 
-def compare(run: runs.Run | State) -> Comparison:
+def compare(run: runs.Run | RunState) -> ResidualTables:
     """Set the residuals of a run against everything that is known of its views, as `stitch compare` does.
 
     Returns:
@@ -229,7 +229,7 @@ def compare(run: runs.Run | State) -> Comparison:
     return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
 
 
-def explain(run: runs.Run | State) -> Explanation:
+def explain(run: runs.Run | RunState) -> Explanation:
     """Look for a formula of what the model of a run leaves, as `stitch explain` does.
 
     Returns:
@@ -244,9 +244,9 @@ def explain(run: runs.Run | State) -> Explanation:
         False
     """
     state = _state(run)
-    if NAME in state.model.effects:
+    if EFFECT_NAME in state.model.effects:
         raise InputError(
-            f"{state.session.name}: has an effect {NAME!r} in its model; to fix: give it another name in its file, "
+            f"{state.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its file, "
             "and add that"
         )
     return explanation.explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
@@ -287,13 +287,13 @@ def plan(
         5
     """
     for name in split or ():
-        known(name)
+        find_effect(name)
     at = None if feature is None else np.asarray(feature, float).reshape(3)
-    wanted = Wanted(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
+    wanted = PlanRequest(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
     if isinstance(cell, runs.Run):
-        return planning.plan(cell.session, _cell_of(cell), wanted)
+        return planning.plan_further_views(cell.session, _cell_of(cell), wanted)
     planned = cell_of_session(cell, None if part is None else Path(part), size, field)
-    return planning.plan(cell, planned, wanted)
+    return planning.plan_further_views(cell, planned, wanted)
 
 
 def export_run(
@@ -335,13 +335,15 @@ def export_run(
     if to in ARM_FORMATS:
         session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
         text = ARM_FORMATS[to](arm_from(session, model_of(run)))
-    elif to in FORMATS:
+    elif to in HAND_EYE_FORMATS:
         document = {} if diagnosis is None else diagnosis_document(diagnosis)
-        text = FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
+        text = HAND_EYE_FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
     else:
-        raise InputError(f"{to}: no such format; to fix: one of {', '.join((*FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}")
+        raise InputError(
+            f"{to}: no such format; to fix: one of {', '.join((*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}"
+        )
     if path is not None:
-        with whole(path) as out:
+        with whole_file(path) as out:
             out.write_text(text, encoding="utf-8")
     return text
 
@@ -354,7 +356,7 @@ def _cloud(run: runs.Run, to: str, file: Path | None) -> None:
         raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
     names = ("points", "normals", "residual")
     fused = replace(run.fused, **{name: _single(getattr(run.fused, name)) for name in names})
-    with whole(file) as out:
+    with whole_file(file) as out:
         CLOUD_FORMATS[to][0](coloured(fused, run.session.length_unit), out)
 
 
@@ -369,15 +371,15 @@ def _model(model: ModelFile | runs.Run) -> ModelFile:
 
 def _names(effects: Sequence[str]) -> list[str]:
     """Names of effects, each of which is known."""
-    return [known(name).name for name in effects]
+    return [find_effect(name).name for name in effects]
 
 
-def _state(run: runs.Run | State) -> State:
+def _state(run: runs.Run | RunState) -> RunState:
     """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
     if not isinstance(run, runs.Run):
         return run
     state = state_of(run)
-    own = corrected(state.measurement, state.model)
+    own = corrected_capture(state.measurement, state.model)
     if not own.scans:
         return state
     with library_threads_off():
@@ -385,7 +387,7 @@ def _state(run: runs.Run | State) -> State:
     return replace(state, gate=gate)
 
 
-def _changed(run: runs.Run | State, state: State, effects: Sequence[str], recorder: Recorder | None) -> Run:
+def _changed(run: runs.Run | RunState, state: RunState, effects: Sequence[str], recorder: Recorder | None) -> Run:
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
     return public_run(revision.change(state, effects, replay), whole_session, replay)

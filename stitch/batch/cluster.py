@@ -11,7 +11,7 @@ from typing import Any
 
 from stitch.errors import InputError
 
-_ANSWER = 10.0  # seconds within which a scheduler has to answer
+_ANSWER_SECONDS = 10.0  # seconds within which a scheduler has to answer
 _SETTINGS = {
     # A worker has one session and no other: if it dies, only that one is suspected.
     "distributed.scheduler.worker-saturation": 1.0,
@@ -41,7 +41,7 @@ def local_client(workers: int) -> Iterator[Any]:
         try:
             security = distributed.Security.temporary()
         except ImportError:
-            raise _missing("cryptography") from None
+            raise _missing_package_error("cryptography") from None
         with _interrupts_ignored():  # by the workers, who inherit it
             cluster = distributed.LocalCluster(
                 n_workers=workers,
@@ -52,10 +52,10 @@ def local_client(workers: int) -> Iterator[Any]:
                 local_directory=scratch,
                 silence_logs=logging.CRITICAL,
             )
-        stack.callback(_closed, cluster)
+        stack.callback(_close_client, cluster)
         client = distributed.Client(cluster)
-        stack.callback(_closed, client)
-        client.register_plugin(_deaf(distributed), name="stitch-deaf")
+        stack.callback(_close_client, client)
+        client.register_plugin(_interrupt_shield(distributed), name="stitch-deaf")
         yield client
 
 
@@ -68,14 +68,14 @@ def joined_client(address: str) -> Iterator[Any]:
     """
     distributed = _package()
     try:
-        client = distributed.Client(address, timeout=_ANSWER)
+        client = distributed.Client(address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"--scheduler {address}: no answer ({reason}); to fix: start one (`dask scheduler`), or correct the address"
         ) from None
     with ExitStack() as stack:
-        stack.callback(_closed, client)
+        stack.callback(_close_client, client)
         yield client
 
 
@@ -87,7 +87,7 @@ def sessions_at_once(client: Any) -> int:
     return max(at_once.values(), default=1)
 
 
-def _deaf(distributed: Any) -> Any:
+def _interrupt_shield(distributed: Any) -> Any:
     """What every worker does first, one that takes the place of a dead one too."""
 
     class Deaf(distributed.WorkerPlugin):  # type: ignore[misc]
@@ -99,7 +99,7 @@ def _deaf(distributed: Any) -> Any:
     return Deaf()
 
 
-def _closed(open_one: Any) -> None:
+def _close_client(open_one: Any) -> None:
     """Close; a second Ctrl-C does not leave processes behind."""
     with _interrupts_ignored():
         open_one.close()
@@ -122,14 +122,14 @@ def _package() -> Any:
     try:
         package = import_module("distributed")
     except ModuleNotFoundError:
-        raise _missing("distributed") from None
+        raise _missing_package_error("distributed") from None
     # What dies is part of the result, and is told there.
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return package
 
 
-def _missing(package: str) -> InputError:
+def _missing_package_error(package: str) -> InputError:
     return InputError(
         f"more than one process needs the package {package}; to fix: pip install 'stitch[cluster]', or leave out "
         "--workers and --scheduler"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """What a worker needs to know; all paths absolute, for it may stand elsewhere."""
 
     session: Path

@@ -7,20 +7,20 @@ from importlib import import_module
 from typing import Any
 
 from stitch.batch.cluster import joined_client, local_client, sessions_at_once
-from stitch.batch.job import Job
+from stitch.batch.job import BatchJob
 from stitch.batch.one_session import run_session
 from stitch.batch.session_row import SessionRow, failed_row
 from stitch.errors import NoResultError
 
-_KILLED = NoResultError(
+_WORKERS_DIED = NoResultError(
     "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
     "again"
 )
-_GONE = NoResultError("the scheduler has gone; to fix: start the same batch again")
+_SCHEDULER_GONE = NoResultError("the scheduler has gone; to fix: start the same batch again")
 
 
-def results(
-    jobs: Sequence[Job], workers: int = 1, scheduler: str = "", say: Callable[[str], object] = str
+def run_jobs(
+    jobs: Sequence[BatchJob], workers: int = 1, scheduler: str = "", say: Callable[[str], object] = str
 ) -> Generator[SessionRow]:
     """Run the jobs on this process, on so many, or on those of a scheduler; rows as they come.
 
@@ -44,7 +44,7 @@ def results(
 
 
 def rows_from(
-    client: Any, jobs: Sequence[Job], work: Callable[[Job], SessionRow] = run_session
+    client: Any, jobs: Sequence[BatchJob], work: Callable[[BatchJob], SessionRow] = run_session
 ) -> Iterator[SessionRow]:
     """Rows from the workers of a client: all jobs at once; then, one after the other, those whose workers died.
 
@@ -62,7 +62,7 @@ def rows_from(
         told = dict(zip(whole, client.gather(whole), strict=True))
         for future in done:
             job = job_of.pop(future)
-            row = told.get(future) or _row(future, job)
+            row = told.get(future) or _row_of_future(future, job)
             # The scheduler need not keep what has been told.
             future.release()
             if row is None:
@@ -71,10 +71,10 @@ def rows_from(
                 yield row
     for job in suspected:
         alone = client.submit(work, job, key=(f"stitch-{job.batch}-alone", job.run.name), pure=False)
-        yield _row(alone, job) or failed_row(job.session, job.run, _KILLED)
+        yield _row_of_future(alone, job) or failed_row(job.session, job.run, _WORKERS_DIED)
 
 
-def _row(future: Any, job: Job) -> SessionRow | None:
+def _row_of_future(future: Any, job: BatchJob) -> SessionRow | None:
     """What a future holds; None where workers died."""
     try:
         row: SessionRow = future.result()
@@ -84,5 +84,5 @@ def _row(future: Any, job: Job) -> SessionRow | None:
             case "KilledWorker":
                 return None
             case "CancelledError" | "FutureCancelledError":
-                return failed_row(job.session, job.run, _GONE)
+                return failed_row(job.session, job.run, _SCHEDULER_GONE)
         return failed_row(job.session, job.run, error)

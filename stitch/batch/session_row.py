@@ -37,7 +37,7 @@ class SessionRow:
         return True, -self.residual_um / self.noise_floor_um
 
 
-def row_of(session: Path, run: Path, skipped: bool = False) -> SessionRow:
+def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
     """The row of a session with a run.
 
     Raises:

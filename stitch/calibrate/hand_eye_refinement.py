@@ -11,7 +11,7 @@ import numpy as np
 from stitch import frames
 from stitch.calibrate.view_jackknife import jackknife
 from stitch.closed_form.axzb import shah
-from stitch.closed_form.relative_motions import roots
+from stitch.closed_form.relative_motions import weight_roots
 from stitch.frames import Array
 from stitch.statistics.robust import mad_sigma
 
@@ -25,7 +25,7 @@ _UNKNOWNS = 12
 
 
 @dataclass(frozen=True)
-class Refined:
+class AxzbSolution:
     """Both transforms; the covariance is of their right perturbations T·exp(ξ), rotation first."""
 
     transforms: tuple[Array, Array]  # X and Z, (4, 4) each
@@ -43,7 +43,7 @@ def refine_axzb(
     weights: Array | None = None,
     robust: bool = False,
     groups: Array | None = None,
-) -> Refined:
+) -> AxzbSolution:
     """X, Z of A·X = Z·B by Gauss–Newton from Shah's start; every step whitens by the scatter that it starts from.
 
     Args:
@@ -57,10 +57,10 @@ def refine_axzb(
         NoResultError: poses that cannot show both; names the axis they share.
     """
     X, Z = shah(A, B, weights)
-    root = roots(A, weights)[:, None]
+    root = weight_roots(A, weights)[:, None]
     for step in range(_STEPS + 1):
-        e, jacobian = _linearise(A, B, X, Z)
-        scatter = np.array(sigma or _scatter(e * root, robust))
+        e, jacobian = _linearise_axzb(A, B, X, Z)
+        scatter = np.array(sigma or _residual_scatter(e * root, robust))
         white = root / np.repeat(scatter, 3)
         information, gradient = _normal_equations(jacobian * white[..., None], e * white, robust)
         total = information.sum(axis=0)
@@ -68,17 +68,17 @@ def refine_axzb(
         if step == _STEPS or np.sqrt(xi @ total @ xi) < _SMALL:
             break
         X, Z = X @ frames.exp(xi[:6]), Z @ frames.exp(xi[6:])
-    model = np.linalg.inv(total) * (_student(e.size - _UNKNOWNS) if sigma is None else 1.0)
+    model = np.linalg.inv(total) * (_student_variance(e.size - _UNKNOWNS) if sigma is None else 1.0)
     statistics = jackknife(information, gradient, model)
     heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(statistics.steps)])
     if groups is not None:
         member = groups == np.unique(groups)[:, None]
         statistics = jackknife(np.tensordot(member, information, 1), member @ gradient, model)
     spread = float(scatter[0]), float(scatter[1])
-    return Refined((X, Z), statistics.covariance, statistics.inflation, e, heldout, spread)
+    return AxzbSolution((X, Z), statistics.covariance, statistics.inflation, e, heldout, spread)
 
 
-def _linearise(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+def _linearise_axzb(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Array]:
     """Residual twists (V, 6) and their Jacobian (V, 6, 12) at X and Z.
 
     With the left and right inverse Jacobians of SE(3) at small twists, to first order (Barfoot 7.84).
@@ -91,7 +91,7 @@ def _linearise(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Array]:
     return e, np.concatenate([by_x, by_z], axis=2)
 
 
-def _student(free: int) -> float:
+def _student_variance(free: int) -> float:
     """Variance of Student's t where each of the two scatters is found from half of the free numbers; at most 3."""
     return min(free / 2 / max(free / 2 - 2, 1e-9), 3.0)
 
@@ -104,7 +104,7 @@ def _normal_equations(jacobian: Array, e: Array, robust: bool) -> tuple[Array, A
     return np.asarray(information), np.einsum("vij,vi->vj", weighted, e)
 
 
-def _scatter(e: Array, robust: bool) -> tuple[float, float]:
+def _residual_scatter(e: Array, robust: bool) -> tuple[float, float]:
     """σ of rotations and of translations; each half of the residuals pays for half of the unknowns."""
     free = max(1 - _UNKNOWNS / e.size, 1 / e.size)
     rotation, translation = (mad_sigma(half) if robust else _rms(half) for half in (e[:, :3], e[:, 3:]))

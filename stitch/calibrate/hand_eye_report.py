@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch import frames
-from stitch.closed_form.relative_motions import axis_spread, from_first
+from stitch.closed_form.relative_motions import axis_spread, motions_from_first
 from stitch.frames import Array
 from stitch.measurement.session import Session
 
@@ -42,7 +42,7 @@ def hand_eye_document(
         "translation_sigma_mount": np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T)).tolist(),
         "covariance_inflation": inflation,
         "turned_deg": float(np.degrees(largest_turn(G))),
-        "axis_spread": axis_spread(from_first(G)).tolist(),
+        "axis_spread": axis_spread(motions_from_first(G)).tolist(),
     }
 
 

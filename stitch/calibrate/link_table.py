@@ -23,7 +23,7 @@ from stitch.measurement.session import Session, View
 from stitch.pipeline import run
 from stitch.reading.dh_rows import robot_from_dh
 from stitch.reading.urdf import robot_from_urdf
-from stitch.statistics.shares import clearly_less
+from stitch.statistics.shares import significantly_smaller
 from stitch.units import length_text
 from stitch.writing.urdf_file import to_urdf
 
@@ -65,19 +65,19 @@ def link_table(session: Session) -> LinkTable:
     nominal = session.robot
     if nominal is None:
         raise InputError(f"{session.path}: no [robot]; a table of its links needs one")
-    left = {choice: rms for choice in _CHOICES if np.isfinite(rms := _left_out(session, choice))}
-    plain = _judged(session, ())
+    left = {choice: rms for choice in _CHOICES if np.isfinite(rms := _heldout_rms(session, choice))}
+    plain = _heldout_squares(session, ())
     best = min(left, key=lambda choice: left[choice]) if left else ()
-    judged = _judged(session, best)
+    judged = _heldout_squares(session, best)
     if judged is None or plain is None:
         return LinkTable(nominal, ())
     here, before = (float(np.sqrt(np.nanmean(squares))) for squares in (judged, plain))
-    if not best or not clearly_less(judged, plain, _CHANCE / len(left)):
+    if not best or not significantly_smaller(judged, plain, _CHANCE / len(left)):
         return LinkTable(nominal, (), here, before)
     return LinkTable(with_geometry(nominal, run(session, effects=best).terms), best, here, before)
 
 
-def _left_out(session: Session, effects: Sequence[str]) -> float:
+def _heldout_rms(session: Session, effects: Sequence[str]) -> float:
     """What they leave in views left out; NaN where the session cannot have them."""
     try:
         return run(session, effects=effects).heldout_rms
@@ -85,7 +85,7 @@ def _left_out(session: Session, effects: Sequence[str]) -> float:
         return float("nan")
 
 
-def _judged(session: Session, effects: Sequence[str]) -> Array | None:
+def _heldout_squares(session: Session, effects: Sequence[str]) -> Array | None:
     """(V,) mean squares of the targets' distances in every view, with the table of the other parts; NaN where none was
     seen. None where a part is too little for it."""
     count = len(session.views)
@@ -94,19 +94,19 @@ def _judged(session: Session, effects: Sequence[str]) -> Array | None:
     number = {view.name: k for k, view in enumerate(session.views)}
     try:
         for k in range(_PARTS):
-            table = _read_back(_fitted(_some(session, part != k), effects), session.length_unit)
-            judged = run(_with_arm(_some(session, part == k), table))
+            table = _read_back(_fit_table(_session_of_views(session, part != k), effects), session.length_unit)
+            judged = run(_with_reported_arm(_session_of_views(session, part == k), table))
             squares[[number[view.name] for view in judged.session.views]] = judged.view_rms**2
     except (InputError, NoResultError):
         return None
     return squares
 
 
-def _some(session: Session, keep: Array) -> Session:
+def _session_of_views(session: Session, keep: Array) -> Session:
     return replace(session, views=tuple(view for view, kept in zip(session.views, keep, strict=True) if kept))
 
 
-def _fitted(session: Session, effects: Sequence[str]) -> Robot:
+def _fit_table(session: Session, effects: Sequence[str]) -> Robot:
     assert session.robot is not None
     return with_geometry(session.robot, run(session, effects=effects).terms) if effects else session.robot
 
@@ -124,7 +124,7 @@ def _read_back(robot: Robot, unit: str) -> Robot:
         return robot_from_urdf(file, "base_link", "flange", unit, robot.gravity)
 
 
-def _with_arm(session: Session, robot: Robot) -> Session:
+def _with_reported_arm(session: Session, robot: Robot) -> Session:
     """As the arm of a table would have reported its poses; what a controller corrects beside its table, stays."""
     assert session.robot is not None
     nominal = session.robot

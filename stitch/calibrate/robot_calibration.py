@@ -10,7 +10,7 @@ from stitch.diagnosis.design.candidate_views import candidate_measurement, nearb
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, elementary
-from stitch.model.term import Term, stacked
+from stitch.model.term import Term, stack_parameters
 from stitch.runs.run import Run
 
 # The effects that DH rows can express.
@@ -27,7 +27,7 @@ class CalibratedRobot:
     held: tuple[str, ...] = ()
 
 
-def calibrated(run: Run) -> CalibratedRobot:
+def calibrated_robot_of_run(run: Run) -> CalibratedRobot:
     """The session's robot with the joint offsets and link errors of a run.
 
     Raises:
@@ -36,10 +36,10 @@ def calibrated(run: Run) -> CalibratedRobot:
     robot = run.session.robot
     if robot is None or not run.measurement.views.joints.shape[1]:
         raise InputError(f"{run.session.path}: no joint angles or no [robot]; a kinematic calibration needs both")
-    return calibrated_arm(robot, run.terms)
+    return calibrated_robot(robot, run.terms)
 
 
-def calibrated_arm(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
+def calibrated_robot(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
     """A robot with the joint offsets and link errors of a model."""
     of_the_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
     held = tuple(name for name in of_the_arm if name in GEOMETRY)
@@ -47,17 +47,19 @@ def calibrated_arm(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
     return CalibratedRobot(with_geometry(robot, terms), beyond, held)
 
 
-def beyond_sentence(found: CalibratedRobot, in_table: Collection[str] = GEOMETRY) -> str:
+def beyond_sentence(calibrated_arm: CalibratedRobot, in_table: Collection[str] = GEOMETRY) -> str:
     """What a table of links cannot hold, and what it could but does not.
 
     Args:
         in_table: effects in the table that is written.
     """
     told = []
-    if unproved := [name for name in found.held if name not in in_table]:
+    if unproved := [name for name in calibrated_arm.held if name not in in_table]:
         told.append(f"Found, but not in it for want of proof: {', '.join(unproved)}; model.toml has it.")
-    if found.beyond:
-        told.append(f"Not in it, because no table of links can hold it: {', '.join(found.beyond)}; model.toml has it.")
+    if calibrated_arm.beyond:
+        told.append(
+            f"Not in it, because no table of links can hold it: {', '.join(calibrated_arm.beyond)}; model.toml has it."
+        )
     return " ".join(told) or "No other error of the arm was found."
 
 
@@ -92,7 +94,7 @@ def poses_to_add(run: Run) -> Array:
     _, columns, covariance = candidate_rows(
         candidate_measurement(run.measurement, joints), found.rows, found.landmarks, found.variances, run.terms
     )
-    sigmas = np.array([p.sigma for p in stacked(run.terms)])
+    sigmas = np.array([p.sigma for p in stack_parameters(run.terms)])
     keep = np.isfinite(sigmas)
     half = np.linalg.inv(np.linalg.cholesky(covariance))
     # In units of what is known now: an information of one doubles it.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch.calibrate.link_table import LinkTable
-from stitch.calibrate.robot_calibration import beyond_sentence, calibrated, poses_to_add
+from stitch.calibrate.robot_calibration import beyond_sentence, calibrated_robot_of_run, poses_to_add
 from stitch.calibrate.robot_table import dh_rows, robot_toml
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
@@ -22,19 +22,19 @@ _HEADER = "The [robot] table of session.toml: put it there in place of the nomin
 def write_robot(table: LinkTable, run: Run, folder: Path) -> None:
     """robot.toml (for an arm of DH rows) and robot.urdf."""
     (folder / "robot.urdf").write_text(to_urdf(table.robot), encoding="utf-8")
-    told = [_HEADER, *sentences(table, run)]
+    told = [_HEADER, *robot_notes(table, run)]
     text = robot_toml(table.robot, told, run.session.repeatability)
     if text is not None:
         (folder / "robot.toml").write_text(text, encoding="utf-8")
 
 
-def sentences(table: LinkTable, run: Run) -> list[str]:
+def robot_notes(table: LinkTable, run: Run) -> list[str]:
     """What the table is worth, what is not in it, and what has to be done so that it counts; a line each."""
-    told = [table.sentence(run.session.length_unit), beyond_sentence(calibrated(run), table.effects)]
-    return [*told, *filter(None, [_reported(table, run.session)])]
+    told = [table.sentence(run.session.length_unit), beyond_sentence(calibrated_robot_of_run(run), table.effects)]
+    return [*told, *filter(None, [_reported_pose_note(table, run.session)])]
 
 
-def _reported(table: LinkTable, session: Session) -> str:
+def _reported_pose_note(table: LinkTable, session: Session) -> str:
     """How a session whose controller reports poses comes to use the table; empty where nothing stands in its way."""
     if not table.effects or session.robot is None or not has_reported_poses(session.path / "views.csv"):
         return ""
@@ -46,9 +46,9 @@ def _reported(table: LinkTable, session: Session) -> str:
     )
 
 
-def document_of(run: Run, table: LinkTable, ways: list[str], sentence: str) -> dict[str, Any]:
+def robot_document(run: Run, table: LinkTable, notes: list[str], sentence: str) -> dict[str, Any]:
     """The JSON document."""
-    result, found = result_document(run), calibrated(run)
+    result, found = result_document(run), calibrated_robot_of_run(run)
     steps = [
         {"effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms} for s in run.ledger
     ]
@@ -66,11 +66,11 @@ def document_of(run: Run, table: LinkTable, ways: list[str], sentence: str) -> d
             "heldout_rms": table.heldout_rms,
             "nominal_heldout_rms": table.nominal_rms,
             "sentence": table.sentence(run.session.length_unit),
-            "sentences": sentences(table, run),
+            "sentences": robot_notes(table, run),
         },
         "beyond_dh": list(found.beyond),
         "unproved": [name for name in found.held if name not in table.effects],
-        "way": ways,
+        "way": notes,
         "left": sentence,
         "next": np.round(poses_to_add(run), 2).tolist(),
     }

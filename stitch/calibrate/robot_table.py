@@ -28,7 +28,7 @@ def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
     return rows
 
 
-def robot_toml(robot: Robot, told: Sequence[str] = (), stated: StatedRepeatability | None = None) -> str | None:
+def robot_toml(robot: Robot, comments: Sequence[str] = (), stated: StatedRepeatability | None = None) -> str | None:
     """The [robot] table of session.toml below lines of comment; None for an arm that came as URDF.
 
     Args:
@@ -48,7 +48,7 @@ def robot_toml(robot: Robot, told: Sequence[str] = (), stated: StatedRepeatabili
         table["payload"] = {"mass": robot.payload_mass, "com": robot.payload_com.tolist()}
     if stated is not None and (repeatability := repeatability_table(stated)):
         table["repeatability"] = repeatability
-    return "".join(f"# {line}\n" for line in told) + tomli_w.dumps({"robot": table})
+    return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps({"robot": table})
 
 
 def repeatability_table(stated: StatedRepeatability) -> dict[str, float]:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.calibrate.sphere_model import SphereState, distances, linearise, solve
-from stitch.calibrate.sphere_scatter import covariances, find_scatter, find_shares
+from stitch.calibrate.sphere_model import SphereState, linearise_sphere, solve_sphere, sphere_distances
+from stitch.calibrate.sphere_scatter import find_scatter, find_shares, view_covariances
 from stitch.calibrate.sphere_views import SphereView
 from stitch.calibrate.view_jackknife import Jackknife, jackknife
 from stitch.errors import NoResultError
@@ -48,7 +48,7 @@ class SphereFit:
 
 
 @dataclass(frozen=True)
-class _Linear:
+class _LinearisedSphere:
     """Residuals, Jacobians and responses to a shift by view, at a state; the weights and scatters that go with it."""
 
     state: SphereState
@@ -80,13 +80,13 @@ def fit_sphere(
         NoResultError: too few views.
     """
     n = 10 if radius_free else 9
-    free = _numbers_over(len(views), n)
+    free = _free_numbers(len(views), n)
     # The points' own sum has side minima for laser lines; the views' leads to the right one.
-    found = _reweighted(G, views, _start(G, views, T_mount, radius, n))
+    found = _reweight(G, views, _initial_linearisation(G, views, T_mount, radius, n))
     if not by_views:
-        found = _reweighted(G, views, found, _points_weights(views, radius))
+        found = _reweight(G, views, found, _points_weights(views, radius))
     state, statistics = found.state, _statistics(found, views, free)
-    off = [distances(G[v], view.points, state) for v, view in enumerate(views)]
+    off = [sphere_distances(G[v], view.points, state) for v, view in enumerate(views)]
     return SphereFit(
         T_mount=state.T_mount,
         centre=state.centre,
@@ -102,7 +102,7 @@ def fit_sphere(
     )
 
 
-def _numbers_over(views: int, n: int) -> int:
+def _free_numbers(views: int, n: int) -> int:
     """Numbers that the views leave over for their scatter; refused where they are too few."""
     free = 3 * views - n
     if free < _FREE:
@@ -111,12 +111,14 @@ def _numbers_over(views: int, n: int) -> int:
     return free
 
 
-def _start(G: Array, views: Sequence[SphereView], T_mount: Array, radius: float, n: int) -> _Linear:
+def _initial_linearisation(
+    G: Array, views: Sequence[SphereView], T_mount: Array, radius: float, n: int
+) -> _LinearisedSphere:
     feet = np.array([v.foot for v in views])
     state = SphereState(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
-    e, jacobian, response = linearise(G, views, state, n)
+    e, jacobian, response = linearise_sphere(G, views, state, n)
     scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
-    return _Linear(state, e, jacobian, response, weights=[], scatter=scatter, shares=np.ones(len(views)))
+    return _LinearisedSphere(state, e, jacobian, response, weights=[], scatter=scatter, shares=np.ones(len(views)))
 
 
 def _points_weights(views: Sequence[SphereView], radius: float) -> list[Array]:
@@ -125,39 +127,39 @@ def _points_weights(views: Sequence[SphereView], radius: float) -> list[Array]:
     return [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
 
 
-def _reweighted(
-    G: Array, views: Sequence[SphereView], found: _Linear, by_points: Sequence[Array] | None = None
-) -> _Linear:
+def _reweight(
+    G: Array, views: Sequence[SphereView], linearised: _LinearisedSphere, by_points: Sequence[Array] | None = None
+) -> _LinearisedSphere:
     """Fit and scatters in turn until the scatters stand; weights of the points, or else from the scatters."""
     for _ in range(_ROUNDS):
         if by_points is None:
-            spread = covariances(views, found.response, found.scatter, found.shares)
+            spread = view_covariances(views, linearised.response, linearised.scatter, linearised.shares)
             weights = [np.asarray(np.linalg.inv(V)) for V in spread]
         else:
-            weights = [w * share for w, share in zip(by_points, found.shares, strict=True)]
-        n = found.jacobian[0].shape[1]
-        state = solve(G, views, found.state, weights, n)
-        e, jacobian, response = linearise(G, views, state, n)
-        shares = found.shares
+            weights = [w * share for w, share in zip(by_points, linearised.shares, strict=True)]
+        n = linearised.jacobian[0].shape[1]
+        state = solve_sphere(G, views, linearised.state, weights, n)
+        e, jacobian, response = linearise_sphere(G, views, state, n)
+        shares = linearised.shares
         if by_points is None:
-            shares = find_shares(e, covariances(views, response, found.scatter, np.ones(len(views))))
-        scatter = find_scatter(views, e, jacobian, response, last=found.scatter, shares=shares)
-        change = float(np.abs(np.log(scatter / found.scatter)).max())
-        found = _Linear(state, e, jacobian, response, weights=weights, scatter=scatter, shares=shares)
+            shares = find_shares(e, view_covariances(views, response, linearised.scatter, np.ones(len(views))))
+        scatter = find_scatter(views, e, jacobian, response, last=linearised.scatter, shares=shares)
+        change = float(np.abs(np.log(scatter / linearised.scatter)).max())
+        linearised = _LinearisedSphere(state, e, jacobian, response, weights=weights, scatter=scatter, shares=shares)
         if change < _SMALL:
             break
-    return found
+    return linearised
 
 
-def _statistics(found: _Linear, views: Sequence[SphereView], free: int) -> Jackknife:
+def _statistics(linearised: _LinearisedSphere, views: Sequence[SphereView], free: int) -> Jackknife:
     """Sandwich of the weights and of the covariances that the scatter gives, and the jackknife over it.
 
     A scatter found from `free` numbers is itself uncertain: the error over it is Student's, not normal.
     """
-    spread = covariances(views, found.response, found.scatter, found.shares)
-    left = [J.T @ w for J, w in zip(found.jacobian, found.weights, strict=True)]
-    information = np.array([a @ J for a, J in zip(left, found.jacobian, strict=True)])
-    gradient = np.array([a @ r for a, r in zip(left, found.e, strict=True)])
+    spread = view_covariances(views, linearised.response, linearised.scatter, linearised.shares)
+    left = [J.T @ w for J, w in zip(linearised.jacobian, linearised.weights, strict=True)]
+    information = np.array([a @ J for a, J in zip(left, linearised.jacobian, strict=True)])
+    gradient = np.array([a @ r for a, r in zip(left, linearised.e, strict=True)])
     middle = np.sum([a @ V @ a.T for a, V in zip(left, spread, strict=True)], axis=0)
     bread = np.linalg.inv(information.sum(axis=0))
     return jackknife(information, gradient, bread @ middle @ bread * free / (free - 2))

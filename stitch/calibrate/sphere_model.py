@@ -28,7 +28,7 @@ class SphereState:
         return SphereState(self.T_mount @ frames.exp(x[:6]), self.centre + x[6:9], radius)
 
 
-def distances(G: Array, points: Array, state: SphereState) -> Array:
+def sphere_distances(G: Array, points: Array, state: SphereState) -> Array:
     """Distances (N,) of one view's points (N, 3) from the sphere, positive outside."""
     return np.asarray(np.linalg.norm(frames.transform(G @ state.T_mount, points) - state.centre, axis=1) - state.radius)
 
@@ -49,7 +49,9 @@ def _residuals(G: Array, views: Sequence[SphereView], state: SphereState) -> tup
     return out, response
 
 
-def solve(G: Array, views: Sequence[SphereView], state: SphereState, weights: Sequence[Array], n: int) -> SphereState:
+def solve_sphere(
+    G: Array, views: Sequence[SphereView], state: SphereState, weights: Sequence[Array], n: int
+) -> SphereState:
     """Weighted least squares over the circles and spheres of the views, weights (k + 1, k + 1) each."""
     W = [np.linalg.cholesky(w).T for w in weights]
 
@@ -59,7 +61,7 @@ def solve(G: Array, views: Sequence[SphereView], state: SphereState, weights: Se
     return state.moved(least_squares(residual, np.zeros(n), "3-point", x_scale="jac").x)
 
 
-def linearise(
+def linearise_sphere(
     G: Array, views: Sequence[SphereView], state: SphereState, n: int
 ) -> tuple[list[Array], list[Array], list[Array]]:
     """Residuals, their Jacobians (k + 1, n) and responses to a shift, by view."""

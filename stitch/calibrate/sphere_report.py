@@ -12,19 +12,19 @@ from stitch.measurement.session import Session
 
 # A view's points are off by more than their noise beyond this ratio.
 _BEYOND_NOISE = 3.0
-_SURE = 3.0
+_FREE_RADIUS_SIGMAS = 3.0
 # A view that counts less than this is named.
 _DOUBTED = 0.5
 
 
-def weak_of(result: SphereCalibration, unit: str) -> list[str]:
+def sphere_weak_components(result: SphereCalibration, unit: str) -> list[str]:
     """Weak components of the hand-eye, a phrase each."""
     seen = frames.transform(frames.inverse(result.G @ result.fit.T_mount), result.fit.centre[None])[:, 0]
     lever = float(np.median(np.linalg.norm(seen, axis=1)))
     return weak_components(result.fit.covariance[:6, :6], result.fit.rms, lever, unit)
 
 
-def notes_of(result: SphereCalibration, unit: str) -> list[str]:
+def sphere_notes(result: SphereCalibration, unit: str) -> list[str]:
     """Sentences: sides, wrist, weak components, noise against poses, the free radius, odd views."""
     fit, notes = result.fit, list[str]()
     if result.sides_found:
@@ -32,9 +32,9 @@ def notes_of(result: SphereCalibration, unit: str) -> list[str]:
         notes.append(
             "The session does not say on which side of the laser plane the sphere lies; the consistency of all poses "
             f"decided: {plus} views along the arc's normal, {len(result.signs) - plus} against it; the next best "
-            f"answer fits {_times(result.runner_up)} worse"
+            f"answer fits {_ratio_text(result.runner_up)} worse"
         )
-    notes += weak_notes(result.G, weak_of(result, unit))
+    notes += weak_notes(result.G, sphere_weak_components(result, unit))
     if np.median(fit.view_rms) > _BEYOND_NOISE * fit.point_sigma:
         low, high = np.percentile(fit.view_rms, [10, 90])
         noise = "profile noise" if any(v.is_line for v in result.views) else "the scanner's noise"
@@ -57,12 +57,14 @@ def _view_notes(result: SphereCalibration, unit: str) -> list[str]:
                 f"View {view.name} contradicts the others ({rms:#.2g} {unit} from the sphere) and counts {share:.2g}; "
                 "check its pose, or scan it again"
             )
-        elif np.abs(step[:6] / sigma[:6]).max() > _SURE:
-            notes.append(f"View {view.name} alone moves the answer by more than {_SURE:g} sigma; scan it again")
+        elif np.abs(step[:6] / sigma[:6]).max() > _FREE_RADIUS_SIGMAS:
+            notes.append(
+                f"View {view.name} alone moves the answer by more than {_FREE_RADIUS_SIGMAS:g} sigma; scan it again"
+            )
     return notes
 
 
-def _times(ratio: float) -> str:
+def _ratio_text(ratio: float) -> str:
     return f"{ratio:.0f} times" if np.isfinite(ratio) and ratio >= 10 else f"{ratio:.1f} times"
 
 
@@ -71,7 +73,7 @@ def _radius_note(result: SphereCalibration, unit: str) -> list[str]:
         return []
     off, sigma = result.free.radius - result.nominal, float(np.sqrt(result.free.covariance[9, 9]))
     found = f"Free, the radius becomes {result.free.radius:.4g} ± {sigma:.2g} {unit}"
-    if abs(off) <= _SURE * sigma:
+    if abs(off) <= _FREE_RADIUS_SIGMAS * sigma:
         return [
             f"{found}: the {result.nominal:g} given agrees ({abs(off) / sigma:.1f} sigma), nothing else is revealed"
         ]
@@ -81,7 +83,7 @@ def _radius_note(result: SphereCalibration, unit: str) -> list[str]:
     ]
 
 
-def document_of(result: SphereCalibration, session: Session) -> dict[str, Any]:
+def sphere_document(result: SphereCalibration, session: Session) -> dict[str, Any]:
     """The JSON document."""
     fit, unit, free = result.fit, session.length_unit, result.free
     return {
@@ -106,13 +108,13 @@ def document_of(result: SphereCalibration, session: Session) -> dict[str, Any]:
             "hand_eye_sigma": np.sqrt(np.diag(result.by_views.covariance))[:6].tolist(),
             "rms": result.by_views.rms,
         },
-        "weak": weak_of(result, unit),
-        "notes": notes_of(result, unit),
-        "views": [_row(*row) for row in zip(result.views, fit.view_rms, result.signs, strict=True)],
+        "weak": sphere_weak_components(result, unit),
+        "notes": sphere_notes(result, unit),
+        "views": [_view_row(*row) for row in zip(result.views, fit.view_rms, result.signs, strict=True)],
     }
 
 
-def _row(view: SphereView, rms: float, sign: float) -> dict[str, Any]:
+def _view_row(view: SphereView, rms: float, sign: float) -> dict[str, Any]:
     return {
         "view": view.name,
         "points": len(view.points),

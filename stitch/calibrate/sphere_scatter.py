@@ -15,7 +15,9 @@ from stitch.frames import Array
 _OUTLYING = 4.0
 
 
-def covariances(views: Sequence[SphereView], response: Sequence[Array], scatter: Array, shares: Array) -> list[Array]:
+def view_covariances(
+    views: Sequence[SphereView], response: Sequence[Array], scatter: Array, shares: Array
+) -> list[Array]:
     """Covariance of each view's circle or sphere: common error of the points, shift, apparent radius.
 
     Args:
@@ -48,7 +50,9 @@ def find_scatter(
     """(σ_p, σ_ρ, σ_c) of the largest restricted likelihood of the linear model."""
 
     def cost(log_scatter: Array) -> float:
-        W = [np.linalg.inv(np.linalg.cholesky(V)) for V in covariances(views, response, np.exp(log_scatter), shares)]
+        W = [
+            np.linalg.inv(np.linalg.cholesky(V)) for V in view_covariances(views, response, np.exp(log_scatter), shares)
+        ]
         J = np.concatenate([w @ j for w, j in zip(W, jacobian, strict=True)])
         r = np.concatenate([w @ x for w, x in zip(W, e, strict=True)])
         R, Q = np.linalg.qr(J)[::-1]

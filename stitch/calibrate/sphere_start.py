@@ -26,7 +26,7 @@ _RANK = 0.02
 
 
 @dataclass(frozen=True)
-class Start:
+class SphereStart:
     """A first hand-eye."""
 
     T_mount: Array  # (4, 4) T_mount_scanner
@@ -35,7 +35,7 @@ class Start:
     runner_up: float  # rms of the best clearly different answer; inf if none was found
 
 
-def decoupled(G: Array, q: Array) -> Array | None:
+def solve_decoupled(G: Array, q: Array) -> Array | None:
     """Rotation from pairs of equal orientation, then translation from clearly different ones.
 
     R_v R_X (q_1 − q_2) = p_2 − p_1 within a group of equal orientations R_v; then
@@ -79,7 +79,7 @@ def equal_orientations(G: Array) -> list[Array]:
     return groups
 
 
-def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = None) -> Start:
+def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = None) -> SphereStart:
     """Best of many rotations; for each the sides of the laser planes that agree best.
 
     Args:
@@ -88,8 +88,8 @@ def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = N
     rotations = Rotation.random(_ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
     if coarse is not None:
         rotations = np.concatenate([coarse[None, :3, :3], rotations])
-    tried = sorted((_sides(G, views, R) for R in rotations), key=lambda start: start.rms)
-    best: list[Start] = []
+    tried = sorted((_solve_sides(G, views, R) for R in rotations), key=lambda start: start.rms)
+    best: list[SphereStart] = []
     for start in tried[:_REFINED]:
         for _ in range(6):
             moved = refine_start(G, views, start)
@@ -100,10 +100,10 @@ def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = N
         best.append(start)
     best.sort(key=lambda start: start.rms)
     others = [b.rms for b in best if frames.angle_between(b.T_mount, best[0].T_mount) > _DISTINCT]
-    return Start(best[0].T_mount, best[0].signs, best[0].rms, min(others, default=float("inf")))
+    return SphereStart(best[0].T_mount, best[0].signs, best[0].rms, min(others, default=float("inf")))
 
 
-def _sides(G: Array, views: Sequence[SphereView], R: Array) -> Start:
+def _solve_sides(G: Array, views: Sequence[SphereView], R: Array) -> SphereStart:
     """Translation and centre by linear least squares, then the sides, a few times, for one rotation."""
     signs = np.array([v.side for v in views])
     design = np.concatenate([-G[:, :3, :3], np.broadcast_to(np.eye(3), (len(G), 3, 3))], axis=2).reshape(-1, 6)
@@ -115,7 +115,7 @@ def _sides(G: Array, views: Sequence[SphereView], R: Array) -> Start:
         rms = float(np.sqrt(np.mean((y.ravel() - design @ x) ** 2)))
         T = frames.make(R, x[:3])
         signs = choose_sides(G, views, T, x[3:])
-    return Start(T, signs, rms, np.inf)
+    return SphereStart(T, signs, rms, np.inf)
 
 
 def choose_sides(G: Array, views: Sequence[SphereView], T_mount: Array, centre: Array) -> Array:
@@ -126,10 +126,10 @@ def choose_sides(G: Array, views: Sequence[SphereView], T_mount: Array, centre: 
     return np.where(said != 0, said, found)
 
 
-def refine_start(G: Array, views: Sequence[SphereView], start: Start) -> Start:
+def refine_start(G: Array, views: Sequence[SphereView], start: SphereStart) -> SphereStart:
     """Hand-eye and centre together from the centres with the sides as they stand, then the sides anew."""
     q = centres(views, start.signs)
-    soft = np.array([np.eye(3) - (1 - _trust(v)) * np.outer(v.normal, v.normal) for v in views])
+    soft = np.array([np.eye(3) - (1 - _offset_weight(v)) * np.outer(v.normal, v.normal) for v in views])
 
     def residual(x: Array) -> Array:
         T = G @ start.T_mount @ frames.exp(x[:6])
@@ -139,10 +139,10 @@ def refine_start(G: Array, views: Sequence[SphereView], start: Start) -> Start:
     fit = least_squares(residual, np.concatenate([np.zeros(6), place]), x_scale="jac", max_nfev=30)
     T = start.T_mount @ frames.exp(fit.x[:6])
     signs = choose_sides(G, views, T, fit.x[6:])
-    return Start(T, signs, float(np.sqrt(np.mean(fit.fun**2))), np.inf)
+    return SphereStart(T, signs, float(np.sqrt(np.mean(fit.fun**2))), np.inf)
 
 
-def _trust(view: SphereView) -> float:
+def _offset_weight(view: SphereView) -> float:
     """Weight of the offset √(R² − ρ²): its sigma is ρ/√(R² − ρ²) times that of the radius ρ found."""
     if not view.is_line:
         return 1.0

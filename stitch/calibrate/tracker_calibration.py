@@ -12,7 +12,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from stitch import frames
-from stitch.calibrate.hand_eye_refinement import Refined, refine_axzb
+from stitch.calibrate.hand_eye_refinement import AxzbSolution, refine_axzb
 from stitch.calibrate.hand_eye_report import hand_eye_document, weak_components, weak_notes
 from stitch.closed_form.axxb import park_martin
 from stitch.closed_form.axzb import shah
@@ -33,7 +33,7 @@ _PLACES, _VIEWS_PER_PLACE = 25, 6
 class TrackerCalibration:
     """X (on the flange), Z (in the base) and what is left."""
 
-    fit: Refined  # transforms (X, Z)
+    fit: AxzbSolution  # transforms (X, Z)
     views: tuple[str, ...]
     A: Array  # (V, 4, 4)
     B: Array  # (V, 4, 4)
@@ -61,7 +61,7 @@ def calibrate_tracker(session: Session) -> TrackerCalibration:
     A = np.array([flange[name] for name in measured.views])
     eye_to_hand = session.mount == "eye_to_hand"
     B = measured.T_sensor_probe if eye_to_hand else frames.inverse(measured.T_sensor_probe)
-    fit = refine_axzb(A, B, weights=_weights(measured), robust=True, groups=_neighbourhoods(A))
+    fit = refine_axzb(A, B, weights=_pose_weights(measured), robust=True, groups=_neighbourhoods(A))
     if fit.sigma[0] > _UNRELATED:
         raise NoResultError(
             f"flange poses and frames.csv do not fit together (rotations scatter by {np.degrees(fit.sigma[0]):.0f}°); "
@@ -77,13 +77,13 @@ def _neighbourhoods(A: Array) -> Array | None:
     return np.asarray(kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1])
 
 
-def _weights(measured: MeasuredFrames) -> Array | None:
+def _pose_weights(measured: MeasuredFrames) -> Array | None:
     if measured.sigma is None:
         return None
     return np.asarray((np.median(measured.sigma) / measured.sigma) ** 2)
 
 
-def document_of(result: TrackerCalibration, session: Session) -> dict[str, Any]:
+def tracker_document(result: TrackerCalibration, session: Session) -> dict[str, Any]:
     """The JSON document."""
     fit, h = result.fit, result.hand_eye
     sigma = np.sqrt(np.diag(result.covariance_of(1 - h)))
@@ -96,28 +96,28 @@ def document_of(result: TrackerCalibration, session: Session) -> dict[str, Any]:
         **hand_eye_document("tracker", session, fit.transforms[h], result.covariance_of(h), fit.inflation, result.A),
         "other": other,
         "views": len(result.views),
-        "position_error": _sizes(fit.residual[:, 3:]),
-        "rotation_error_deg": _sizes(np.degrees(fit.residual[:, :3])),
-        "heldout_position_error": _sizes(fit.heldout[:, 3:]),
-        "heldout_rotation_error_deg": _sizes(np.degrees(fit.heldout[:, :3])),
+        "position_error": _error_sizes(fit.residual[:, 3:]),
+        "rotation_error_deg": _error_sizes(np.degrees(fit.residual[:, :3])),
+        "heldout_position_error": _error_sizes(fit.heldout[:, 3:]),
+        "heldout_rotation_error_deg": _error_sizes(np.degrees(fit.heldout[:, :3])),
         "scatter": {"rotation": fit.sigma[0], "translation": fit.sigma[1]},
-        "closed_forms": closed_forms(result),
-        "weak": _weak(result, session.length_unit),
-        "notes": notes_of(result, session),
+        "closed_forms": compare_closed_forms(result),
+        "weak": _weak_phrases(result, session.length_unit),
+        "notes": tracker_notes(result, session),
     }
 
 
-def _sizes(errors: Array) -> dict[str, float]:
+def _error_sizes(errors: Array) -> dict[str, float]:
     length = np.linalg.norm(errors, axis=1)
     return {"mean": float(length.mean()), "rms": float(np.sqrt(np.mean(length**2))), "max": float(length.max())}
 
 
-def _weak(result: TrackerCalibration, unit: str) -> list[str]:
+def _weak_phrases(result: TrackerCalibration, unit: str) -> list[str]:
     lever = float(np.median(np.linalg.norm(result.B[:, :3, 3], axis=1)))
     return weak_components(result.covariance_of(result.hand_eye), result.fit.sigma[1], lever, unit)
 
 
-def closed_forms(result: TrackerCalibration) -> dict[str, dict[str, float]]:
+def compare_closed_forms(result: TrackerCalibration) -> dict[str, dict[str, float]]:
     """How far X of the closed forms is from the refined one: second opinions of other errors."""
     half = len(result.A) // 2
     A = frames.inverse(result.A[:half]) @ result.A[half : 2 * half]
@@ -130,11 +130,11 @@ def closed_forms(result: TrackerCalibration) -> dict[str, dict[str, float]]:
     return out
 
 
-def notes_of(result: TrackerCalibration, session: Session) -> list[str]:
+def tracker_notes(result: TrackerCalibration, session: Session) -> list[str]:
     """Sentences about the wrist, weak components, and errors that base and tool do not explain."""
     unit, fit = session.length_unit, result.fit
-    notes = weak_notes(result.A, _weak(result, unit))
-    position, noise = _sizes(fit.heldout[:, 3:])["mean"], session.scanner.noise
+    notes = weak_notes(result.A, _weak_phrases(result, unit))
+    position, noise = _error_sizes(fit.heldout[:, 3:])["mean"], session.scanner.noise
     if noise is not None and position > _SURE * np.sqrt(3) * noise:
         notes.append(
             f"Base and tool alone leave {position:#.3g} {unit} in the position of views left out (mean), "

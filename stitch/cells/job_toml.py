@@ -13,14 +13,14 @@ from stitch.frames import Array
 from stitch.reading.toml_file import read_toml
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
-SMALLEST, LARGEST = 1e-12, 1e9
+LOWEST_VALUE, HIGHEST_VALUE = 1e-12, 1e9
 
 
-def read_job_file(file: Path, wanted: str, known: set[str], example: str) -> dict[str, Any]:
+def read_job_file(file: Path, expected_format: str, known: set[str], example: str) -> dict[str, Any]:
     """The document of a job file.
 
     Args:
-        wanted: the format it must state, such as "stitch-drill/1".
+        expected_format: the format it must state, such as "stitch-drill/1".
         known: the keys of its top level.
         example: where a job of that format lies.
 
@@ -28,8 +28,8 @@ def read_job_file(file: Path, wanted: str, known: set[str], example: str) -> dic
         InputError: it is missing, not TOML, of another format, or holds an unknown key.
     """
     document = read_toml(file, f"see {example} for how it looks")
-    if document.get("format") != wanted:
-        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{wanted}"')
+    if document.get("format") != expected_format:
+        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{expected_format}"')
     check_keys(file, "", document, known)
     return document
 
@@ -80,9 +80,9 @@ def finite(file: Path, place: str, value: Any, positive: bool = False) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{file}: {place} is {value!r}; write a finite number")
-    if abs(value) > LARGEST:
+    if abs(value) > HIGHEST_VALUE:
         raise InputError(f"{file}: {place} is {value!r}; nothing in a cell is that large")
-    if positive and value < SMALLEST:
+    if positive and value < LOWEST_VALUE:
         raise InputError(f"{file}: {place} is {value!r}; it must be above zero")
     return float(value)
 
@@ -110,7 +110,7 @@ def _flat(file: Path, place: str, value: Any, shape: tuple[int, ...], form: str)
     return [entry for part in value for entry in _flat(file, place, part, shape[1:], form)]
 
 
-def file_beside(file: Path, place: str, value: Any) -> Path:
+def resolve_file(file: Path, place: str, value: Any) -> Path:
     """A file that a job names relative to itself.
 
     Raises:

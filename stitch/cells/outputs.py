@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from stitch.errors import InputError
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 
 JobFile = Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
@@ -25,17 +25,17 @@ SessionOption = Annotated[
 ]
 
 
-def draw(command: str, folder: Path, *found: Any) -> list[str]:
-    """Write the pictures of a command's job and result (`found`) into its folder; returns the files' names.
+def write_pictures(command: str, folder: Path, *results: Any) -> list[str]:
+    """Write the pictures of a command's job and result (`results`) into its folder; returns the files' names.
 
     They come from whoever offers them under the entry point `stitch.cell_pictures`, by the command's name.
     """
     offered = entry_points(group="stitch.cell_pictures", name=command)
-    return [name for writer in offered for name in writer.load()(*found, folder)]
+    return [name for writer in offered for name in writer.load()(*results, folder)]
 
 
-def show(command: str, recording: Path | None, report: Path | None, *found: Any) -> None:
-    """Write recording and page of a command's job and result (`found`), each whole or not at all.
+def write_recording_and_page(command: str, recording: Path | None, report: Path | None, *results: Any) -> None:
+    """Write recording and page of a command's job and result (`results`), each whole or not at all.
 
     Raises:
         InputError: nobody offers one for this command, or its folder does not exist.
@@ -48,6 +48,6 @@ def show(command: str, recording: Path | None, report: Path | None, *found: Any)
             raise InputError(f"{path}: no writer for `stitch {command}` is installed; install stitch anew")
         if not path.parent.is_dir():
             raise InputError(f"{path}: its folder does not exist; make it first")
-        with whole(path) as scratch:
+        with whole_file(path) as scratch:
             for writer in offered:
-                writer.load()(*found, scratch)
+                writer.load()(*results, scratch)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from stitch.frames import Array
-from stitch.writing.session_files import Columns
+from stitch.writing.session_files import TableColumns
 
 
-def points_table(views: Sequence[str], targets: Sequence[str], places: Array, sigma: Array | None) -> Columns:
+def points_table(views: Sequence[str], targets: Sequence[str], places: Array, sigma: Array | None) -> TableColumns:
     """Columns view, target, x, y, z and, where it is known, sigma.
 
     Args:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import Force, Json
-from stitch.cli.terminal.streams import results_alone
+from stitch.cli.terminal.streams import stdout_for_results
 from stitch.errors import InputError
 
 calibrate = typer.Typer(
@@ -19,7 +19,7 @@ _SESSION = Annotated[Path, typer.Argument(metavar="SESSION", help="Session folde
 
 
 @calibrate.command()
-@results_alone
+@stdout_for_results
 def sphere(
     session: _SESSION,
     radius_free: Annotated[bool, typer.Option("--radius-free", help="Fit the sphere's radius too.")] = False,
@@ -36,13 +36,13 @@ def sphere(
     if output is not None and output.exists() and output.suffix != ".json":
         raise InputError(f"{output}: exists and is no JSON file; name another, or remove it")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.calibrated_cell import calibrated_by_sphere
+    from stitch.cli.actions.calibrated_cell import calibrate_by_sphere
 
-    calibrated_by_sphere(session, radius_free, output, as_json)
+    calibrate_by_sphere(session, radius_free, output, as_json)
 
 
 @calibrate.command()
-@results_alone
+@stdout_for_results
 def tracker(session: _SESSION, as_json: Json = False) -> None:
     """Base and tool from frames.csv: a tracker and its 6D probe, or a camera and its board.
 
@@ -51,13 +51,13 @@ def tracker(session: _SESSION, as_json: Json = False) -> None:
       stitch calibrate tracker probe-session --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.calibrated_cell import calibrated_by_tracker
+    from stitch.cli.actions.calibrated_cell import calibrate_by_tracker
 
-    calibrated_by_tracker(session, as_json)
+    calibrate_by_tracker(session, as_json)
 
 
 @calibrate.command()
-@results_alone
+@stdout_for_results
 def robot(
     session: _SESSION,
     output: Annotated[
@@ -74,6 +74,6 @@ def robot(
       stitch calibrate robot reflector-session -o runs/arm
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.calibrated_cell import calibrated_arm
+    from stitch.cli.actions.calibrated_cell import calibrate_arm
 
-    calibrated_arm(session, output, force=force, at_most=at_most, as_json=as_json)
+    calibrate_arm(session, output, force=force, at_most=at_most, as_json=as_json)

@@ -34,13 +34,13 @@ def add(
     if bool(effects) + suggested + group != 1:
         raise InputError("add what? to fix: name the effects, or let --suggested or --group choose; one of the three")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.changed_run import add_chosen, add_named
+    from stitch.cli.actions.changed_run import add_diagnosed, add_effects
 
     if effects:
-        add_named(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
+        add_effects(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
     else:
         limit = at_most if suggested else None
-        add_chosen(run, limit, effects_file, trust=trust, recording=recording, as_json=as_json)
+        add_diagnosed(run, limit, effects_file, trust=trust, recording=recording, as_json=as_json)
 
 
 def drop(
@@ -57,6 +57,6 @@ def drop(
     Examples:
       stitch drop runs/blade-17 backlash
     """
-    from stitch.cli.actions.changed_run import drop_named
+    from stitch.cli.actions.changed_run import drop_effects
 
-    drop_named(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
+    drop_effects(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)

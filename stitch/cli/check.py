@@ -23,9 +23,9 @@ def check(
       stitch check --deep blade-17 --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.checked_sessions import checked, deeply_checked
+    from stitch.cli.actions.checked_sessions import check_deeply, check_sessions
 
     if deep:
-        deeply_checked(sessions, as_json)
+        check_deeply(sessions, as_json)
     else:
-        checked(sessions, as_json)
+        check_sessions(sessions, as_json)

@@ -6,10 +6,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 
-def help_of(entry: EntryPoint) -> str | None:
+def command_help(entry: EntryPoint) -> str | None:
     """The docstring of the function behind an entry, or the `help` of a group of commands; None where it is neither."""
     try:
-        nodes = ast.parse(_source(entry.module)).body
+        nodes = ast.parse(_module_source(entry.module)).body
     except (OSError, SyntaxError, ValueError):
         return None
     for node in nodes:
@@ -22,7 +22,7 @@ def help_of(entry: EntryPoint) -> str | None:
     return None
 
 
-def _source(module: str) -> str:
+def _module_source(module: str) -> str:
     """Source of a module; the packages above it are not imported."""
     top, *inner = module.split(".")
     spec = find_spec(top)

@@ -11,11 +11,11 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from stitch.cli.command_help import help_of
-from stitch.cli.terminal.streams import results_alone
+from stitch.cli.command_help import command_help
+from stitch.cli.terminal.streams import stdout_for_results
 
 GROUP = "stitch.commands"
-_OWN = {
+_OWN_COMMANDS = {
     "init": "stitch.cli.init:init",
     "detect": "stitch.cli.detect:detect",
     "run": "stitch.cli.run:run",
@@ -42,10 +42,10 @@ class Commands(MutableMapping[str, Any]):
     """Name to command, loaded at first use."""
 
     def __init__(self) -> None:
-        own = [EntryPoint(name, place, GROUP) for name, place in _OWN.items()]
+        own = [EntryPoint(name, place, GROUP) for name, place in _OWN_COMMANDS.items()]
         added = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
         self._entries = {entry.name: entry for entry in (*own, *added)}
-        self._load = cache(_loaded)
+        self._load = cache(_load_command)
 
     def __getitem__(self, name: str) -> Any:
         return self._load(self._entries[name])
@@ -64,16 +64,16 @@ class Commands(MutableMapping[str, Any]):
 
     def unloaded(self) -> dict[str, TyperCommand]:
         """All of them by name with what they are for, as a list shows them; only what does not say so is loaded."""
-        told = {name: help_of(entry) for name, entry in self._entries.items()}
+        told = {name: command_help(entry) for name, entry in self._entries.items()}
         return {name: TyperCommand(name, help=text) if text else self[name] for name, text in told.items()}
 
 
-def _loaded(entry: EntryPoint) -> Any:
+def _load_command(entry: EntryPoint) -> Any:
     """The command behind an entry; a `typer.Typer` is a group of commands."""
     found = entry.load()
     if not isinstance(found, typer.Typer):
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-        alone.command(entry.name)(results_alone(found) if entry.value in _OWN.values() else found)
+        alone.command(entry.name)(stdout_for_results(found) if entry.value in _OWN_COMMANDS.values() else found)
         found = alone
     command = typer.main.get_command(found)
     command.name = entry.name

@@ -19,6 +19,6 @@ def compare_run(
       stitch compare runs/blade-17 --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.compared_run import compared_run
+    from stitch.cli.actions.compared_run import run_compare
 
-    compared_run(run, effects_file, trust=trust, as_json=as_json)
+    run_compare(run, effects_file, trust=trust, as_json=as_json)

@@ -27,6 +27,6 @@ def detect(
       stitch detect calibration --ball any
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.detected_targets import detected_targets
+    from stitch.cli.actions.detected_targets import run_detect
 
-    detected_targets(session, board, ball, output, as_json)
+    run_detect(session, board, ball, output, as_json)

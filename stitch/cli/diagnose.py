@@ -17,9 +17,9 @@ def diagnose_run(
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.diagnosed_run import diagnosed_run
+    from stitch.cli.actions.diagnosed_run import run_diagnose
 
-    diagnosed_run(run, effects_file, trust=trust, as_json=as_json)
+    run_diagnose(run, effects_file, trust=trust, as_json=as_json)
 
 
 def next_measurement(
@@ -34,6 +34,6 @@ def next_measurement(
     Examples:
       stitch next runs/blade-17
     """
-    from stitch.cli.actions.diagnosed_run import next_for_run
+    from stitch.cli.actions.diagnosed_run import run_next
 
-    next_for_run(run, effects_file, trust=trust, as_json=as_json)
+    run_next(run, effects_file, trust=trust, as_json=as_json)

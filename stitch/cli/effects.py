@@ -21,6 +21,6 @@ def effects(
       stitch effects --effects-file mine.py --json
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.listed_effects import listed_effects
+    from stitch.cli.actions.listed_effects import run_effects
 
-    listed_effects(name, effects_file, as_json)
+    run_effects(name, effects_file, as_json)

@@ -33,6 +33,6 @@ def explain_run(
     if output is not None and not output.parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}; to fix: make it, or name another")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.explained_run import explained_run
+    from stitch.cli.actions.explained_run import run_explain
 
-    explained_run(run, output, effects_file, trust=trust, as_json=as_json)
+    run_explain(run, output, effects_file, trust=trust, as_json=as_json)

@@ -60,20 +60,20 @@ def export_run(
       stitch export runs/blade-17 --to glb -o blade.glb
       stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
     """
-    _require(to, program, output)
+    _require_export_options(to, program, output)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.exported_program import exported_program
-    from stitch.cli.actions.exported_run import exported_run
-    from stitch.export.arm_model import arm_of
+    from stitch.cli.actions.exported_program import export_program
+    from stitch.cli.actions.exported_run import export_result
+    from stitch.export.arm_model import arm_of_run
 
     if program is not None:
-        arm = arm_of(run, effects_file, trust)
-        exported_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
+        arm = arm_of_run(run, effects_file, trust)
+        export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
     else:
-        exported_run(run, str(to), output, parent, child, effects_file, trust=trust)
+        export_result(run, str(to), output, parent, child, effects_file, trust=trust)
 
 
-def _require(to: str | None, program: Path | None, output: Path | None) -> None:
+def _require_export_options(to: str | None, program: Path | None, output: Path | None) -> None:
     """Refuse neither or both of format and program, a format that is none, and a file that has no place."""
     if (to is None) == (program is None):
         raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")

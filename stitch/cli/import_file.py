@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import names_in, require_new
+from stitch.cli.options import require_new, split_names
 
 _File = Annotated[
     Path,
@@ -57,8 +57,8 @@ def import_command(
     """
     require_new(output)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.imported_points import imported_points
+    from stitch.cli.actions.imported_points import run_import
     from stitch.intake.stated import StatedTable
 
-    stated = StatedTable(names_in(columns), rotation, angles, length_unit=file_unit, inverse=inverse or None)
-    imported_points(file, output, unit, stated, frame=frame, tool=tool)
+    stated = StatedTable(split_names(columns), rotation, angles, length_unit=file_unit, inverse=inverse or None)
+    run_import(file, output, unit, stated, frame=frame, tool=tool)

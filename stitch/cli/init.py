@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import names_in
+from stitch.cli.options import split_names
 from stitch.cli.target_options import BallOption, BoardOption
 
 _Folder = Annotated[
@@ -65,12 +65,12 @@ def init(
       stitch init drive.mcap --topic /points
     """
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.first_folder import first_folder
-    from stitch.cli.actions.looked_for import looked_for
+    from stitch.cli.actions.first_folder import run_init
+    from stitch.cli.actions.looked_for import parse_target_options
     from stitch.intake.stated import StatedFolder
 
     stated = StatedFolder(
-        names_in(columns),
+        split_names(columns),
         rotation,
         angles,
         length_unit=unit,
@@ -78,6 +78,6 @@ def init(
         poses=poses,
         cloud_unit=cloud_unit,
         mount=mount,
-        targets=looked_for(board, ball),
+        targets=parse_target_options(board, ball),
     )
-    first_folder(folder, output, stated, topic=topic, frames=frames, yes=yes, as_json=as_json)
+    run_init(folder, output, stated, topic=topic, frames=frames, yes=yes, as_json=as_json)

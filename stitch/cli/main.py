@@ -34,8 +34,8 @@ _FIXES = {
 }
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         print(f"stitch {version('stitch')}")
         raise typer.Exit
 
@@ -54,7 +54,7 @@ def build() -> typer.Typer:
 
 
 def _options(
-    asked: Annotated[
+    show_version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             finally:
                 live_line().stop()
     except StitchError as error:
-        _end(str(error), error.exit_code)
+        _exit_with_message(str(error), error.exit_code)
     except BrokenPipeError:
         # Whoever read the output has seen enough; nothing must be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -80,14 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         fix = _FIXES.get(error.errno or 0, "")
         place = shortened(error.filename, 200).strip("'") if error.filename else "file system"
-        _end(f"{place}: {error.strerror or error}{fix}", 2)
+        _exit_with_message(f"{place}: {error.strerror or error}{fix}", 2)
     except MemoryError:
-        _end("not enough memory; leave out views, or thin the scans", 1)
+        _exit_with_message("not enough memory; leave out views, or thin the scans", 1)
     except Exception as error:
-        _end(_unexpected(error), 1)
+        _exit_with_message(_unexpected_message(error), 1)
 
 
-def _end(message: str, code: int) -> None:
+def _exit_with_message(message: str, code: int) -> None:
     """One line on standard error, and the end of the process."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     print(f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}", file=sys.stderr, flush=True)
@@ -97,7 +97,7 @@ def _end(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def _unexpected(error: Exception) -> str:
+def _unexpected_message(error: Exception) -> str:
     """A fault of the program in one line; the environment variable STITCH_TRACEBACK shows all of it."""
     if os.environ.get("STITCH_TRACEBACK"):
         traceback.print_exception(error)

@@ -34,9 +34,9 @@ def note(
     # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.stored.run_documents import read_ledger
     from stitch.writing.json_file import to_json, write_json
-    from stitch.writing.run_folder import held
+    from stitch.writing.run_folder import lock_run_folder
 
-    with held(run):
+    with lock_run_folder(run):
         steps = read_ledger(run)
         at = len(steps) - 1 if step is None else step
         if not 0 <= at < len(steps):

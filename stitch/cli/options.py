@@ -24,7 +24,7 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `sti
 Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone on standard output.")]
 
 
-def names_in(text: str | None) -> tuple[str, ...]:
+def split_names(text: str | None) -> tuple[str, ...]:
     """What a list with commas names, empty places too."""
     return tuple(name.strip() for name in text.split(",")) if text else ()
 

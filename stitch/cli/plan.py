@@ -60,15 +60,15 @@ def plan_views(
       stitch plan blade-18 --part blade.stl --split joint_compliance gear_eccentricity -o more
       stitch plan runs/blade-17 --halve
     """
-    _require(views, size, field, output)
+    _require_plan_options(views, size, field, output)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.planned_views import Asked, StatedCell, planned_views
+    from stitch.cli.actions.planned_views import PlanOptions, StatedCell, run_plan
 
     stated = StatedCell(part, size, field, start)
-    planned_views(folder, Asked(views, split, halve, feature), stated, output, trust=trust, as_json=as_json)
+    run_plan(folder, PlanOptions(views, split, halve, feature), stated, output, trust=trust, as_json=as_json)
 
 
-def _require(views: int | None, size: float | None, field: float | None, output: Path | None) -> None:
+def _require_plan_options(views: int | None, size: float | None, field: float | None, output: Path | None) -> None:
     if views is not None and not 0 < views <= 40:
         raise InputError(f"--views {views}: to fix: give a number from 1 to 40")
     if size is not None and not 0 < size < 1e6:

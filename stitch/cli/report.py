@@ -46,9 +46,9 @@ def report(
         flag = "--diagnosis" if with_diagnosis else "--no-diagnosis"
         raise InputError(f"{flag}: of two runs nothing is diagnosed; to fix: leave {flag} away")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.written_pages import page_of_one, page_of_two
+    from stitch.cli.actions.written_pages import write_run_page, write_two_run_page
 
     if other is None:
-        page_of_one(run, with_diagnosis is not False, tolerance, printer, effects_file, trust)
+        write_run_page(run, with_diagnosis is not False, tolerance, printer, effects_file, trust)
     else:
-        page_of_two(run, other, output, tolerance, printer, effects_file, trust)
+        write_two_run_page(run, other, output, tolerance, printer, effects_file, trust)

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from stitch.cli.options import EffectsFile, Force, Json, Memory, Tolerance, Trust, bytes_of, names_in, require_tolerance
+from stitch.cli.options import (
+    EffectsFile,
+    Force,
+    Json,
+    Memory,
+    Tolerance,
+    Trust,
+    bytes_of,
+    require_tolerance,
+    split_names,
+)
 from stitch.cli.run_options import ModelOptions, RunOptions
 
 _Sessions = Annotated[
@@ -63,7 +73,7 @@ def run(
     # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.cli.actions.run_sessions import run_sessions
 
-    named = tuple(name for name in names_in(effects) if name)
+    named = tuple(name for name in split_names(effects) if name)
     options = RunOptions(
         output=output,
         model=ModelOptions(hand_eye, arm, named, effects_file=effects_file, trust=trust),

@@ -35,11 +35,9 @@ def watch(
     folders = cells[:1] if add else cells
     _require_sense(add, runs, at, in_use, dfq, folders)
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.watched_cells import watched_cells
+    from stitch.cli.actions.watched_cells import run_watch
 
-    watched_cells(
-        folders, runs, add=add, at=at, in_use=in_use, tolerance=tolerance, page=page, dfq=dfq, as_json=as_json
-    )
+    run_watch(folders, runs, add=add, at=at, in_use=in_use, tolerance=tolerance, page=page, dfq=dfq, as_json=as_json)
 
 
 def _require_sense(

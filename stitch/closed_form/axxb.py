@@ -13,10 +13,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.closed_form.axxb_simultaneous import andreff, daniilidis
-from stitch.closed_form.relative_motions import matched_rotations, require_motion, roots, translation
+from stitch.closed_form.relative_motions import hand_eye_translation, matched_rotations, require_motion, weight_roots
 from stitch.frames import Array, skew
 
-__all__ = ["SOLVERS", "andreff", "daniilidis", "horaud_dornaika", "park_martin", "tsai_lenz"]
+__all__ = ["AXXB_SOLVERS", "andreff", "daniilidis", "horaud_dornaika", "park_martin", "tsai_lenz"]
 
 
 def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
@@ -30,8 +30,8 @@ def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
     """
     require_motion(A)
     alpha, beta, _ = matched_rotations(A, B)
-    R = frames.nearest_rotation((roots(A, weights)[:, None] ** 2 * alpha).T @ beta)
-    return frames.make(R, translation(A, B, R, weights))
+    R = frames.nearest_rotation((weight_roots(A, weights)[:, None] ** 2 * alpha).T @ beta)
+    return frames.make(R, hand_eye_translation(A, B, R, weights))
 
 
 def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
@@ -47,7 +47,7 @@ def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
         return np.asarray(2 * np.sin(angle / 2) * rotation / np.maximum(angle, 1e-12))
 
     alpha, beta, _ = matched_rotations(A, B)
-    root = roots(A, weights)[:, None]
+    root = weight_roots(A, weights)[:, None]
     pa, pb = root * rodrigues(alpha), root * rodrigues(beta)
     flips = [np.eye(3), *(np.diag(d) for d in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1]))]
     condition = [np.linalg.svd(skew(pa + pb @ flip).reshape(-1, 3), compute_uv=False)[-1] for flip in flips]
@@ -58,7 +58,7 @@ def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
     P = 2 * half / np.sqrt(1 + half @ half)
     R = (1 - P @ P / 2) * np.eye(3) + 0.5 * (np.outer(P, P) + np.sqrt(4 - P @ P) * skew(P))
     R = R @ flip
-    return frames.make(R, translation(A, B, R, weights))
+    return frames.make(R, hand_eye_translation(A, B, R, weights))
 
 
 def horaud_dornaika(A: Array, B: Array, weights: Array | None = None) -> Array:
@@ -66,29 +66,29 @@ def horaud_dornaika(A: Array, B: Array, weights: Array | None = None) -> Array:
     require_motion(A)
     na, nb, _ = matched_rotations(A, B)
     K = np.zeros((4, 4))
-    for a, b, root in zip(na, nb, roots(A, weights), strict=True):
-        D = root * (_left(a) - _right(b))
+    for a, b, root in zip(na, nb, weight_roots(A, weights), strict=True):
+        D = root * (_left_product(a) - _right_product(b))
         K += D.T @ D
     q = np.linalg.eigh(K)[1][:, 0]
     R = frames.from_quaternion(np.zeros(3), np.append(q[1:], q[0]))[:3, :3]
-    return frames.make(R, translation(A, B, R, weights))
+    return frames.make(R, hand_eye_translation(A, B, R, weights))
 
 
-def _left(v: Array) -> Array:
+def _left_product(v: Array) -> Array:
     """Matrix of the product (0, v)·q for q = (w, x, y, z)."""
     out = np.zeros((4, 4))
     out[0, 1:], out[1:, 0], out[1:, 1:] = -v, v, skew(v)
     return out
 
 
-def _right(v: Array) -> Array:
+def _right_product(v: Array) -> Array:
     """Matrix of the product q·(0, v)."""
     out = np.zeros((4, 4))
     out[0, 1:], out[1:, 0], out[1:, 1:] = -v, v, -skew(v)
     return out
 
 
-SOLVERS: dict[str, Callable[..., Array]] = {
+AXXB_SOLVERS: dict[str, Callable[..., Array]] = {
     "Tsai-Lenz": tsai_lenz,
     "Park-Martin": park_martin,
     "Horaud-Dornaika": horaud_dornaika,

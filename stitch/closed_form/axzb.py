@@ -9,7 +9,7 @@ X = T_flange_camera, Z = T_base_board, B = T_camera_board inverted, T_board_came
 import numpy as np
 
 from stitch import frames
-from stitch.closed_form.relative_motions import from_first, require_motion, roots, solve_translation
+from stitch.closed_form.relative_motions import motions_from_first, require_motion, solve_translation, weight_roots
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -24,7 +24,7 @@ def require_poses(A: Array) -> None:
         raise NoResultError(
             f"{len(A)} poses cannot show the base and the tool; measure three or more, turned both ways"
         )
-    require_motion(from_first(A))
+    require_motion(motions_from_first(A))
 
 
 def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
@@ -41,7 +41,7 @@ def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array
     require_poses(A)
     Ra, Rb = A[:, :3, :3], B[:, :3, :3]
     # Row-major vec: vec(RaᵀZ Rb) = (Raᵀ ⊗ Rbᵀ) vec Z.
-    K = np.einsum("v,vji,vlk->ikjl", roots(A, weights) ** 2, Ra, Rb).reshape(9, 9)
+    K = np.einsum("v,vji,vlk->ikjl", weight_roots(A, weights) ** 2, Ra, Rb).reshape(9, 9)
     U, _, Vt = np.linalg.svd(K)
     x, z = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)
     sign = np.sign(np.linalg.det(x))

@@ -18,7 +18,7 @@ from stitch.frames import Array, Indices
 
 _BINS = 11
 _NEIGHBOURS = 100
-_SMALLEST_SAMPLE = 3
+_MIN_SAMPLE = 3
 # Edges of a triple that differ by more than a tenth between the surfaces are no rigid copy.
 _EDGE_RATIO = 0.9
 _ICP_STEPS = 30
@@ -36,7 +36,7 @@ class FeaturedSurface:
     tree: Any  # pykdtree KDTree over `points`
 
 
-def thin(points: Array, normals: Array, size: float) -> tuple[Array, Array]:
+def voxel_downsample(points: Array, normals: Array, size: float) -> tuple[Array, Array]:
     """Mean point (M, 3) and unit mean normal (M, 3) of every voxel of edge `size` that holds points."""
     _, voxel = np.unique(np.floor((points - points.min(axis=0)) / size).astype(int), axis=0, return_inverse=True)
     voxel = voxel.ravel()
@@ -48,7 +48,7 @@ def thin(points: Array, normals: Array, size: float) -> tuple[Array, Array]:
     return mean(points), _unit(mean(normals))
 
 
-def describe(points: Array, normals: Array, radius: float) -> FeaturedSurface:
+def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurface:
     """Feature histograms of points (N, 3) with unit normals (N, 3) from up to 99 neighbours within `radius`."""
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points)
@@ -62,7 +62,7 @@ def describe(points: Array, normals: Array, radius: float) -> FeaturedSurface:
     return FeaturedSurface(points, normals, _normalised(simple) + _normalised(around), tree)
 
 
-def register(source: FeaturedSurface, target: FeaturedSurface, reach: float, draws: int, seed: int = 0) -> Array:
+def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: float, draws: int, seed: int = 0) -> Array:
     """Motion (4, 4) that maps `source` onto `target` by RANSAC over feature partners (Fischler & Bolles 1981).
 
     Args:
@@ -74,15 +74,15 @@ def register(source: FeaturedSurface, target: FeaturedSurface, reach: float, dra
     """
     own, other = _partners(source.histograms, target.histograms)
     a, b = source.points[own], target.points[other]
-    triples = np.random.default_rng(seed).integers(len(a), size=(draws, _SMALLEST_SAMPLE))
+    triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
     triples = triples[_same_shape(a[triples], b[triples])]
     T = _least_squares_motions(a[triples], b[triples])
     moved = a[triples] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
     T = T[np.linalg.norm(moved - b[triples], axis=2).max(axis=1, initial=0.0) < reach]
-    return np.asarray(T[np.argmin(_costs(T, a, b, reach))]) if len(T) else np.eye(4)
+    return np.asarray(T[np.argmin(_msac_costs(T, a, b, reach))]) if len(T) else np.eye(4)
 
 
-def align(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach: float) -> Array:
+def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach: float) -> Array:
     """Motion (4, 4) after point-to-plane ICP from `T` (Chen & Medioni 1992); partners lie within `reach`."""
     for _ in range(_ICP_STEPS):
         moved = frames.transform(T, source.points)
@@ -141,7 +141,7 @@ def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
     forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
     own = np.arange(len(a))
     mutual = back[forth] == own
-    return (own[mutual], forth[mutual]) if mutual.sum() >= 3 * _SMALLEST_SAMPLE else (own, forth)
+    return (own[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (own, forth)
 
 
 def _same_shape(a: Array, b: Array) -> NDArray[np.bool_]:
@@ -161,7 +161,7 @@ def _least_squares_motions(a: Array, b: Array) -> Array:
     return T
 
 
-def _costs(T: Array, a: Array, b: Array, reach: float) -> Array:
+def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:
     """Sum of squared distances, truncated at `reach`, under each motion (K,): MSAC, Torr & Zisserman 2000."""
     costs = []
     for block in np.array_split(T, len(T) // _BLOCK + 1):

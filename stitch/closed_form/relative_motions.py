@@ -51,24 +51,24 @@ def require_motion(A: Array) -> None:
         )
 
 
-def from_first(G: Array) -> Array:
+def motions_from_first(G: Array) -> Array:
     """Motions (V − 1, 4, 4) from the first of the poses (V, 4, 4) to each of the others."""
     return frames.inverse(G[:1]) @ G[1:]
 
 
-def roots(A: Array, weights: Array | None) -> Array:
+def weight_roots(A: Array, weights: Array | None) -> Array:
     """Square roots (M,) of the weights of the motions, ones without weights."""
     return np.ones(len(A)) if weights is None else np.sqrt(np.asarray(weights, float))
 
 
-def translation(A: Array, B: Array, R: Array, weights: Array | None = None) -> Array:
+def hand_eye_translation(A: Array, B: Array, R: Array, weights: Array | None = None) -> Array:
     """t (3,) of X from (R_A − 1) t = R t_B − t_A, weighted least squares over all motions."""
     return solve_translation(A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3], weights)
 
 
 def solve_translation(left: Array, right: Array, weights: Array | None = None) -> Array:
     """t (K,) of left (M, 3, K) · t = right (M, 3), weighted least squares."""
-    root = roots(left, weights)[:, None]
+    root = weight_roots(left, weights)[:, None]
     rows = (root[..., None] * left).reshape(right.size, -1)
     return np.asarray(np.linalg.lstsq(rows, (root * right).ravel(), rcond=None)[0])
 
@@ -128,7 +128,7 @@ def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
 def _misfit(A: Array, B: Array, R: Array) -> float:
     """Σ|R_A R − R R_B|² + Σ|(R_A − 1)t − R t_B + t_A|² in units of the motions' size: free of branches."""
     rotation = A[:, :3, :3] @ R - R @ B[:, :3, :3]
-    t = translation(A, B, R)
+    t = hand_eye_translation(A, B, R)
     shift = (A[:, :3, :3] - np.eye(3)) @ t - B[:, :3, 3] @ R.T + A[:, :3, 3]
     unit = float(np.abs(np.concatenate([A[:, :3, 3], B[:, :3, 3]])).max()) or 1.0
     return float((rotation**2).sum() + (shift**2).sum() / unit**2)

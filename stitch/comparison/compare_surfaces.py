@@ -10,15 +10,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.comparison.table import Table, table_of
-from stitch.comparison.tables import PLACE, Comparison, binned, changes, values_of_views, view_properties
-from stitch.comparison.view_scatter import Statistics, view_statistics
+from stitch.comparison.table import ResidualTable, table_of
+from stitch.comparison.tables import (
+    PLACE,
+    ResidualTables,
+    equal_count_bins,
+    property_varies,
+    values_of_views,
+    view_properties,
+)
+from stitch.comparison.view_scatter import BinStatistics, view_statistics
 from stitch.frames import Array, Indices
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.observations.surfaces.gram import RMS_GATE
-from stitch.observations.surfaces.match import Match, sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
-from stitch.runs.state import State
+from stitch.observations.surfaces.match import Match, sample_points
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect_overlaps
+from stitch.runs.state import RunState
 from stitch.system.threads import library_threads_off
 
 # Correspondences of a view in a bin that make a sample.
@@ -26,22 +33,24 @@ _ENOUGH = 30
 _PLACES = 4  # cells along each axis of the part
 
 
-def compare(state: State) -> Comparison:
+def compare_surfaces(state: RunState) -> ResidualTables:
     """Tables of the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate, place.
 
     Raises:
         NoResultError: no two views overlap.
     """
     with library_threads_off():
-        own = corrected(state.measurement, state.model)
+        own = corrected_capture(state.measurement, state.model)
         poses = own.poses(state.model.T_mount)
-        overlaps = collect(own, poses, state.gate, [sample(s, FINE_SAMPLES) for s in own.scans])
-    rows = _Rows(state, poses, overlaps.matches, overlaps.gram.scale)
+        overlaps = collect_overlaps(own, poses, state.gate, [sample_points(s, FINE_SAMPLES) for s in own.scans])
+    rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
-    tables = [_views(rows, names), _pairs(rows, names)]
-    tables += [_binned(rows, name, unit, values) for name, unit, values in _properties(state, rows)]
+    tables = [_view_table(rows, names), _pair_table(rows, names)]
+    tables += [
+        _property_table(rows, name, unit, values) for name, unit, values in _correspondence_properties(state, rows)
+    ]
     tables.append(_regions(rows))
-    return Comparison(
+    return ResidualTables(
         tables=tuple(t for t in tables if len(t.count) > (0 if t.label else 1)),
         rms=overlaps.gram.rms,
         scale=overlaps.gram.scale,
@@ -50,10 +59,10 @@ def compare(state: State) -> Comparison:
     )
 
 
-class _Rows:
+class _CorrespondenceRows:
     """Both sides of every correspondence inside the robust gate."""
 
-    def __init__(self, state: State, poses: Array, matches: Sequence[Match], scale: float) -> None:
+    def __init__(self, state: RunState, poses: Array, matches: Sequence[Match], scale: float) -> None:
         self.count = len(poses)
         parts: list[list[Array]] = [[], [], [], [], [], []]
         for m in matches:
@@ -78,29 +87,29 @@ class _Rows:
         )
 
 
-def _statistics(rows: _Rows, bins: Indices, size: int) -> Statistics:
+def _bin_statistics(rows: _CorrespondenceRows, bins: Indices, size: int) -> BinStatistics:
     n, s, q = (x.sum(axis=2) for x in rows.sums(bins, size))  # (B, V)
     return view_statistics(n, s, q, _ENOUGH)
 
 
-def _labelled(rows: _Rows, name: str, bins: Indices, labels: Sequence[str]) -> Table:
+def _labelled_table(rows: _CorrespondenceRows, name: str, bins: Indices, labels: Sequence[str]) -> ResidualTable:
     number = np.arange(len(labels), dtype=float)
-    return table_of(name, "", (number, number), tuple(labels), _statistics(rows, bins, len(labels)))
+    return table_of(name, "", (number, number), tuple(labels), _bin_statistics(rows, bins, len(labels)))
 
 
-def _views(rows: _Rows, names: Sequence[str]) -> Table:
+def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     """One sample each: how well its own mean is known nothing says."""
-    table = _labelled(rows, "view", rows.view, names)
+    table = _labelled_table(rows, "view", rows.view, names)
     nothing = np.full(len(names), np.nan)
     return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
 
 
-def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
+def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
     v, w = np.nonzero(np.triu(n, 1))
     count, mean, square = n[v, w], s[v, w], q[v, w]
     nothing, number = np.full(len(v), np.nan), np.arange(len(v), dtype=float)
-    return Table(
+    return ResidualTable(
         name="pair",
         unit="",
         low=number,
@@ -116,7 +125,7 @@ def _pairs(rows: _Rows, names: Sequence[str]) -> Table:
     )
 
 
-def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
+def _correspondence_properties(state: RunState, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     views, unit = state.measurement.views, state.session.length_unit
     x, y, z = rows.points.T
@@ -127,15 +136,17 @@ def _properties(state: State, rows: _Rows) -> list[tuple[str, str, Array]]:
         ("field b = y/z", "", y / z),
         ("field ρ", "", np.hypot(x, y) / z),
     ]
-    return out + [(name, u, values[rows.view]) for name, u, values in view_properties(views) if changes(name, values)]
+    return out + [
+        (name, u, values[rows.view]) for name, u, values in view_properties(views) if property_varies(name, values)
+    ]
 
 
-def _binned(rows: _Rows, name: str, unit: str, values: Array) -> Table:
-    edges, bins = binned(values)
-    return table_of(name, unit, (edges[:-1], edges[1:]), (), _statistics(rows, bins, len(edges) - 1))
+def _property_table(rows: _CorrespondenceRows, name: str, unit: str, values: Array) -> ResidualTable:
+    edges, bins = equal_count_bins(values)
+    return table_of(name, unit, (edges[:-1], edges[1:]), (), _bin_statistics(rows, bins, len(edges) - 1))
 
 
-def _regions(rows: _Rows) -> Table:
+def _regions(rows: _CorrespondenceRows) -> ResidualTable:
     """Cells of the part along the axes of the reference frame."""
     low, high = np.quantile(rows.place, [0.005, 0.995], axis=0)
     cell = np.clip(((rows.place - low) / np.maximum(high - low, 1e-12) * _PLACES).astype(np.int64), 0, _PLACES - 1)
@@ -143,4 +154,4 @@ def _regions(rows: _Rows) -> Table:
     used, bins = np.unique(bins, return_inverse=True)
     centre = [low + (np.array(np.unravel_index(b, (_PLACES,) * 3)) + 0.5) / _PLACES * (high - low) for b in used]
     labels = [f"({c[0]:.4g}, {c[1]:.4g}, {c[2]:.4g})" for c in centre]
-    return _labelled(rows, PLACE, bins.astype(np.int64), labels)
+    return _labelled_table(rows, PLACE, bins.astype(np.int64), labels)

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.table import Table, table_of
-from stitch.comparison.tables import Comparison, binned, changes, view_properties
+from stitch.comparison.table import ResidualTable, table_of
+from stitch.comparison.tables import ResidualTables, equal_count_bins, property_varies, view_properties
 from stitch.comparison.view_scatter import view_statistics
 from stitch.frames import Array, Indices
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.observations.targets.landmarks import drawing_of, initial_landmarks
-from stitch.observations.targets.rows import rows_of
-from stitch.runs.state import State
-from stitch.statistics.block_least_squares import Blocks
+from stitch.observations.targets.rows import target_rows
+from stitch.runs.state import RunState
+from stitch.statistics.block_least_squares import BlockLeastSquares
 
 # A direction is chosen for every table among so many dimensions.
 _DIRECTIONS = 3
@@ -35,49 +35,51 @@ class _Offsets:
     views: int
 
 
-def compare_targets(state: State) -> Comparison:
+def compare_targets(state: RunState) -> ResidualTables:
     """Tables of the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
-    rows = _offsets(state)
+    rows = _target_offsets(state)
     s = state.measurement.capture.sightings
     assert s is not None
     labels = {"view": (rows.view, state.session.names), "target": (rows.target, list(s.targets))}
-    tables = [_table(rows, name, "", bins, _numbers(names), names) for name, (bins, names) in labels.items()]
-    for name, unit, values in _properties(state, rows):
-        edges, bins = binned(values)
+    tables = [
+        _offset_table(rows, name, "", bins, _numbered_labels(names), names) for name, (bins, names) in labels.items()
+    ]
+    for name, unit, values in _offset_properties(state, rows):
+        edges, bins = equal_count_bins(values)
         if len(edges) > 2:
-            tables.append(_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
+            tables.append(_offset_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
-    of_views = {name: values for name, _, values in _of_views(state)}
-    return Comparison(tuple(tables), rms, rms, tuple(state.session.names), of_views)
+    of_views = {name: values for name, _, values in _offset_view_properties(state)}
+    return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views)
 
 
-def _offsets(state: State) -> _Offsets:
+def _target_offsets(state: RunState) -> _Offsets:
     """With the targets where hand-eye and effects of the model put them best."""
-    own = corrected(state.measurement, state.model)
+    own = corrected_capture(state.measurement, state.model)
     s = own.sightings
     assert s is not None
     T_mount = state.model.T_mount
-    rows = rows_of(own, T_mount, initial_landmarks(own, T_mount, drawing_of(state.session.nominal, s)))
+    rows = target_rows(own, T_mount, initial_landmarks(own, T_mount, drawing_of(state.session.nominal, s)))
     diagonal = np.zeros((*rows.residual.shape, rows.residual.shape[1]))
     diagonal[:, np.arange(rows.residual.shape[1]), np.arange(rows.residual.shape[1])] = rows.noise + rows.fixed
     k = rows.landmarks.shape[2]
     left = (
         rows.residual
-        + rows.landmarks @ Blocks(-rows.residual, rows.landmarks, diagonal, np.zeros(k), np.zeros(k)).solve()
+        + rows.landmarks @ BlockLeastSquares(-rows.residual, rows.landmarks, diagonal, np.zeros(k), np.zeros(k)).solve()
     )
     v, slot = np.nonzero(s.used)
     offset = left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
     return _Offsets(v, s.target[v, slot], offset, s.points[v, slot], len(s.used))
 
 
-def _numbers(names: Sequence[str]) -> tuple[Array, Array]:
+def _numbered_labels(names: Sequence[str]) -> tuple[Array, Array]:
     number = np.arange(len(names), dtype=float)
     return number, number
 
 
-def _table(
+def _offset_table(
     rows: _Offsets, name: str, unit: str, bins: Indices, edges: tuple[Array, Array], labels: Sequence[str]
-) -> Table:
+) -> ResidualTable:
     size = len(edges[0])
     count = np.asarray(np.bincount(bins, minlength=size), float)
     sums_3d = np.stack([np.bincount(bins, rows.offset[:, i], size) for i in range(3)], axis=1)
@@ -90,13 +92,17 @@ def _table(
     return table_of(name, unit, edges, tuple(labels), view_statistics(n, s, q, directions=_DIRECTIONS))
 
 
-def _properties(state: State, rows: _Offsets) -> list[tuple[str, str, Array]]:
+def _offset_properties(state: RunState, rows: _Offsets) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     out = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
-    return out + [(name, unit, values[rows.view]) for name, unit, values in _of_views(state) if changes(name, values)]
+    return out + [
+        (name, unit, values[rows.view])
+        for name, unit, values in _offset_view_properties(state)
+        if property_varies(name, values)
+    ]
 
 
-def _of_views(state: State) -> list[tuple[str, str, Array]]:
+def _offset_view_properties(state: RunState) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per view."""
     views = state.measurement.views
     moves = np.degrees(views.joints - views.previous)

@@ -18,7 +18,7 @@ _MEAN_OF_NORMAL = float(np.sqrt(2 / np.pi))
 
 
 @dataclass(frozen=True)
-class Field:
+class DisagreementField:
     """Signed distances of V views at K patches, positive outwards; NaN where a view and no other sees the patch."""
 
     values: Array  # (V, K) length_unit
@@ -27,7 +27,7 @@ class Field:
     @cached_property
     def overall(self) -> Array:
         """(K,) mean of |value| over the views that see a patch; NaN where they are fewer than two."""
-        return _mean(np.abs(self.values))
+        return _mean_over_views(np.abs(self.values))
 
     @cached_property
     def by_view(self) -> Array:
@@ -46,7 +46,7 @@ class Field:
         """What `mean_abs` would be if noise were all there is."""
         if not np.isfinite(self.sigma).any():
             return float("nan")
-        return _MEAN_OF_NORMAL * float(np.nanmean(_mean(self.sigma)))
+        return _MEAN_OF_NORMAL * float(np.nanmean(_mean_over_views(self.sigma)))
 
     def quantile(self, share: float = 0.95) -> float:
         """The distance that this share of the part keeps."""
@@ -54,17 +54,17 @@ class Field:
         return float(np.quantile(seen, share)) if len(seen) else float("nan")
 
 
-def full_colour(field: Field) -> float:
+def full_colour_distance(field: DisagreementField) -> float:
     """Distance at which colours are full: no step of them is smaller than the standard error of nearly all patches."""
-    return max(field.quantile(), COLOUR_STEPS * most(field.sigma))
+    return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma))
 
 
-def most(sigma: Array) -> float:
+def largest_standard_error(sigma: Array) -> float:
     """What nearly all standard errors stay below."""
     return float(np.nanquantile(sigma, 0.9))
 
 
-def _mean(values: Array) -> Array:
+def _mean_over_views(values: Array) -> Array:
     """(K,) over the views (V, K) that see a patch; NaN where they are fewer than two."""
     seen = np.isfinite(values)
     count = seen.sum(axis=0)

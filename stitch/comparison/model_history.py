@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.disagreement_field import Field
+from stitch.comparison.disagreement_field import DisagreementField
 from stitch.comparison.patches import Patches, patches_of
 from stitch.effects.contract import EFFECTS
 from stitch.effects.in_session import parameters_in
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
-from stitch.model.forward import placed
+from stitch.model.forward import true_geometry
 from stitch.model.model import Model
 from stitch.model.term import Term
-from stitch.observations.surfaces.match import distances
+from stitch.observations.surfaces.match import signed_distances
 from stitch.runs.run import LedgerStep, Run
 
-COARSE, ALONE, REGISTER = "coarse", "hand-eye alone", "register"
+COARSE, HAND_EYE_ONLY, REGISTER = "coarse", "hand-eye alone", "register"
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ModelStep:
 
     name: str  # coarse | hand-eye alone | + joint_compliance | register
     poses: Array  # (V, 4, 4) T_reference_scanner
-    field: Field
+    field: DisagreementField
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ModelHistory:
 
 
 # The history of the run that was asked for last: files, page, recording and terminal ask for it one after another.
-_last: tuple[weakref.ref[Run], ModelHistory | None] | None = None
+_last_history: tuple[weakref.ref[Run], ModelHistory | None] | None = None
 
 
 def model_history(run: Run) -> ModelHistory | None:
@@ -52,28 +52,28 @@ def model_history(run: Run) -> ModelHistory | None:
 
     Steps whose effects are not known any more are left out.
     """
-    global _last
-    if _last is None or _last[0]() is not run:
-        _last = weakref.ref(run), _found(run)
-    return _last[1]
+    global _last_history
+    if _last_history is None or _last_history[0]() is not run:
+        _last_history = weakref.ref(run), _build_history(run)
+    return _last_history[1]
 
 
-def _found(run: Run) -> ModelHistory | None:
+def _build_history(run: Run) -> ModelHistory | None:
     if run.registered is None:
         return None
     matches = run.registered.matches
-    states = [(name, *placed(run.measurement, model)) for name, model in models_of(run)]
+    states = [(name, *true_geometry(run.measurement, model)) for name, model in models_of(run)]
     states.append((REGISTER, run.poses, states[-1][2]))
-    apart = [distances(matches, poses, points) for _, poses, points in states]
-    patches = patches_of(matches, len(run.poses), run.registered.gram.scale, shown=apart[1])
+    apart = [signed_distances(matches, poses, points) for _, poses, points in states]
+    patches = patches_of(matches, len(run.poses), run.registered.gram.scale, model_distances=apart[1])
     steps = [ModelStep(name, poses, patches.field(e)) for (name, poses, _), e in zip(states, apart, strict=True)]
     return ModelHistory(patches, tuple(steps))
 
 
-def change_of(ledger: Sequence[LedgerStep], i: int) -> str:
+def effect_changes(ledger: Sequence[LedgerStep], i: int) -> str:
     """What step i brought or took: + joint_compliance."""
     if i == 0:
-        return ", ".join(ledger[0].effects) or ALONE
+        return ", ".join(ledger[0].effects) or HAND_EYE_ONLY
     new = [f"+ {e}" for e in ledger[i].effects if e not in ledger[i - 1].effects]
     gone = [f"− {e}" for e in ledger[i - 1].effects if e not in ledger[i].effects]
     return ", ".join([*new, *gone]) or "fitted again"
@@ -85,8 +85,8 @@ def models_of(run: Run) -> list[tuple[str, Model]]:
     for i, step in enumerate(run.ledger[:-1]):
         model = _model_of(step, run.measurement)
         if model is not None:
-            out.append((change_of(run.ledger, i), model))
-    last = change_of(run.ledger, len(run.ledger) - 1) if run.ledger else ", ".join(run.effects) or ALONE
+            out.append((effect_changes(run.ledger, i), model))
+    last = effect_changes(run.ledger, len(run.ledger) - 1) if run.ledger else ", ".join(run.effects) or HAND_EYE_ONLY
     return [*out, (last, run.model)]
 
 

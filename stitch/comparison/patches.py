@@ -12,7 +12,7 @@ import numpy as np
 from pykdtree.kdtree import KDTree
 from scipy.sparse import csr_matrix
 
-from stitch.comparison.disagreement_field import COLOUR_STEPS, Field, most
+from stitch.comparison.disagreement_field import COLOUR_STEPS, DisagreementField, largest_standard_error
 from stitch.frames import Array, Indices, Mask
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.observations.surfaces.match import Match
@@ -41,12 +41,12 @@ class Patches:
     kernel: csr_matrix  # (K, C) weights of cells
     counts: "_Counts"
 
-    def field(self, distances: Array) -> Field:
+    def field(self, distances: Array) -> DisagreementField:
         """The field of signed distances (M,) of all correspondences in their order, v less w."""
         count = self.counts.by_cell(np.ones_like(distances), 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             value = self.kernel @ self.counts.by_cell(distances, -1.0) / (self.kernel @ count)
-        return Field(np.where(np.isfinite(self.sigma), value.T, np.nan), self.sigma)
+        return DisagreementField(np.where(np.isfinite(self.sigma), value.T, np.nan), self.sigma)
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ class _Counts:
         return np.asarray(sums.reshape(self.cells, self.views), float)
 
 
-def patches_of(matches: Sequence[Match], views: int, scale: float, shown: Array) -> Patches:
+def patches_of(matches: Sequence[Match], views: int, scale: float, model_distances: Array) -> Patches:
     """Patches over the surface that the matches cover, as small as the noise allows.
 
     Args:
         matches: of all overlapping pairs, with the views where they agree best: what scatters there is noise.
         views: their number V.
         scale: robust sigma of the distances; what lies beyond the gate of the rms is an edge.
-        shown: (M,) distances under the model whose field the colours are to show.
+        model_distances: (M,) distances under the model whose field the colours are to show.
     """
     quiet = np.concatenate([m.residual for m in matches])
     inside = np.abs(quiet) < RMS_GATE * scale
@@ -85,13 +85,16 @@ def patches_of(matches: Sequence[Match], views: int, scale: float, shown: Array)
     size = float(np.ptp(np.quantile(middle, [0.005, 0.995], axis=0), axis=0).max())
     for share in _RADII:
         radius = share * size
-        cell, centre, facing = _grouped(middle, normal, _CELL * radius)
+        cell, centre, facing = _group_points(middle, normal, _CELL * radius)
         counts = _Counts(inside, view, cell, views, len(centre))
-        _, place, outwards = _grouped(centre, facing, _APART * radius)
+        _, place, outwards = _group_points(centre, facing, _APART * radius)
         kernel = _kernel(place, outwards, centre, facing, radius)
         sigma = _standard_errors(kernel, counts, quiet)
         found = Patches(place, outwards, radius=radius, sigma=sigma, kernel=kernel, counts=counts)
-        if not np.isfinite(sigma).any() or most(sigma) <= found.field(shown).quantile() / COLOUR_STEPS:
+        if (
+            not np.isfinite(sigma).any()
+            or largest_standard_error(sigma) <= found.field(model_distances).quantile() / COLOUR_STEPS
+        ):
             break
     return found
 
@@ -126,7 +129,7 @@ def _kernel(place: Array, outwards: Array, centre: Array, facing: Array, radius:
     return csr_matrix((weights, (row, index[found])), shape=(len(place), len(centre)))
 
 
-def _grouped(points: Array, normals: Array, size: float) -> tuple[Indices, Array, Array]:
+def _group_points(points: Array, normals: Array, size: float) -> tuple[Indices, Array, Array]:
     """Number of the group of every point, and per group mean point and unit normal; both sides of a sheet differ."""
     side = 2 * np.abs(normals).argmax(axis=1)
     side += np.take_along_axis(normals, (side // 2)[:, None], axis=1)[:, 0] > 0

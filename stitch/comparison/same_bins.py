@@ -4,17 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.comparison.table import Table
+from stitch.comparison.table import ResidualTable
 
 # Of the size of the largest mean: sums of the same rows in another order differ by rounding.
 _ROUNDING = 1e-6
 
 
-def same_bins(tables: Sequence[Table]) -> tuple[tuple[Table, ...], ...]:
+def group_same_bins(tables: Sequence[ResidualTable]) -> tuple[tuple[ResidualTable, ...], ...]:
     """Tables in groups whose bins hold the same rows, in whichever order; groups and tables as they come."""
-    groups: list[list[Table]] = []
+    groups: list[list[ResidualTable]] = []
     for table in tables:
-        group = next((g for g in groups if _same(g[0], table)), None)
+        group = next((g for g in groups if _same_rows(g[0], table)), None)
         if group is None:
             groups.append([table])
         else:
@@ -22,7 +22,7 @@ def same_bins(tables: Sequence[Table]) -> tuple[tuple[Table, ...], ...]:
     return tuple(tuple(g) for g in groups)
 
 
-def _same(a: Table, b: Table) -> bool:
+def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
     if len(a.count) != len(b.count):
         return False
     first, second = (np.lexsort((np.nan_to_num(t.rms), np.nan_to_num(t.mean), t.count)) for t in (a, b))

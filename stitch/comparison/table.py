@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.comparison.view_scatter import Statistics
+from stitch.comparison.view_scatter import BinStatistics
 from stitch.frames import Array
 
 _FAIR = 50  # correspondences of a bin that may be called the worst
 
 
 @dataclass(frozen=True)
-class Table:
+class ResidualTable:
     """One property in bins; lengths in length_unit, counts of correspondences and of views."""
 
     name: str
@@ -45,6 +45,8 @@ class Table:
         return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
 
 
-def table_of(name: str, unit: str, edges: tuple[Array, Array], label: tuple[str, ...], statistics: Statistics) -> Table:
+def table_of(
+    name: str, unit: str, edges: tuple[Array, Array], label: tuple[str, ...], statistics: BinStatistics
+) -> ResidualTable:
     """The table of bins with their statistics; `edges` are (B,) lower and (B,) upper ones."""
-    return Table(name, unit, *edges, label, **vars(statistics))
+    return ResidualTable(name, unit, *edges, label, **vars(statistics))

@@ -5,46 +5,46 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.comparison.same_bins import same_bins
-from stitch.comparison.table import Table
+from stitch.comparison.same_bins import group_same_bins
+from stitch.comparison.table import ResidualTable
 from stitch.frames import Array, Indices
 from stitch.measurement.views import Views
 
 PLACE = "place on the part"
 APPROACH = "approach of j"
-_SAME = 1e-9  # numbers closer than that are one
+_SAME_VALUE = 1e-9  # numbers closer than that are one
 _BINS = 6
 _ENDINGS = {"_c": "°C", "_percent": "%", "_s": "s", "_mm": "mm", "_deg": "°"}
 CLEAR = 0.05  # p over all means
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ResidualTables:
     """All tables, and the rms they share."""
 
-    tables: tuple[Table, ...]
+    tables: tuple[ResidualTable, ...]
     rms: float
     scale: float
     views: tuple[str, ...] = ()  # names, V
     of_views: dict[str, Array] = field(default_factory=dict)  # property -> (V,) value of each view
 
-    def table(self, name: str) -> Table:
+    def table(self, name: str) -> ResidualTable:
         """One table by its name."""
         return next(t for t in self.tables if t.name == name)
 
     @property
-    def labelled(self) -> tuple[Table, ...]:
+    def labelled(self) -> tuple[ResidualTable, ...]:
         """Tables by name: views, pairs, places, targets."""
         return tuple(t for t in self.tables if t.label)
 
     @cached_property
-    def groups(self) -> tuple[tuple[Table, ...], ...]:
+    def groups(self) -> tuple[tuple[ResidualTable, ...], ...]:
         """Tables of properties, clearest dependence first; those whose bins hold the same rows together."""
-        own = same_bins([t for t in self.tables if not t.label])
+        own = group_same_bins([t for t in self.tables if not t.label])
         return tuple(sorted(own, key=lambda g: (g[0].least_p, -g[0].clearest)))
 
     @property
-    def places(self) -> tuple[Table, ...]:
+    def places(self) -> tuple[ResidualTable, ...]:
         """The first table of every group, clearest dependence first."""
         return tuple(group[0] for group in self.groups)
 
@@ -57,13 +57,13 @@ class Comparison:
         """
         sums = [np.abs(t.mean * t.count)[np.isfinite(t.p_value)] for t in self.places]
         ordered = np.sort(np.concatenate(sums)) if sums else np.zeros(0)
-        return len(ordered) and 1 + int((np.diff(ordered) > _SAME * ordered[-1]).sum())
+        return len(ordered) and 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
 
-    def p_of_all(self, table: Table) -> float:
+    def p_of_all(self, table: ResidualTable) -> float:
         """That chance makes any of all the means as clear as the clearest of this table (Bonferroni)."""
         return min(1.0, max(self.means, 1) * table.least_p)
 
-    def is_clear(self, table: Table) -> bool:
+    def is_clear(self, table: ResidualTable) -> bool:
         """True where chance does not explain its clearest mean (5 % over all means)."""
         return self.p_of_all(table) <= CLEAR
 
@@ -88,13 +88,13 @@ def values_of_views(views: Views) -> dict[str, Array]:
     return {name: values for name, _, values in view_properties(views)}
 
 
-def changes(name: str, values: Array) -> bool:
+def property_varies(name: str, values: Array) -> bool:
     """True if a property (V,) has two values; that no view came before the first is no approach."""
     told = values[values != 0] if name.startswith(APPROACH) else values
-    return bool(len(told) and np.ptp(told) > _SAME)
+    return bool(len(told) and np.ptp(told) > _SAME_VALUE)
 
 
-def binned(values: Array) -> tuple[Array, Indices]:
+def equal_count_bins(values: Array) -> tuple[Array, Indices]:
     """(B + 1,) edges of bins with about equal counts, and the bin of every value (N,); equal values stay together.
 
     Of no more values than bins, each has its own.
@@ -109,7 +109,7 @@ def binned(values: Array) -> tuple[Array, Indices]:
     return edges, bins.astype(np.int64)
 
 
-def comparison_document(found: Comparison) -> dict[str, object]:
+def comparison_document(found: ResidualTables) -> dict[str, object]:
     """The tables as plain lists."""
     floats, counts = "low high mean mean_sigma rms rms_sigma p_value", "count views"
     names = {t.name: [x.name for x in group if x is not t] for group in found.groups for t in group}

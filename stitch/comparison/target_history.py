@@ -8,7 +8,7 @@ from stitch import frames
 from stitch.comparison.model_history import REGISTER, models_of
 from stitch.frames import Array
 from stitch.measurement.sightings import Sightings
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.observations.targets.target_fit import rms_of
 from stitch.runs.run import Run
 
@@ -33,15 +33,15 @@ def target_history(run: Run) -> tuple[TargetStep, ...]:
     models = models_of(run)
     steps = []
     for name, model in models[:-1]:
-        own = corrected(run.measurement, model)
+        own = corrected_capture(run.measurement, model)
         assert own.sightings is not None
-        steps.append(_step(name, s, frames.transform(own.poses(model.T_mount), own.sightings.points)))
+        steps.append(_target_step(name, s, frames.transform(own.poses(model.T_mount), own.sightings.points)))
     rows = run.targets.rows
     steps.append(TargetStep(models[-1][0], rows.distances(rows.residual), run.targets.rms))
-    return (*steps, _step(REGISTER, s, frames.transform(run.poses, rows.sightings.points)))
+    return (*steps, _target_step(REGISTER, s, frames.transform(run.poses, rows.sightings.points)))
 
 
-def _step(name: str, s: Sightings, placed: Array) -> TargetStep:
+def _target_step(name: str, s: Sightings, placed: Array) -> TargetStep:
     """Of targets (V, S, 3) as the views place them: each about the middle of all views, the place of least squares."""
     own = np.full(s.used.shape, np.nan)
     for k in range(len(s.targets)):

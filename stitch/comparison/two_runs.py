@@ -23,7 +23,7 @@ _POINTS = 20_000
 
 
 @dataclass(frozen=True)
-class Side:
+class ComparedRun:
     """One of two runs, with what is asked of it more than once."""
 
     name: str  # of its folder
@@ -63,8 +63,8 @@ class HandEyeChange:
 class TwoRuns:
     """A and B, whose numbers count in the same unit and frames."""
 
-    a: Side
-    b: Side
+    a: ComparedRun
+    b: ComparedRun
 
     @property
     def same_data(self) -> bool:
@@ -77,7 +77,7 @@ class TwoRuns:
         return hand_eye_change(self.a.run, self.b.run)
 
 
-def two_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
+def compare_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
     """Two runs with the names of their folders.
 
     Raises:
@@ -87,7 +87,7 @@ def two_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
     for what, of_a, of_b in (
         ("length_unit", a.session.length_unit, b.session.length_unit),
         ("mount", a.session.mount, b.session.mount),
-        ("what the views show", _shows(a), _shows(b)),
+        ("what the views show", _seen_points(a), _seen_points(b)),
     ):
         if of_a != of_b:
             raise InputError(
@@ -95,12 +95,13 @@ def two_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
                 "to fix: name two runs of one cell"
             )
     sides = [
-        Side(name, run, model_history(run), session_hash(run.session)) for name, run in zip(names, runs, strict=True)
+        ComparedRun(name, run, model_history(run), session_hash(run.session))
+        for name, run in zip(names, runs, strict=True)
     ]
     return TwoRuns(*sides)
 
 
-def _shows(run: Run) -> str:
+def _seen_points(run: Run) -> str:
     return "labelled points alone" if run.registered is None else "surfaces"
 
 
@@ -124,18 +125,20 @@ def hand_eye_change(a: Run, b: Run) -> HandEyeChange:
     )
 
 
-def sentence(both: TwoRuns) -> str:
+def comparison_sentence(both: TwoRuns) -> str:
     """What changed from A to B, for everybody."""
     unit = both.a.run.session.length_unit
     off_a, off_b = (length_text(side.error, unit) for side in (both.a, both.b))
     where = "rms over the labelled points" if both.a.history is None else "on average over the part"
     told = f"as far as those of A, by {off_a}" if off_a == off_b else f"by {off_b} instead of {off_a}"
-    subject = _change(both.a.run.effects, both.b.run.effects) + ("" if both.same_data else ", on other data")
+    subject = _effects_difference(both.a.run.effects, both.b.run.effects) + (
+        "" if both.same_data else ", on other data"
+    )
     seen = "targets" if both.a.history is None else "part"
-    return f"{subject}, the views of B disagree {told}, {where}; {_hand_eyes(both.hand_eye, unit, seen)}."
+    return f"{subject}, the views of B disagree {told}, {where}; {_hand_eye_sentence(both.hand_eye, unit, seen)}."
 
 
-def _change(a: Sequence[str], b: Sequence[str]) -> str:
+def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
     """With joint_compliance and without backlash in the model."""
     gained, lost = [e for e in b if e not in a], [e for e in a if e not in b]
     parts = [f"with {' and '.join(gained)}"] * bool(gained) + [f"without {' and '.join(lost)}"] * bool(lost)
@@ -143,7 +146,7 @@ def _change(a: Sequence[str], b: Sequence[str]) -> str:
     return f"{told[0].upper()}{told[1:]} in the model"
 
 
-def _hand_eyes(change: HandEyeChange, length_unit: str, seen: str) -> str:
+def _hand_eye_sentence(change: HandEyeChange, length_unit: str, seen: str) -> str:
     if not change.twist.any():
         return "both have the same hand-eye"
     apart = f"the hand-eyes put the {seen} {length_text(change.at_part, length_unit)} apart"

@@ -9,7 +9,7 @@ from stitch.statistics.tails import f_tail
 
 
 @dataclass(frozen=True)
-class Statistics:
+class BinStatistics:
     """Of B bins; lengths in length_unit, counts of rows and of views that make a sample."""
 
     mean: Array  # (B,) signed
@@ -21,7 +21,7 @@ class Statistics:
     p_value: Array  # (B,) that chance makes this one mean so large; NaN where that is unknown
 
 
-def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, directions: int = 1) -> Statistics:
+def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, directions: int = 1) -> BinStatistics:
     """Means of bins with what the scatter between views says of them.
 
     A view off by its pose error ε is off in all its rows, so a mean over views with shares w of the rows has the
@@ -39,15 +39,15 @@ def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, direction
     with np.errstate(invalid="ignore", divide="ignore"):
         dilution = ((n / total[:, None]) ** 2).sum(axis=1)
         mean, rms = s.sum(axis=1) / total, np.sqrt(q.sum(axis=1) / total)
-        variance, freedom = _scatter(s / n, s.sum(axis=0) / seen, use)
-        of_rms, _ = _scatter(np.sqrt(q / n), np.sqrt(q.sum(axis=0) / seen), use)
+        variance, freedom = _view_scatter(s / n, s.sum(axis=0) / seen, use)
+        of_rms, _ = _view_scatter(np.sqrt(q / n), np.sqrt(q.sum(axis=0) / seen), use)
         sigma = np.sqrt(variance * dilution * (1 - total / total.sum()))
         z = np.abs(mean) / sigma
-    tails = np.array([_tail(float(x), float(v), directions) for x, v in zip(z, freedom, strict=True)])
-    return Statistics(mean, sigma, rms, np.sqrt(of_rms * dilution), total, use.sum(axis=1), tails)
+    tails = np.array([_mean_p_value(float(x), float(v), directions) for x, v in zip(z, freedom, strict=True)])
+    return BinStatistics(mean, sigma, rms, np.sqrt(of_rms * dilution), total, use.sum(axis=1), tails)
 
 
-def _scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
+def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
     """Variance between views (B,) and its degrees of freedom (B,).
 
     A bin of one or two views does not know it. Pooled with the views of the bin about their mean are the views that
@@ -69,7 +69,7 @@ def _scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
     return np.where(known, square / np.maximum(freedom, 1), np.nan), freedom
 
 
-def _tail(z: float, freedom: float, directions: int) -> float:
+def _mean_p_value(z: float, freedom: float, directions: int) -> float:
     """P of a mean so many sigmas from zero by chance, in the worst direction; Student's t for one direction."""
     left = freedom - directions + 1
     if not np.isfinite(z):

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, Written, line_of, quaternion_w_first
+from stitch.controllers.taught import TaughtPoint, WrittenNumber, line_of, quaternion_w_first
 from stitch.errors import InputError
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import finite_number
 
 CONVENTION = "quaternion q1, q2, q3, q4 with q1 = w; mm"
 pose = quaternion_w_first
@@ -28,14 +28,14 @@ _USED = re.compile(r"\bMove[LJ]\s+(\w+|\[[^;]*\])[^;]*,\s*(\w+)\s*(?:\\WObj\s*:=
 _NONE = 8e9
 
 
-def read(file: Path, text: str) -> list[Taught]:
+def read(file: Path, text: str) -> list[TaughtPoint]:
     """Targets in the order of the file; arrays give one point per element.
 
     Raises:
         InputError: a target without numbers or with a quaternion that is none.
     """
     clean = _without_comments(text)
-    found: list[tuple[int, Taught]] = []
+    found: list[tuple[int, TaughtPoint]] = []
     for match in _DECLARED.finditer(clean):
         found += _targets(file, text, match.start(3), match[2], match[3], match[1].lower() == "jointtarget")
     for match in _MOVE.finditer(clean):
@@ -59,7 +59,7 @@ def _without_comments(text: str) -> str:
     return re.sub(r'"[^"\n]*"|![^\n]*', lambda m: m[0] if m[0].startswith('"') else " " * len(m[0]), text)
 
 
-def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool) -> list[tuple[int, Taught]]:
+def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool) -> list[tuple[int, TaughtPoint]]:
     matches = list(_TARGET.finditer(value))
     line = line_of(text, at)
     if not matches:
@@ -71,12 +71,12 @@ def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool)
     ]
 
 
-def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bool) -> Taught:
+def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bool) -> TaughtPoint:
     """A point from its lists, which stand at `begin`."""
     lists = [
         [
-            Written(
-                number(file, line, name, cell[0]),
+            WrittenNumber(
+                finite_number(file, line, name, cell[0]),
                 (begin + part.start(1) + cell.start(), begin + part.start(1) + cell.end()),
             )
             for cell in _CELL.finditer(part[1])
@@ -85,7 +85,7 @@ def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bo
     ]
     values, spans = [[w.value for w in own] for own in lists], [tuple(w.span for w in own) for own in lists]
     if joint and len(lists[0]) == 6:
-        return Taught(name, line, None, np.radians(values[0]), joints_at=spans[0])
+        return TaughtPoint(name, line, None, np.radians(values[0]), joints_at=spans[0])
     if not joint and len(lists[0]) == 3 and len(lists[1]) == 4:
         try:
             T_frame_tool = quaternion_w_first(np.array(values[0] + values[1]))
@@ -93,5 +93,5 @@ def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bo
             raise InputError(f"{file} line {line}: {name}: {error}") from None
         axes = [f"eax_{letter} {x:g}" for letter, x in zip("abcdef", values[-1], strict=False) if x and x < _NONE]
         moved_by = ", ".join(axes) if len(values) == 4 else ""
-        return Taught(name, line, T_frame_tool, None, pose_at=spans[0] + spans[1], moved_by=moved_by)
+        return TaughtPoint(name, line, T_frame_tool, None, pose_at=spans[0] + spans[1], moved_by=moved_by)
     raise InputError(f"{file} line {line}: {name} is neither [[x,y,z],[q1,q2,q3,q4],…] nor [[j1 … j6],…]")

@@ -7,9 +7,9 @@ DH joint 3 of most published tables is J2 + J3.
 import re
 from pathlib import Path
 
-from stitch.controllers.taught import Taught, Written, fixed_xyz, line_of, taught
+from stitch.controllers.taught import TaughtPoint, WrittenNumber, fixed_xyz, line_of, taught_point
 from stitch.errors import InputError
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import finite_number
 
 CONVENTION = "W, P, R in degrees about fixed x, y, z: Rz(R)·Ry(P)·Rx(W); mm"
 pose = fixed_xyz
@@ -24,7 +24,7 @@ _FIELD = re.compile(r"\b([XYZWPR]|[JE]\d)\s*=\s*([-+.\deE*]+)")
 _DECIMAL_COMMA = re.compile(r"=\s*([-+]?\d+,\d+)")
 
 
-def read(file: Path, text: str) -> list[Taught]:
+def read(file: Path, text: str) -> list[TaughtPoint]:
     """Points of one listing.
 
     Raises:
@@ -36,7 +36,7 @@ def read(file: Path, text: str) -> list[Taught]:
     return [_point(file, text, match) for match in _POINT.finditer(text, start)]
 
 
-def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
+def _point(file: Path, text: str, match: re.Match[str]) -> TaughtPoint:
     index, comment, body = match.groups()
     line, name = line_of(text, match.start()), comment or f"P{index}"
     group = _GROUP.search(body)
@@ -46,15 +46,15 @@ def _point(file: Path, text: str, match: re.Match[str]) -> Taught:
         raise InputError(f"{file} line {line}: P[{index}] has {cut[1]!r}; to fix: write decimals with a point")
     begin = match.start(3) + group.start(1)
     fields = {
-        m[1]: Written(
-            number(file, line, f"P[{index}] {m[1]}", m[2], "teach the point or remove it"),
+        m[1]: WrittenNumber(
+            finite_number(file, line, f"P[{index}] {m[1]}", m[2], "teach the point or remove it"),
             (begin + m.start(2), begin + m.end(2)),
         )
         for m in _FIELD.finditer(group[1])
     }
     taught_in = _FRAME.search(group[1])
     frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
-    point = taught(name, line, fields, "XYZWPR", fixed_xyz, joint="J", frame=frame)
+    point = taught_point(name, line, fields, "XYZWPR", fixed_xyz, joint="J", frame=frame)
     if point is None:
         raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; teach it again")
     return point

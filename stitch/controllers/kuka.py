@@ -7,9 +7,17 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from stitch.controllers.taught import Taught, Written, line_of, program_text, taught, without_comments, zyx
+from stitch.controllers.taught import (
+    TaughtPoint,
+    WrittenNumber,
+    line_of,
+    program_text,
+    taught_point,
+    without_comments,
+    zyx,
+)
 from stitch.errors import InputError
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import finite_number
 
 CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"
 pose = zyx
@@ -30,26 +38,26 @@ _CELL = re.compile(r"\s*(?:\w+\s*:)?\s*\w+\s+\S+\s*")
 _FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
 
-def read(file: Path, text: str) -> list[Taught]:
+def read(file: Path, text: str) -> list[TaughtPoint]:
     """Points of a .dat (as declared) or a .src (as moved to).
 
     Raises:
         InputError: a point without numbers or with a brace that stays open, a name that is declared nowhere.
     """
     if file.suffix.lower() == ".dat":
-        return list(_declared(file, text).values())
-    known = _declared(file, text)
+        return list(_declared_points(file, text).values())
+    known = _declared_points(file, text)
     data = next((p for p in (file.with_suffix(".dat"), file.with_suffix(".DAT")) if p.is_file()), None)
     if data is not None:
-        told = _declared(data, program_text(data))
+        told = _declared_points(data, program_text(data))
         known |= {name: replace(point, file=data) for name, point in told.items()}
     clean = without_comments(text, ";")
     if (left := _OPEN.search(clean)) is not None:
         raise InputError(f"{file} line {line_of(text, left.start())}: a brace stays open; to fix: close it on its line")
-    return [_moved_to(file, text, match, known) for match in _MOTION.finditer(clean)]
+    return [_motion_target(file, text, match, known) for match in _MOTION.finditer(clean)]
 
 
-def _declared(file: Path, text: str) -> dict[str, Taught]:
+def _declared_points(file: Path, text: str) -> dict[str, TaughtPoint]:
     clean = without_comments(text, ";")
     found = [
         (m[2], m[1], _point(file, m[2], line_of(text, m.start(2)), m[3], m.start(3))) for m in _DECLARED.finditer(clean)
@@ -61,7 +69,7 @@ def _declared(file: Path, text: str) -> dict[str, Taught]:
     }
 
 
-def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taught]) -> Taught:
+def _motion_target(file: Path, text: str, match: re.Match[str], known: dict[str, TaughtPoint]) -> TaughtPoint:
     line = line_of(text, match.start(1) if match[1] else match.start(2))
     if "_REL" in match[0].upper():
         raise InputError(f"{file} line {line}: a relative motion has no pose of its own; give the point as E6POS")
@@ -72,7 +80,7 @@ def _moved_to(file: Path, text: str, match: re.Match[str], known: dict[str, Taug
     return replace(known[match[1].upper()], is_target=True)
 
 
-def _point(file: Path, name: str, line: int, body: str, begin: int) -> Taught:
+def _point(file: Path, name: str, line: int, body: str, begin: int) -> TaughtPoint:
     """A point from the fields between its braces, which stand at `begin`."""
     odd = next((cell for cell in body.split(",") if not _CELL.fullmatch(cell)), None)
     if odd is not None:
@@ -81,12 +89,12 @@ def _point(file: Path, name: str, line: int, body: str, begin: int) -> Taught:
             "decimals with a point"
         )
     fields = {
-        m[1].upper(): Written(
-            number(file, line, f"{name} {m[1].upper()}", m[2]), (begin + m.start(2), begin + m.end(2))
+        m[1].upper(): WrittenNumber(
+            finite_number(file, line, f"{name} {m[1].upper()}", m[2]), (begin + m.start(2), begin + m.end(2))
         )
         for m in _FIELD.finditer(body)
     }
-    point = taught(name, line, fields, "XYZABC", zyx, joint="A")
+    point = taught_point(name, line, fields, "XYZABC", zyx, joint="A")
     if point is None:
         raise InputError(f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; write all of them")
     return point

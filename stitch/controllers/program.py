@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from stitch.controllers import abb, fanuc, kuka, universal
-from stitch.controllers.taught import Taught, line_of, program_text, without_comments
+from stitch.controllers.taught import TaughtPoint, line_of, program_text, without_comments
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.reading.csv_number import is_number
@@ -34,11 +34,11 @@ class Program:
 
     file: Path
     controller: str  # kuka | fanuc | abb | ur
-    points: tuple[Taught, ...]  # in the order of the file, each once
+    points: tuple[TaughtPoint, ...]  # in the order of the file, each once
     texts: dict[Path, str]  # of the files that hold the points' numbers, byte for byte
     T_base_frame: Array  # (4, 4) mm
     T_flange_tool: Array  # (4, 4) mm
-    again: tuple[str, ...] = ()  # points that are moved to more than once
+    repeated: tuple[str, ...] = ()  # points that are moved to more than once
     other: tuple[str, ...] = ()  # poses that are no targets: they stay
     unread: tuple[int, ...] = ()  # lines of motions whose targets are not read: they stay too
 
@@ -61,7 +61,7 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     if not file.is_file():
         raise InputError(f"{file}: no such file; to fix: name a program of the controller")
     text = program_text(file)
-    told: list[Taught] = reader.read(file, text)
+    told: list[TaughtPoint] = reader.read(file, text)
     every = [p for p in told if p.is_target]
     points = tuple({(p.file, p.pose_at, p.joints_at): p for p in every}.values())
     if not points:
@@ -78,11 +78,11 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         _NAMES[reader],
         points,
         texts,
-        T_base_frame=given(reader.pose, "frame", frame),
-        T_flange_tool=given(reader.pose, "tool", tool),
-        again=tuple(p.name for p in points if times[p.name] > 1),
+        T_base_frame=stated_pose(reader.pose, "frame", frame),
+        T_flange_tool=stated_pose(reader.pose, "tool", tool),
+        repeated=tuple(p.name for p in points if times[p.name] > 1),
         other=tuple(p.name for p in told if not p.is_target),
-        unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(_plain(reader, text))),
+        unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(_without_comments(reader, text))),
     )
 
 
@@ -97,7 +97,7 @@ def _require_stated(file: Path, taught_in: str | None, lacking: list[str]) -> No
     )
 
 
-def _require_own_motion(file: Path, points: Sequence[Taught]) -> None:
+def _require_own_motion(file: Path, points: Sequence[TaughtPoint]) -> None:
     """Refuse poses that an arm reaches on an external axis."""
     moved = next((p for p in points if p.moved_by and p.T_frame_tool is not None), None)
     if moved is not None:
@@ -107,13 +107,13 @@ def _require_own_motion(file: Path, points: Sequence[Taught]) -> None:
         )
 
 
-def _plain(reader: ModuleType, text: str) -> str:
+def _without_comments(reader: ModuleType, text: str) -> str:
     """The text without comments; lengths stay."""
     mark = {kuka: ";", universal: "#", abb: "!"}.get(reader)
     return text if mark is None else without_comments(text, mark)
 
 
-def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
+def stated_pose(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
     """(4, 4) mm of the numbers that a person states as the controller shows them; the unit matrix without any.
 
     Raises:
@@ -133,7 +133,7 @@ def given(pose: Callable[[Array], Array], name: str, value: str | None) -> Array
         raise InputError(f"--{name} {value}: {error}") from None
 
 
-def require_one_frame(file: Path, points: Sequence[Taught]) -> str | None:
+def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
     """Frame and tool of all poses as the file calls them, "" where it does not say of all; None without poses.
 
     Raises:

@@ -16,7 +16,7 @@ Span = tuple[int, int]  # begin and end in a text
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenNumber:
     """A number as a program has it, and where."""
 
     value: float
@@ -24,7 +24,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Taught:
+class TaughtPoint:
     """One point of a program: a pose, joint angles, or both."""
 
     name: str
@@ -55,10 +55,10 @@ def quaternion_w_first(numbers: Array) -> Array:
     Raises:
         ValueError: not a unit quaternion.
     """
-    return posed(np.asarray(numbers[:3], float), np.asarray(numbers, float)[[4, 5, 6, 3]])
+    return pose_from_quaternion(np.asarray(numbers[:3], float), np.asarray(numbers, float)[[4, 5, 6, 3]])
 
 
-def posed(position: Array, quaternion: Array) -> Array:
+def pose_from_quaternion(position: Array, quaternion: Array) -> Array:
     """Pose (4, 4) from a position (3,) and a unit quaternion (4,), w last.
 
     Raises:
@@ -76,16 +76,16 @@ def rotation_vector(numbers: Array) -> Array:
     return frames.make(Rotation.from_rotvec(numbers[3:6]).as_matrix(), numbers[:3] * 1000)
 
 
-def taught(
+def taught_point(
     name: str,
     line: int,
-    fields: Mapping[str, Written],
+    fields: Mapping[str, WrittenNumber],
     axes: str,
     pose: Callable[[Array], Array],
     *,
     joint: str,
     frame: str = "",
-) -> Taught | None:
+) -> TaughtPoint | None:
     """A point with the pose from the fields named by `axes`, else the joint angles from fields joint1, joint2, …
 
     Args:
@@ -100,12 +100,12 @@ def taught(
         own = [fields[axis] for axis in axes]
         T_frame_tool = pose(np.array([number.value for number in own]))
         spans = tuple(number.span for number in own)
-        return Taught(name, line, T_frame_tool, None, frame, pose_at=spans, moved_by=moved_by)
+        return TaughtPoint(name, line, T_frame_tool, None, frame, pose_at=spans, moved_by=moved_by)
     own = [fields[f"{joint}{i}"] for i in range(1, 10) if f"{joint}{i}" in fields]
     if len(own) < _FEWEST_JOINTS:
         return None
     joints = np.radians([number.value for number in own])
-    return Taught(name, line, None, joints, frame, joints_at=tuple(number.span for number in own))
+    return TaughtPoint(name, line, None, joints, frame, joints_at=tuple(number.span for number in own))
 
 
 def program_text(file: Path) -> str:

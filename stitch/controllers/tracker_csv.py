@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import fixed_xyz, posed
+from stitch.controllers.taught import fixed_xyz, pose_from_quaternion
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import finite_number
 
 CONVENTION = "quaternion by its letters, or Rx, Ry, Rz in degrees about fixed x, y, z: Rz·Ry·Rx; mm or m by the header"
 
@@ -25,7 +25,7 @@ _ANGLES = ("rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
-class Measured:
+class TrackerPoint:
     """One measurement of the tracker."""
 
     name: str
@@ -34,7 +34,7 @@ class Measured:
     T_sensor_probe: Array | None  # (4, 4) mm, for 6D probes
 
 
-def columns(text: str) -> tuple[list[str], str]:
+def split_header(text: str) -> tuple[list[str], str]:
     """Names of the columns, lower case without units, and the separator."""
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((s for s in ";\t," if s in first), ",")
@@ -42,13 +42,13 @@ def columns(text: str) -> tuple[list[str], str]:
     return [name.removesuffix("deg") for name in plain], separator
 
 
-def read(file: Path, text: str) -> list[Measured]:
+def read(file: Path, text: str) -> list[TrackerPoint]:
     """Measurements in the order of the file.
 
     Raises:
         InputError: names the line and how to fix it.
     """
-    header, separator = columns(text)
+    header, separator = split_header(text)
     if not all(axis in header for axis in "xyz"):
         raise InputError(f"{file} line 1: no columns x, y, z; the header has {', '.join(header)}")
     first = text.strip().splitlines()[0].lower()
@@ -60,7 +60,7 @@ def read(file: Path, text: str) -> list[Measured]:
             f"{file} line 1: rx, ry, rz may be degrees or a rotation vector; write Rx (deg) … for a tracker's angles, "
             "actual_TCP_pose_0 … for a UR's pose"
         )
-    out: list[Measured] = []
+    out: list[TrackerPoint] = []
     reader = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
     rows = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     for line, cells in rows[1:]:
@@ -70,8 +70,8 @@ def read(file: Path, text: str) -> list[Measured]:
         if separator != ",":
             row = {key: cell.replace(",", ".") for key, cell in row.items()}
         name = next((row[n].strip() for n in _NAMES if row.get(n, "").strip()), f"m{len(out) + 1}")
-        position = scale * np.array([number(file, line, axis, row[axis]) for axis in "xyz"])
-        out.append(Measured(name, line, position, _pose(file, line, row, position, quaternion, angles)))
+        position = scale * np.array([finite_number(file, line, axis, row[axis]) for axis in "xyz"])
+        out.append(TrackerPoint(name, line, position, _pose(file, line, row, position, quaternion, angles)))
     return out
 
 
@@ -79,11 +79,11 @@ def _pose(
     file: Path, line: int, row: dict[str, str], position: Array, quaternion: tuple[str, ...] | None, angles: bool
 ) -> Array | None:
     if angles:
-        return fixed_xyz(np.append(position, [number(file, line, n, row[n]) for n in _ANGLES]))
+        return fixed_xyz(np.append(position, [finite_number(file, line, n, row[n]) for n in _ANGLES]))
     if quaternion is None:
         return None
-    q = np.array([number(file, line, n, row[n]) for n in quaternion])
+    q = np.array([finite_number(file, line, n, row[n]) for n in quaternion])
     try:
-        return posed(position, q)
+        return pose_from_quaternion(position, q)
     except ValueError as error:
         raise InputError(f"{file} line {line}: {error}") from None

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import Taught, line_of, rotation_vector, without_comments
+from stitch.controllers.taught import TaughtPoint, line_of, rotation_vector, without_comments
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.csv_number import is_number, number
+from stitch.reading.csv_number import finite_number, is_number
 
 CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
 pose = rotation_vector
@@ -31,20 +31,20 @@ _POSE = tuple([f"{kind}_TCP_pose_{i}" for i in range(6)] for kind in ("actual", 
 _JOINTS = tuple([f"{kind}_q_{i}" for i in range(6)] for kind in ("actual", "target"))
 
 
-def read(file: Path, text: str) -> list[Taught]:
+def read(file: Path, text: str) -> list[TaughtPoint]:
     """Points of a .script, or one per row of a .csv.
 
     Raises:
         InputError: names the line and how to fix it.
     """
-    return _table(file, text) if file.suffix.lower() == ".csv" else _script(file, text)
+    return _read_recording(file, text) if file.suffix.lower() == ".csv" else _read_script(file, text)
 
 
-def _script(file: Path, text: str) -> list[Taught]:
+def _read_script(file: Path, text: str) -> list[TaughtPoint]:
     clean = without_comments(text, "#")
     found = [(m.start(), m[1], m[2], m.span(3)) for m in _NAMED.finditer(clean)]
     found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m.span(2)) for m in _MOVE.finditer(clean)]
-    points: dict[str, Taught] = {}
+    points: dict[str, TaughtPoint] = {}
     for position, name, kind, (begin, end) in sorted(found):
         spans = tuple((begin + m.start(), begin + m.end()) for m in _CELL.finditer(clean[begin:end]))
         cells = [clean[slice(*span)] for span in spans]
@@ -59,16 +59,16 @@ def _script(file: Path, text: str) -> list[Taught]:
             raise InputError(f"{file} line {line}: the target is computed while the program runs; write its numbers")
         values = np.array([float(cell) for cell in cells])
         base = re.sub(r"_[pq]$", "", name)
-        before = points.get(base, Taught(base, line, None, None))
+        before = points.get(base, TaughtPoint(base, line, None, None))
         if kind:
             points[base] = replace(before, T_frame_tool=rotation_vector(values), pose_at=spans)
         else:
             points[base] = replace(before, joints=values, joints_at=spans)
     used = {name for m in _USED.finditer(clean) for name in re.findall(r"\w+", m[1])}
-    return [replace(p, is_target=_moved_to(p, used)) for p in points.values()]
+    return [replace(p, is_target=_is_motion_target(p, used)) for p in points.values()]
 
 
-def _moved_to(point: Taught, used: set[str]) -> bool:
+def _is_motion_target(point: TaughtPoint, used: set[str]) -> bool:
     """Whether a motion names the point: other poses are tools and planes."""
     return point.name.startswith("line") or not used.isdisjoint({point.name, f"{point.name}_p", f"{point.name}_q"})
 
@@ -80,7 +80,7 @@ def is_recording(text: str) -> bool:
     return any(all(name in header for name in names) for names in (*_POSE, *_JOINTS))
 
 
-def _table(file: Path, text: str) -> list[Taught]:
+def _read_recording(file: Path, text: str) -> list[TaughtPoint]:
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     separator = _separator(lines[0][1])
     rows = list(csv.reader([line for _, line in lines], delimiter=separator, skipinitialspace=True))
@@ -91,8 +91,10 @@ def _table(file: Path, text: str) -> list[Taught]:
         if len(row) < len(header):
             raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
         cells = dict(zip(header, row, strict=False))
-        T = None if pose is None else rotation_vector(_values(file, line, cells, pose))
-        out.append(Taught(f"row{line}", line, T, None if joints is None else _values(file, line, cells, joints)))
+        T = None if pose is None else rotation_vector(_row_values(file, line, cells, pose))
+        out.append(
+            TaughtPoint(f"row{line}", line, T, None if joints is None else _row_values(file, line, cells, joints))
+        )
     return out
 
 
@@ -100,5 +102,5 @@ def _separator(header: str) -> str:
     return next((s for s in ",;\t" if s in header), " ")
 
 
-def _values(file: Path, line: int, cells: dict[str, str], names: list[str]) -> Array:
-    return np.array([number(file, line, name, cells[name]) for name in names])
+def _row_values(file: Path, line: int, cells: dict[str, str], names: list[str]) -> Array:
+    return np.array([finite_number(file, line, name, cells[name]) for name in names])

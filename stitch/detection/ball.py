@@ -14,7 +14,7 @@ _LARGEST = 3.0
 # Points for the search and the fit of one view; the joint fit sees all of them.
 _POINTS = 3000
 # Points this many robust sigmas off the fitted circle or sphere are of something else.
-_GATE = 6.0
+_OUTLIER_GATE = 6.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def refine_ball(points: Array, centre: Array, radius: float, known: float | None
             break
         x = least_squares(_distances, x, args=(kept, known), loss="soft_l1", f_scale=scale, x_scale="jac").x
         scale = max(1.4826 * float(np.median(np.abs(_distances(x, kept, known)))), 1e-9 * scale)
-        inside, gate = _distances(x, thin, known), _GATE * scale
+        inside, gate = _distances(x, thin, known), _OUTLIER_GATE * scale
     off = _distances(x, points, known)
     k, keep, sigma = points.shape[1], np.abs(off) < gate, scale
     outward = points[keep] - x[:k]

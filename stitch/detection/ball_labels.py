@@ -16,14 +16,14 @@ from stitch import frames
 from stitch.frames import Array, Indices
 
 # Distances agree within this share, and within so many sigmas.
-_SHARE, _SIGMAS = 0.004, 5.0
+_DISTANCE_SHARE, _DISTANCE_SIGMAS = 0.004, 5.0
 # Radii that differ by less belong together.
 _RADIUS_SHARE = 0.04
 # Another way counts as as good if its rms is at most so many times larger.
 _CLEARLY = 3.0
 # Angles of scanner and flange agree within (rad): hundredths of a degree of poses, tenths of balls close together.
 _ANGLE = np.radians(2.0)
-_FEWEST = 3
+_MIN_COMMON_BALLS = 3
 # Steps of the search for one view: a grid of many balls has more, and its ways are alike anyway.
 _MOST_STEPS = 100_000
 
@@ -39,7 +39,7 @@ class ViewBalls:
 
 
 @dataclass(frozen=True)
-class _Placed:
+class _Arrangement:
     """The arrangement so far: a place and a kind for each name, in the frame of the first view."""
 
     places: Array  # (K, 3)
@@ -52,24 +52,24 @@ def label_balls(views: Sequence[ViewBalls]) -> list[list[int | None]]:
 
     Numbers run by radius, then as they were found.
     """
-    kinds = _kinds(views)
+    kinds = _radius_classes(views)
     order = sorted(range(len(views)), key=lambda v: -len(kinds[v]))
     names: list[list[int | None]] = [[None] * len(k) for k in kinds]
     if not order or not len(kinds[order[0]]):
         return names
     single = {kind for kind in np.unique(np.concatenate(kinds)) if all((k == kind).sum() < 2 for k in kinds)}
     first = order[0]
-    arrangement = _Placed(views[first].centres, kinds[first], ((first, np.eye(3)),))
-    if len(kinds[first]) >= _FEWEST or all(kind in single for kind in kinds[first]):
+    arrangement = _Arrangement(views[first].centres, kinds[first], ((first, np.eye(3)),))
+    if len(kinds[first]) >= _MIN_COMMON_BALLS or all(kind in single for kind in kinds[first]):
         names[first] = list(range(len(kinds[first])))
     # A view that shares too little with the first may share enough with what the others have added.
     waiting = order[1:]
     while waiting:
         grown = []
         for v in waiting:
-            way = _best_way(arrangement, views, v, kinds[v])
+            way = _best_matching(arrangement, views, v, kinds[v])
             if way is not None:
-                names[v], arrangement = _laid(arrangement, views[v], kinds[v], way, v)
+                names[v], arrangement = _extend_arrangement(arrangement, views[v], kinds[v], way, v)
                 grown.append(v)
         waiting = [v for v in waiting if v not in grown]
         if not grown:
@@ -88,7 +88,7 @@ def _by_radius(names: list[list[int | None]], kinds: Indices) -> list[list[int |
     return [[None if name is None else rank[name] for name in own] for own in names]
 
 
-def _kinds(views: Sequence[ViewBalls]) -> list[Indices]:
+def _radius_classes(views: Sequence[ViewBalls]) -> list[Indices]:
     """Per view the class of each radius, from the smallest."""
     radii = np.concatenate([view.radii for view in views]) if views else np.zeros(0)
     ordered = np.sort(radii)
@@ -96,31 +96,33 @@ def _kinds(views: Sequence[ViewBalls]) -> list[Indices]:
     return [np.searchsorted(edges, view.radii, side="right") for view in views]
 
 
-def _best_way(arrangement: _Placed, views: Sequence[ViewBalls], v: int, kinds: Indices) -> list[tuple[int, int]] | None:
+def _best_matching(
+    arrangement: _Arrangement, views: Sequence[ViewBalls], v: int, kinds: Indices
+) -> list[tuple[int, int]] | None:
     """Pairs (ball of the view, name) of the one way in which most balls fit; None where there is none or several."""
     view = views[v]
-    ways = _ways(arrangement, view, kinds)
+    ways = _largest_matchings(arrangement, view, kinds)
     if not ways:
         return None
-    rated = sorted(((_motion(arrangement, view, way), way) for way in ways), key=lambda pair: pair[0][1])
+    rated = sorted(((_matching_motion(arrangement, view, way), way) for way in ways), key=lambda pair: pair[0][1])
     floor = float(view.sigma.mean()) + 1e-12
     close = [(T, way) for (T, rms), way in rated if rms <= _CLEARLY * max(rated[0][0][1], floor)]
     if len(close) > 1:
-        close = [(T, way) for T, way in close if _turned_alike(arrangement, views, v, T)]
+        close = [(T, way) for T, way in close if _rotation_agrees(arrangement, views, v, T)]
     return close[0][1] if len(close) == 1 else None
 
 
-def _ways(arrangement: _Placed, view: ViewBalls, kinds: Indices) -> list[list[tuple[int, int]]]:
+def _largest_matchings(arrangement: _Arrangement, view: ViewBalls, kinds: Indices) -> list[list[tuple[int, int]]]:
     """Every largest set of pairs whose distances agree: cliques, ball by ball; none where the search is too long."""
     K, B = len(arrangement.places), len(kinds)
     there = np.linalg.norm(arrangement.places[:, None] - arrangement.places[None], axis=2)
     here = np.linalg.norm(view.centres[:, None] - view.centres[None], axis=2)
-    room = _SHARE * here + _SIGMAS * np.hypot(view.sigma[:, None], view.sigma[None])
+    room = _DISTANCE_SHARE * here + _DISTANCE_SIGMAS * np.hypot(view.sigma[:, None], view.sigma[None])
     found, steps = [list[tuple[int, int]]()], [0]
 
     def grow(b: int, way: list[tuple[int, int]]) -> None:
         steps[0] += 1
-        most = max(_FEWEST, len(found[0]))
+        most = max(_MIN_COMMON_BALLS, len(found[0]))
         if len(way) + B - b < most or steps[0] > _MOST_STEPS:
             return
         if b == B:
@@ -136,16 +138,18 @@ def _ways(arrangement: _Placed, view: ViewBalls, kinds: Indices) -> list[list[tu
     return found if found[0] and steps[0] <= _MOST_STEPS else []
 
 
-def _motion(arrangement: _Placed, view: ViewBalls, way: Sequence[tuple[int, int]]) -> tuple[Array, float]:
+def _matching_motion(
+    arrangement: _Arrangement, view: ViewBalls, matching: Sequence[tuple[int, int]]
+) -> tuple[Array, float]:
     """T_arrangement_scanner (4, 4) of a way and the rms distance that it leaves (Arun, Huang & Blostein 1987)."""
-    own, other = view.centres[[b for b, _ in way]], arrangement.places[[k for _, k in way]]
+    own, other = view.centres[[b for b, _ in matching]], arrangement.places[[k for _, k in matching]]
     a, b = own - own.mean(axis=0), other - other.mean(axis=0)
     R = frames.nearest_rotation(b.T @ a)
     left = float(np.sqrt(np.mean(np.sum((b - a @ R.T) ** 2, axis=1))))
     return frames.make(R, other.mean(axis=0) - R @ own.mean(axis=0)), left
 
 
-def _turned_alike(arrangement: _Placed, views: Sequence[ViewBalls], v: int, T: Array) -> bool:
+def _rotation_agrees(arrangement: _Arrangement, views: Sequence[ViewBalls], v: int, T: Array) -> bool:
     """Whether the scanner has turned by the flange's angle since each view that is placed."""
     own = views[v].R_flange
     for w, R in arrangement.views:
@@ -159,12 +163,12 @@ def _angle(R: Array) -> float:
     return float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
 
 
-def _laid(
-    arrangement: _Placed, view: ViewBalls, kinds: Indices, way: Sequence[tuple[int, int]], v: int
-) -> tuple[list[int | None], _Placed]:
+def _extend_arrangement(
+    arrangement: _Arrangement, view: ViewBalls, kinds: Indices, matching: Sequence[tuple[int, int]], v: int
+) -> tuple[list[int | None], _Arrangement]:
     """Names of the view's balls; those that are new join the arrangement."""
-    T, _ = _motion(arrangement, view, way)
-    named = dict(way)
+    T, _ = _matching_motion(arrangement, view, matching)
+    named = dict(matching)
     places, classes, names = list(arrangement.places), list(arrangement.kinds), list[int | None]()
     for b, centre in enumerate(frames.transform(T, view.centres)):
         taken = np.linalg.norm(np.array(places) - centre, axis=1) < view.radii[b]
@@ -174,4 +178,4 @@ def _laid(
             classes.append(kinds[b])
         # One that is there already, at another distance than it should have, stays without a name.
         names.append(named.get(b))
-    return names, _Placed(np.array(places), np.array(classes), (*arrangement.views, (v, T[:3, :3])))
+    return names, _Arrangement(np.array(places), np.array(classes), (*arrangement.views, (v, T[:3, :3])))

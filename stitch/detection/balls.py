@@ -13,17 +13,17 @@ from scipy.spatial import cKDTree
 
 from stitch.detection.ball import Ball, refine_ball
 from stitch.frames import Array, Mask
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 
 # Radii looked for at one thinning, in its spacing: a cap of 60° then has 30 to 600 points.
 _RADII = (3.0, 14.0)
 # Neighbours that pairs are drawn from, pairs a point, and pairs in all.
 _NEIGHBOURS, _PAIRS, _MOST = 48, 8, 30000
 # Sine of the least angle between normals of a pair; how far its two centres may lie apart, of the radius.
-_TURNED, _APART = 0.3, 0.15
+_MIN_NORMAL_ANGLE, _MIN_PAIR_DISTANCE = 0.3, 0.15
 # Votes lie together within this share of the radius; fewer make no candidate; candidates a thinning.
-_TOGETHER, _VOTES, _CANDIDATES = 0.1, 8, 12
-_FEWEST = 60
+_VOTE_RADIUS, _VOTES, _CANDIDATES = 0.1, 8, 12
+_MIN_BALL_POINTS = 60
 # Robust sigma about a ball, of its radius, unless the scan is noisier: then of the noise.
 _ROUND, _NOISES = 0.006, 3.0
 # The cap that must be covered: its half angle, the number of equal cells on the whole sphere, and the share of it that
@@ -35,7 +35,7 @@ _THINNEST, _THICKEST = 150, 200_000
 
 
 @dataclass(frozen=True)
-class _Level:
+class _ThinningLevel:
     points: Array  # (N, 3)
     normals: Array  # (N, 3) towards the scanner
     spacing: float
@@ -48,34 +48,34 @@ def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> li
         limits: of the radius.
     """
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < _FEWEST:
+    if len(points) < _MIN_BALL_POINTS:
         return []
-    noise = prepare_view("", points, np.arange(0, len(points), max(1, len(points) // 2000))).noise
+    noise = prepare_scan("", points, np.arange(0, len(points), max(1, len(points) // 2000))).noise
     found: list[Ball] = []
-    for level in _levels(points, *limits):
+    for level in _thinning_levels(points, *limits):
         for centre, radius in _candidates(level):
             if any(np.linalg.norm(centre - ball.centre) < 0.5 * ball.radius for ball in found):
                 continue
-            ball = _confirmed(points, centre, radius, noise)
+            ball = _confirmed_ball(points, centre, radius, noise)
             if ball is not None and limits[0] <= ball.radius <= limits[1]:
                 found.append(ball)
-    return _apart(found)
+    return _without_overlaps(found)
 
 
-def _levels(points: Array, smallest: float, largest: float) -> list[_Level]:
+def _thinning_levels(points: Array, min_radius: float, max_radius: float) -> list[_ThinningLevel]:
     """Ever thinner scans, from the scan's own spacing on; those that show balls of the radii looked for."""
-    out: list[_Level] = []
+    out: list[_ThinningLevel] = []
     spacing = float(np.median(cKDTree(points).query(points[:: max(1, len(points) // 500)], k=2)[0][:, 1]))
     size = 1.5 * max(spacing, 1e-9 * float(np.ptp(points)))
     while True:
         thin = _thinned(points, size)
         if len(thin) < _THINNEST:
             return out
-        if len(thin) <= _THICKEST and size * _RADII[1] > smallest:
-            scan = prepare_view("", thin)
-            out.append(_Level(scan.points, scan.normals, size))
+        if len(thin) <= _THICKEST and size * _RADII[1] > min_radius:
+            scan = prepare_scan("", thin)
+            out.append(_ThinningLevel(scan.points, scan.normals, size))
         size *= 2.0
-        if size * _RADII[0] > largest:
+        if size * _RADII[0] > max_radius:
             return out
 
 
@@ -87,7 +87,7 @@ def _thinned(points: Array, size: float) -> Array:
     return np.stack([np.bincount(voxel, column) / count for column in points.T], axis=1)
 
 
-def _candidates(level: _Level) -> list[tuple[Array, float]]:
+def _candidates(level: _ThinningLevel) -> list[tuple[Array, float]]:
     """Centres and radii that many pairs agree on, the best first."""
     rng = np.random.default_rng(0)
     N, count = len(level.points), min(_NEIGHBOURS, len(level.points) - 1)
@@ -98,8 +98,8 @@ def _candidates(level: _Level) -> list[tuple[Array, float]]:
     square = np.einsum("ij,ij->i", turn, turn)
     radius = np.einsum("ij,ij->i", apart, turn) / np.maximum(square, 1e-12)
     ends = [level.points[i] - radius[:, None] * level.normals[i] for i in (first, second)]
-    good = (square > _TURNED**2) & (radius > _RADII[0] * level.spacing) & (radius < _RADII[1] * level.spacing)
-    good &= np.linalg.norm(ends[0] - ends[1], axis=1) < _APART * radius
+    good = (square > _MIN_NORMAL_ANGLE**2) & (radius > _RADII[0] * level.spacing) & (radius < _RADII[1] * level.spacing)
+    good &= np.linalg.norm(ends[0] - ends[1], axis=1) < _MIN_PAIR_DISTANCE * radius
     centre, radius = (ends[0] + ends[1])[good] / 2, radius[good]
     if len(centre) > _MOST:
         picked = rng.choice(len(centre), _MOST, replace=False)
@@ -107,19 +107,19 @@ def _candidates(level: _Level) -> list[tuple[Array, float]]:
     if not len(centre):
         return []
     tree = cKDTree(centre)
-    votes = tree.query_ball_point(centre, _TOGETHER * radius, return_length=True)
+    votes = tree.query_ball_point(centre, _VOTE_RADIUS * radius, return_length=True)
     out: list[tuple[Array, float]] = []
     free = votes >= _VOTES
     while free.any() and len(out) < _CANDIDATES:
         i = int(np.argmax(np.where(free, votes, 0)))
-        around = tree.query_ball_point(centre[i], _TOGETHER * radius[i])
+        around = tree.query_ball_point(centre[i], _VOTE_RADIUS * radius[i])
         out.append((np.median(centre[around], axis=0), float(np.median(radius[around]))))
         free &= np.linalg.norm(centre - out[-1][0], axis=1) > 0.5 * out[-1][1]
         free[i] = False
     return out
 
 
-def _confirmed(points: Array, centre: Array, radius: float, noise: float) -> Ball | None:
+def _confirmed_ball(points: Array, centre: Array, radius: float, noise: float) -> Ball | None:
     """The ball there, fitted to all points; None where there is none."""
     local = points[np.linalg.norm(points - centre, axis=1) < 1.3 * radius]
     # Most candidates are none: seen at once, without a fit.
@@ -127,10 +127,10 @@ def _confirmed(points: Array, centre: Array, radius: float, noise: float) -> Bal
     if not _is_cap(local, centre, near, _ROUGHLY_COVERED):
         return None
     for _ in range(2):
-        if len(local) < _FEWEST:
+        if len(local) < _MIN_BALL_POINTS:
             return None
         ball = refine_ball(local, centre, radius)
-        if not 0.6 * radius < ball.radius < 1.6 * radius or ball.keep.sum() < _FEWEST:
+        if not 0.6 * radius < ball.radius < 1.6 * radius or ball.keep.sum() < _MIN_BALL_POINTS:
             return None
         centre, radius = ball.centre, ball.radius
         local = points[np.linalg.norm(points - centre, axis=1) < 1.3 * radius]
@@ -141,7 +141,7 @@ def _confirmed(points: Array, centre: Array, radius: float, noise: float) -> Bal
 
 def _is_cap(local: Array, centre: Array, on_ball: Mask, share: float) -> bool:
     """Whether the points on the ball cover a cap of it around the middle of what is seen, and nothing else is there."""
-    if on_ball.sum() < _FEWEST:
+    if on_ball.sum() < _MIN_BALL_POINTS:
         return False
     outward = local - centre
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
@@ -164,10 +164,10 @@ def _even_directions() -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _apart(found: list[Ball]) -> list[Ball]:
+def _without_overlaps(balls: list[Ball]) -> list[Ball]:
     """Balls that do not overlap; of two that do, the one with more points."""
     out: list[Ball] = []
-    for ball in sorted(found, key=lambda ball: -int(ball.keep.sum())):
+    for ball in sorted(balls, key=lambda ball: -int(ball.keep.sum())):
         if all(np.linalg.norm(ball.centre - b.centre) > 0.7 * max(ball.radius, b.radius) for b in out):
             out.append(ball)
     return out

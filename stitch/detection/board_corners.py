@@ -14,7 +14,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 
 # Fewer corners of a board hold it on nothing.
-_FEWEST = 4
+_MIN_BOARD_CORNERS = 4
 # Largest half width of the window in which corners are refined, of the distance to the next.
 _REFINED = 0.25
 
@@ -38,7 +38,7 @@ def find_corners(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corner
         InputError: a dictionary that OpenCV does not have, or a checkerboard that looks the same turned round.
     """
     finder = {"charuco": _charuco, "checkerboard": _checkerboard, "apriltag": _tags}[board.kind]
-    return [found for found in finder(np.ascontiguousarray(grey), board, cv2) if len(found.names) >= _FEWEST]
+    return [found for found in finder(np.ascontiguousarray(grey), board, cv2) if len(found.names) >= _MIN_BOARD_CORNERS]
 
 
 def _dictionary(board: Board, cv2: Any) -> Any:

@@ -11,42 +11,42 @@ from stitch.frames import Array, Mask
 from stitch.measurement.range_image import RangeImage
 
 # Pixels around a corner, and how many must have measured something.
-_SMALLEST, _LARGEST = 3, 25
-_FEWEST, _SHARE = 12, 0.3
+_MIN_WINDOW, _MAX_WINDOW = 3, 25
+_MIN_WINDOW_PIXELS, _SHARE = 12, 0.3
 # Pixels further off the plane than so many robust sigmas belong to something else.
-_GATE = 3.5
+_PLANE_GATE = 3.5
 _DRAWS = 40
 # The pixels that are left lie around the point: their middle is this much of the window's radius off at most.
-_ASIDE = 0.5
+_MAX_OFFSET_SHARE = 0.5
 # Of the window's size.
 _ROUNDED = 1e-6
 
 
-def lift(image: RangeImage, pixels: Array, radius: Array, pixel_sigma: float) -> tuple[Array, Array]:
+def lift_points(image: RangeImage, pixels: Array, radius: Array, pixel_sigma: float) -> tuple[Array, Array]:
     """Places (K, 3) and sigma of a coordinate (K,) of image points (K, 2); NaN where too little was measured.
 
     Args:
         radius: (K,) half width of the window, pixels.
         pixel_sigma: of the image points themselves, pixels.
     """
-    found = [_lifted(image, pixel, r, pixel_sigma) for pixel, r in zip(pixels, radius, strict=True)]
+    found = [_lift_pixel(image, pixel, r, pixel_sigma) for pixel, r in zip(pixels, radius, strict=True)]
     return np.array([point for point, _ in found]).reshape(-1, 3), np.array([sigma for _, sigma in found])
 
 
-def _lifted(image: RangeImage, pixel: Array, radius: float, pixel_sigma: float) -> tuple[Array, float]:
+def _lift_pixel(image: RangeImage, pixel: Array, radius: float, pixel_sigma: float) -> tuple[Array, float]:
     nothing = np.full(3, np.nan), float("nan")
-    reach = int(np.clip(round(radius), _SMALLEST, _LARGEST))
+    reach = int(np.clip(round(radius), _MIN_WINDOW, _MAX_WINDOW))
     column, row = (round(float(x)) for x in pixel)
     rows, columns = (np.arange(max(x - reach, 0), x + reach + 1) for x in (row, column))
     window = image.points[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     v, u = np.mgrid[rows[0] : rows[0] + window.shape[0], columns[0] : columns[0] + window.shape[1]]
     seen = np.isfinite(window).all(axis=2)
-    if seen.sum() < max(_FEWEST, _SHARE * (2 * reach + 1) ** 2):
+    if seen.sum() < max(_MIN_WINDOW_PIXELS, _SHARE * (2 * reach + 1) ** 2):
         return nothing
     points, offset = window[seen], np.stack([u[seen], v[seen]], axis=1) - pixel
     kept = _on_plane(points)
     points, offset = points[kept], offset[kept]
-    if len(points) < _FEWEST or np.linalg.norm(offset.mean(axis=0)) > _ASIDE * reach:
+    if len(points) < _MIN_WINDOW_PIXELS or np.linalg.norm(offset.mean(axis=0)) > _MAX_OFFSET_SHARE * reach:
         return nothing
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
@@ -82,10 +82,10 @@ def _on_plane(points: Array) -> Mask:
     best = int(np.argmin(np.median(off, axis=1)))
     # Without noise the scatter is what numbers are rounded to.
     floor = _ROUNDED * float(np.linalg.norm(np.ptp(points, axis=0)))
-    kept = off[best] <= _GATE * 1.4826 * np.median(off[best]) + floor
+    kept = off[best] <= _PLANE_GATE * 1.4826 * np.median(off[best]) + floor
     for _ in range(3):
         middle = points[kept].mean(axis=0)
         normal = np.linalg.svd(points[kept] - middle, full_matrices=False)[2][2]
         off_now: Array = np.abs((points - middle) @ normal)
-        kept = off_now <= _GATE * 1.4826 * np.median(off_now[kept]) + floor
+        kept = off_now <= _PLANE_GATE * 1.4826 * np.median(off_now[kept]) + floor
     return np.asarray(kept, bool)

@@ -9,7 +9,7 @@ import numpy as np
 from stitch.effects.contract import EFFECTS, Effect, Parameter
 from stitch.effects.empirical import empirical_effects
 from stitch.effects.groups import by_joint, one_by_one, without_offset
-from stitch.effects.in_session import lacking, parameters_in
+from stitch.effects.in_session import missing_need, parameters_in
 from stitch.frames import Array, Mask
 from stitch.model.term import Term
 from stitch.observations.linear_model import LinearModel
@@ -80,23 +80,23 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
     """Physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones lack."""
     used = linear.model.effects
     library = [e for e in EFFECTS.values() if e.name not in used]
-    missing = {e.name: lacks for e in library if (lacks := lacking(linear.measurement, e))}
+    missing = {e.name: lacks for e in library if (lacks := missing_need(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
     shapes = empirical_effects(linear.measurement.views) if empirical else []
-    effects += [e for e in shapes if not lacking(linear.measurement, e)]
+    effects += [e for e in shapes if not missing_need(linear.measurement, e)]
     terms = [_grid_terms(linear, effect) for effect in effects]
     responses = iter(linear.responses([term for own in terms for term in own]))
-    tried = [_candidate(linear, own, [next(responses) for _ in own]) for own in terms]
+    tried = [_build_candidate(linear, own, [next(responses) for _ in own]) for own in terms]
     return [c for c in tried if c is not None], missing
 
 
 def candidate_of(linear: LinearModel, effect: Effect) -> Candidate | None:
     """One effect as a candidate; None if it has no parameters here."""
     terms = _grid_terms(linear, effect)
-    return _candidate(linear, terms, linear.responses(terms))
+    return _build_candidate(linear, terms, linear.responses(terms))
 
 
-def as_fitted(linear: LinearModel, term: Term) -> Candidate:
+def candidate_as_fitted(linear: LinearModel, term: Term) -> Candidate:
     """An effect with those of its parameters that a fit left in use, as the one form it may have."""
     zero, keep = term.at(np.where(term.gridded, term.values, 0.0)), ~term.gridded & (term.values != 0)
     response = linear.responses([zero])[0].columns
@@ -110,7 +110,7 @@ def _grid_terms(linear: LinearModel, effect: Effect) -> list[Term]:
     return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
 
-def _candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
+def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
     forms = [f for term, r in zip(terms, responses, strict=True) for f in _forms(linear, term, r.columns)]
     if not forms:
         return None
@@ -125,11 +125,11 @@ def _forms(linear: LinearModel, term: Term, response: Array) -> list[Form]:
 def free_masks(term: Term) -> list[Mask]:
     """(P,) parameters that are free in each form of an effect: all together, then those that can be true alone."""
     free = ~term.gridded
-    alone = [free & np.isin(np.arange(len(free)), g) for g in _groups(term.effect, term.parameters)]
+    alone = [free & np.isin(np.arange(len(free)), g) for g in _parameter_groups(term.effect, term.parameters)]
     return [free, *(keep for keep in alone if (keep != free).any())]
 
 
-def _groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+def _parameter_groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
     """Parameters of one joint, or all but an offset; links in single numbers too, and shapes over points in these."""
     if effect.tier == "empirical" and effect.place == "sensor":
         return one_by_one(effect, parameters)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.selection.ranking import Ranked, ranked_all
+from stitch.diagnosis.selection.ranking import Ranked, rank_all
 from stitch.frames import Array
 from stitch.measurement.views import Views
 from stitch.observations.linear_model import LinearModel
@@ -34,7 +34,7 @@ def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Depend
     """
     if linear.pose_errors is not None:
         linear = linear.scatter_only
-        empirical = ranked_all(linear, [r.score.candidate for r in empirical])[1]
+        empirical = rank_all(linear, [r.score.candidate for r in empirical])[1]
     views = linear.measurement.views
     best: dict[str, Ranked] = {}
     for r in empirical:
@@ -42,12 +42,14 @@ def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Depend
         if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
             best[group] = r
     found = [
-        _dependence(linear, r, course) for name, r in best.items() if (course := course_of(views, name)) is not None
+        _dependence(linear, r, course)
+        for name, r in best.items()
+        if (course := covariate_values(views, name)) is not None
     ]
     return sorted(found, key=lambda d: (d.p_value, -d.score))
 
 
-def course_of(views: Views, name: str) -> Array | None:
+def covariate_values(views: Views, name: str) -> Array | None:
     """(V,) values of a covariate, a joint angle in degrees, the time, or the order of the views for an event."""
     if name == "time_s":
         return views.time
@@ -64,14 +66,14 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     basis, s, _ = np.linalg.svd(white, full_matrices=False)
     basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
     share = float(np.sum((basis.T @ linear.white_residual) ** 2) / max(float(np.sum(linear.white_residual**2)), 1e-300))
-    displacement = linear.displaced()
+    displacement = linear.view_displacements()
     # The direction in which the displacements follow the fitted shape most.
-    fitted = linear.observation.at_part(scored.form.columns @ scored.values)
+    fitted = linear.observation.part_displacements(scored.form.columns @ scored.values)
     direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
     y = displacement @ direction
     if np.dot(y, fitted @ direction) < 0:
         y = -y
-    centres, mean, sigma = binned(course, y)
+    centres, mean, sigma = bin_means(course, y)
     effect = scored.candidate.effect
     return Dependence(
         covariate=effect.group if effect.group != "an event" else "view order",
@@ -84,7 +86,7 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     )
 
 
-def binned(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:
+def bin_means(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:
     """Middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
     order = np.argsort(x, kind="stable")
     parts = [p for p in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(p)]

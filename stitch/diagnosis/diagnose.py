@@ -6,35 +6,35 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import on_views_left_out, upheld
+from stitch.diagnosis.conclusion import check_verdict, cross_validate_named
 from stitch.diagnosis.covariate_dependence import dependences
-from stitch.diagnosis.design.next_view import propose
+from stitch.diagnosis.design.next_view import propose_measurements
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.distorted_field import follows_field
 from stitch.diagnosis.plausible_scatter import implausible, scatter_limit
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.selection.pairs import beside_each_other
+from stitch.diagnosis.selection.pairs import score_pair
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.selection.verdict import Selection, select
 from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
-from stitch.diagnosis.sensitivity.detectable import smallest_detectable
+from stitch.diagnosis.sensitivity.detectable import detectable_sizes
 from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
-from stitch.diagnosis.sentences import sentence_of
-from stitch.diagnosis.thresholds import MANY_POSES, MANY_VIEWS, PREDICTED
+from stitch.diagnosis.sentences import diagnosis_sentence
+from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES, MANY_VIEWS
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said, unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
 from stitch.diagnosis.variance_budget import BudgetLine, variance_budget
-from stitch.diagnosis.within_overlaps import left_within, scanner_error
+from stitch.diagnosis.within_overlaps import find_scanner_error, overlap_misfit_beyond_noise
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.state import State
+from stitch.runs.state import RunState
 from stitch.stages.course import linearise
 from stitch.system.heap import return_large_arrays
 from stitch.system.threads import library_threads_off, parallel
 
 
-def diagnose_state(state: State) -> Diagnosis:
+def diagnose_state(state: RunState) -> Diagnosis:
     """Which effect is missing in the model of a run.
 
     Raises:
@@ -43,27 +43,27 @@ def diagnose_state(state: State) -> Diagnosis:
     if len(state.session.views) > MANY_POSES:
         return_large_arrays()
     with library_threads_off():
-        return _diagnosed(state)
+        return _diagnose(state)
 
 
-def _diagnosed(state: State) -> Diagnosis:
+def _diagnose(state: RunState) -> Diagnosis:
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     candidates, missing = candidates_of(linear)
     selection = select(linear, candidates, limit)
-    left_out = on_views_left_out(linear, selection)
-    selection, smooth = upheld(linear, candidates, selection, left_out)
+    left_out = cross_validate_named(linear, selection)
+    selection, smooth = check_verdict(linear, candidates, selection, left_out)
     matrix = alias_matrix(linear, [r.score for r in selection.ranked])
-    examined = _examined(linear, selection, matrix, sum(not c.empirical for c in candidates), left_out)
-    within = left_within(linear, state.session.scanner.noise)
+    examined = _examine_candidates(linear, selection, matrix, sum(not c.empirical for c in candidates), left_out)
+    within = overlap_misfit_beyond_noise(linear, state.session.scanner.noise)
     if within and selection.verdict == "adequate":
         selection = replace(selection, verdict="unknown_effect")
     unknown = selection.verdict == "unknown_effect"
-    unnamed = _unnamed(linear, selection) if unknown else ()
+    unnamed = _repeating_errors(linear, selection) if unknown else ()
     of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     beyond = implausible(linear, limit)
-    said = to_be_said(unnamed, beyond)
-    rotation, translation = _scatter(linear, said)
+    said = reportable(unnamed, beyond)
+    rotation, translation = _pose_scatter(linear, said)
     found = Diagnosis(
         verdict=selection.verdict,
         effects=tuple(r.name for r in selection.named),
@@ -76,65 +76,69 @@ def _diagnosed(state: State) -> Diagnosis:
         candidates=tuple(examined),
         matrix=matrix,
         depends_on=tuple(dependences(linear, selection.empirical)),
-        next=tuple(propose(linear, selection)),
+        next=tuple(propose_measurements(linear, selection)),
         missing=missing,
         linear=linear,
         notes=selection.notes,
         scatter_limit=limit,
         implausible=beyond,
-        unnamed=unnamed,
+        repeating_errors=unnamed,
         curves=curves,
-        over_nothing=selection.over_nothing,
-        within=within,
-        of_field=of_field,
-        smooth=smooth or (scanner_error(linear) if unknown else None),
+        log_odds_over_nothing=selection.log_odds_over_nothing,
+        overlap_misfit=within,
+        follows_field=of_field,
+        scanner_error=smooth or (find_scanner_error(linear) if unknown else None),
         doubts=state.doubts,
-        budget=_budget(linear, selection, said),
+        budget=_error_budget(linear, selection, said),
     )
-    return replace(found, sentence=sentence_of(found, state.session.length_unit, _pair(linear, selection)))
+    return replace(
+        found, sentence=diagnosis_sentence(found, state.session.length_unit, _rescore_pair(linear, selection))
+    )
 
 
-def _pair(linear: LinearModel, selection: Selection) -> tuple[Ranked, Ranked] | None:
+def _rescore_pair(linear: LinearModel, selection: Selection) -> tuple[Ranked, Ranked] | None:
     """Two effects that are missing; of many views they were chosen beside each other."""
     if selection.second is None:
         return None
     first, second = selection.named[0], selection.second
     if linear.measurement.views.count >= MANY_VIEWS:
         return first, second
-    return beside_each_other(linear, first, second, len(selection.ranked))
+    return score_pair(linear, first, second, len(selection.ranked))
 
 
-def _unnamed(linear: LinearModel, selection: Selection) -> tuple[Unnamed, ...]:
+def _repeating_errors(linear: LinearModel, selection: Selection) -> tuple[RepeatingError, ...]:
     """What repeats without a name, asked only where the verdict did not rest on it."""
-    return unnamed_errors(linear) if selection.unnamed is None else selection.unnamed
+    return find_repeating_errors(linear) if selection.repeating_errors is None else selection.repeating_errors
 
 
-def _scatter(linear: LinearModel, said: Sequence[Unnamed]) -> tuple[float, float]:
+def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tuple[float, float]:
     """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
-    process = said[0].process if said else None
-    beside = _beside(linear, said) if said else linear.scatter_only
+    process = reported[0].process if reported else None
+    beside = _with_joint_law(linear, reported) if reported else linear.scatter_only
     rotation, translation = np.sqrt(process.flange_scatter if process else beside.flange_scatter(beside.null))
     return float(rotation), float(translation)
 
 
-def _budget(linear: LinearModel, selection: Selection, said: Sequence[Unnamed]) -> tuple[BudgetLine, ...]:
+def _error_budget(
+    linear: LinearModel, selection: Selection, reported: Sequence[RepeatingError]
+) -> tuple[BudgetLine, ...]:
     """Of what the poses leave, with what is named first and what is said to err without a name."""
-    process = said[0].process if said else None
-    return variance_budget(_beside(linear, said), [r.score for r in selection.named[:1]], process)
+    process = reported[0].process if reported else None
+    return variance_budget(_with_joint_law(linear, reported), [r.score for r in selection.named[:1]], process)
 
 
-def _beside(linear: LinearModel, said: Sequence[Unnamed]) -> LinearModel:
+def _with_joint_law(linear: LinearModel, reported: Sequence[RepeatingError]) -> LinearModel:
     """The views where the joint that is said to err without a name may err so."""
-    laws = said[0].laws if said else ()
+    laws = reported[0].laws if reported else ()
     return laws[0].model if laws else linear
 
 
-def linear_model_of(state: State) -> LinearModel:
+def linear_model_of(state: RunState) -> LinearModel:
     """What a session says beside the model of a run."""
     return linearise(state.session, state.measurement, state.model, state.gate)
 
 
-def _examined(
+def _examine_candidates(
     linear: LinearModel, selection: Selection, matrix: Array, tests: int, left_out: Mapping[str, CrossValidation]
 ) -> list[CandidateEffect]:
     """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes.
@@ -146,11 +150,12 @@ def _examined(
 
     def asked(k: int) -> CandidateEffect:
         ranked, candidate = selection.ranked[k], scores[k].candidate
-        detectable = smallest_detectable(linear, candidate, tests)
+        detectable = detectable_sizes(linear, candidate, tests)
         return CandidateEffect(
             ranked=ranked,
             aliases=tuple(aliases_of(k, matrix, scores)),
-            cross_validation=left_out.get(ranked.name) or (_alone(linear, scores[k]) if k < PREDICTED else None),
+            cross_validation=left_out.get(ranked.name)
+            or (_cross_validate_fitted(linear, scores[k]) if k < CROSS_VALIDATED_CANDIDATES else None),
             detectable=detectable,
             hand_eye=omitted_effect_bias(linear, push, candidate, detectable),
         )
@@ -158,5 +163,5 @@ def _examined(
     return list(parallel(asked, range(len(scores)), "candidate effects on views left out"))
 
 
-def _alone(linear: LinearModel, scored: Score) -> CrossValidation | None:
+def _cross_validate_fitted(linear: LinearModel, scored: Score) -> CrossValidation | None:
     return cross_validate(linear, scored) if scored.observable and scored.fitted else None

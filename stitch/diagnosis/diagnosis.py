@@ -12,7 +12,7 @@ from stitch.diagnosis.sensitivity.aliases import Alias
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_curves import JointCurve
 from stitch.diagnosis.unknown.time_curve import TimeCurve
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed, to_be_said
+from stitch.diagnosis.unknown.unnamed_errors import RepeatingError, reportable
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.frames import Array
@@ -65,13 +65,15 @@ class Diagnosis:
     scatter_limit: ScatterLimit  # what "adequate" is measured against
     implausible: bool  # the poses scatter by more than that
     notes: tuple[str, ...] = ()
-    unnamed: tuple[Unnamed, ...] = ()  # kinds of errors that repeat, where nothing is named
+    repeating_errors: tuple[RepeatingError, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
     curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, along angles and moves
-    over_nothing: float = np.inf  # log odds of what is named over nothing being missing
-    within: float = 0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
-    of_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
-    smooth: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
+    log_odds_over_nothing: float = np.inf  # log odds of what is named over nothing being missing
+    overlap_misfit: float = (
+        0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
+    )
+    follows_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
+    scanner_error: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
     doubts: tuple[
         str, ...
     ] = ()  # of the session as a whole, as sentences: what is found may be no more than their mark
@@ -79,7 +81,7 @@ class Diagnosis:
     @property
     def certain(self) -> bool:
         """False where a name, or a group, is less than 20 to 1 likelier than nothing being missing."""
-        return self.over_nothing > ODDS
+        return self.log_odds_over_nothing > ODDS
 
     def rms_if_added(self, validation: CrossValidation) -> tuple[float, float]:
         """With an effect, in the fit and on views left out, length_unit: shares of what the model leaves there."""
@@ -88,12 +90,12 @@ class Diagnosis:
     @property
     def likelier_than_not(self) -> bool:
         """False where a name, or a group, is less likely than nothing being missing."""
-        return self.over_nothing > 0
+        return self.log_odds_over_nothing > 0
 
     @property
     def time_curve(self) -> TimeCurve | None:
         """What the flange does in a course of time that is said."""
-        return next((u.curve for u in to_be_said(self.unnamed, self.implausible) if u.curve is not None), None)
+        return next((u.curve for u in reportable(self.repeating_errors, self.implausible) if u.curve is not None), None)
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

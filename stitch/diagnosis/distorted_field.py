@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, ODDS
-from stitch.diagnosis.unknown.unnamed_errors import Unnamed
+from stitch.diagnosis.unknown.unnamed_errors import RepeatingError
 from stitch.effects.empirical import FIELD
 
 
-def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[Unnamed]) -> bool:
+def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[RepeatingError]) -> bool:
     """True if the field is the likeliest of all shapes without a cause, 20 to 1 over errors of poses that repeat.
 
     Args:

@@ -77,20 +77,20 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     a = mixed.A.shape[2]
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
     rank, square = _wald(theta, covariance, form.sizes)
-    p = f_tail(square / max(rank, 1), max(rank, 1), _known(linear, form, max(mixed.size - a - rank, 1)))
+    p = f_tail(square / max(rank, 1), max(rank, 1), _scatter_degrees(linear, form, max(mixed.size - a - rank, 1)))
     gained = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(found.values())), scales)
     return FormTrial(gained, p, theta, covariance, integrated.variances, scale)
 
 
-def _known(linear: LinearModel, form: Form, rest: int) -> float:
+def _scatter_degrees(linear: LinearModel, form: Form, rest: int) -> float:
     """Degrees of freedom to which the scatter along the columns of a form is known: fewer than numbers are left, where
     views tell several components apart; among very many numbers as many."""
     if linear.pose_errors is None and linear.mixed.size > LONG:
         return rest
-    return max(linear.satterthwaite.of(linear.in_blocks(linear.residual(form.columns))), 1.0)
+    return max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(linear.residual(form.columns))), 1.0)
 
 
-def residuals(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
+def residual_form_columns(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
     """(n, p) per form what its columns say beside the model; those of one joint are among those of all."""
     whole = candidate.forms[0]
     white = linear.residual(whole.columns)

@@ -7,10 +7,10 @@ from functools import partial
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import score
 from stitch.effects.contract import Effect
-from stitch.effects.in_session import known
+from stitch.effects.in_session import find_effect
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.model.bound import bound
+from stitch.model.bound import bind_to_session
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term, term_of
@@ -18,7 +18,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.stages.course import linearise
 
 
-def with_effects(
+def start_with_effects(
     session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
 ) -> Model:
     """The model with another run's arm in place of its effects, if any, and with further effects by name.
@@ -27,10 +27,12 @@ def with_effects(
         gate: largest distance between partners where the session has scans, length_unit.
     """
     if arm:
-        known_arm = bound(arm, measurement)
+        known_arm = bind_to_session(arm, measurement)
         model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
     linear = partial(linearise, session, measurement, model, gate)
-    return model.with_terms([*model.terms, *_initial_terms(measurement, [known(name) for name in effects], linear)])
+    return model.with_terms(
+        [*model.terms, *_initial_terms(measurement, [find_effect(name) for name in effects], linear)]
+    )
 
 
 def _initial_terms(
@@ -45,10 +47,10 @@ def _initial_terms(
     if not any(term.gridded.any() for term in zero):
         return zero
     linear = linear_now()
-    return [_suggested(linear, term) if term.gridded.any() else term for term in zero]
+    return [_suggest_values(linear, term) if term.gridded.any() else term for term in zero]
 
 
-def _suggested(linear: LinearModel, zero: Term) -> Term:
+def _suggest_values(linear: LinearModel, zero: Term) -> Term:
     candidate = candidate_of(linear, zero.effect)
     if candidate is None:
         return zero

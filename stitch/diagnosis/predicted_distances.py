@@ -6,10 +6,10 @@ import numpy as np
 
 from stitch.diagnosis.score import Score, score
 from stitch.frames import Array
-from stitch.model.forward import moves_points, shift
+from stitch.model.forward import moves_points, scan_correction
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.match import Match, distances
-from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.observations.surfaces.match import Match, signed_distances
+from stitch.observations.surfaces.surface_model import SurfaceObservation
 
 
 def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
@@ -23,30 +23,30 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
     In the order of the matches to which the views were freed. None without clouds.
     """
     surfaces = linear.observation
-    if not isinstance(surfaces, Surfaces):
+    if not isinstance(surfaces, SurfaceObservation):
         return None
     fitted = linear.scatter_only
     if scored is not None and fitted is not linear:
         scored = score(fitted, scored.candidate)
     linear = fitted
-    freed = surfaces.freed
+    freed = surfaces.unconstrained
     poses = surfaces.capture.poses(linear.model.T_mount)
     points = [scan.points for scan in surfaces.capture.scans]
-    twists = linear.design @ linear.present.solve()
+    twists = linear.design @ linear.baseline_trial.solve()
     if scored is not None:
         X, sums = np.hstack([linear.design, scored.form.response]), scored.candidate.points
-        found = linear.trial(X, None if sums is None else sums.of(scored.form.keep)).solve()
+        found = linear.trial(X, None if sums is None else sums.select(scored.form.keep)).solve()
         k = scored.form.response.shape[1]
         term = scored.form.at(found[-k:])
         if moves_points([term]):
             # Such an effect changes the points, and the views only as hand-eye and the others follow.
             twists = X[:, :-k] @ found[:-k]
             measurement, every = linear.measurement, slice(None)
-            points = [p + shift(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
+            points = [p + scan_correction(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
         else:
             twists = X @ found
     matches, centre = freed.overlaps.matches, freed.overlaps.gram.centre
-    return distances(matches, poses, points) + _along_normals(matches, centre, twists.reshape(-1, 6))
+    return signed_distances(matches, poses, points) + _along_normals(matches, centre, twists.reshape(-1, 6))
 
 
 def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Array:

@@ -6,13 +6,13 @@ Poses found from such scans are off too, and an effect that explains some of tha
 from dataclasses import replace
 
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.within_overlaps import scanner_error
+from stitch.diagnosis.within_overlaps import find_scanner_error
 from stitch.model.forward import moves_points
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError
 
 
-def scanner_first(linear: LinearModel, selection: Selection) -> tuple[Selection, FieldError | None]:
+def check_scanner_errors(linear: LinearModel, selection: Selection) -> tuple[Selection, FieldError | None]:
     """A verdict held against what the overlaps show of smooth errors, and those where they are part of the answer.
 
     Where nothing is missing it stays beside the verdict, as long as it is smaller than the noise. A name is not given
@@ -20,13 +20,13 @@ def scanner_first(linear: LinearModel, selection: Selection) -> tuple[Selection,
     """
     unknown = replace(selection, verdict="unknown_effect", named=(), second=None)
     if selection.verdict == "adequate":
-        found = scanner_error(linear)
+        found = find_scanner_error(linear)
         return (unknown if found is not None and found.over_noise else selection), found
     if selection.verdict != "missing_effect":
         return selection, None
     named = selection.named[0]
     said = [r.score.form.term for r in (named, selection.second) if r is not None]
-    found = scanner_error(linear, beside=[term for term in said if moves_points([term])])
+    found = find_scanner_error(linear, other_terms=[term for term in said if moves_points([term])])
     if found is None or found.gain < named.score.log_bayes_factor:
         return selection, None
     return replace(unknown, notes=(f"{named.name} is less clear than that", *selection.notes)), found

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.form_trial import LONG, FormTrial, Gain, gain_at_null, residuals, try_form
+from stitch.diagnosis.form_trial import LONG, FormTrial, Gain, gain_at_null, residual_form_columns, try_form
 from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
@@ -44,7 +44,9 @@ class Score:
     values: Array  # (p,) of the best form, free fit
     covariance: Array  # (p, p); NaN where no form was worth a fit
     scale: float = 1.0  # of the plausible sizes of its parameters, the likeliest
-    beside: LinearModel | None = None  # with the pose errors that remain beside the best form, where these have a prior
+    base_model: LinearModel | None = (
+        None  # with the pose errors that remain beside the best form, where these have a prior
+    )
 
     @property
     def name(self) -> str:
@@ -74,14 +76,14 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     whatever size the views give them.
     """
     base = linear.without([candidate.name])
-    starts = (base, *base.elsewhere)
-    gained, shown = zip(*(_quick(base, at, candidate) for at in starts), strict=True)
+    starts = (base, *base.alternative_starts)
+    gained, shown = zip(*(_gains_at_null(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
     likely = quick.max(axis=1)
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     seen = seen or bool(likely.max() > LOG_BAYES_FACTOR)
     least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
-    worth = [i for i in np.argsort(-likely, kind="stable")[: _refitted(linear)] if likely[i] >= least]
+    worth = [i for i in np.argsort(-likely, kind="stable")[: _count_refitted_forms(linear)] if likely[i] >= least]
     tried = [
         try_form(base, form, starts[start].null.variances, gained[start][i].scale)
         if i in worth and candidate.forms[i].columns.any()
@@ -107,11 +109,11 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         values=values,
         covariance=covariance,
         scale=best.scale,
-        beside=_beside(base, best),
+        base_model=_base_with_candidate(base, best),
     )
 
 
-def _refitted(linear: LinearModel) -> int:
+def _count_refitted_forms(linear: LinearModel) -> int:
     """How many forms of a candidate are worth a fit of their own."""
     size = linear.mixed.size
     if linear.pose_errors is not None and size > LONG:
@@ -119,17 +121,17 @@ def _refitted(linear: LinearModel) -> int:
     return _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
 
 
-def _beside(base: LinearModel, best: FormTrial) -> LinearModel | None:
+def _base_with_candidate(base: LinearModel, best: FormTrial) -> LinearModel | None:
     if base.pose_errors is None or best.variances is None:
         return None
     return replace(base, null=at_variances(base.mixed, best.variances))
 
 
-def _quick(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[Gain], bool]:
+def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[Gain], bool]:
     """What its forms (F,) gain over the base at given variances, which refitted variances can only raise; and whether
     the first form, of all its parameters, is seen."""
     gains, seen = list[Gain](), False
-    for form, white in zip(candidate.forms, residuals(at, candidate), strict=True):
+    for form, white in zip(candidate.forms, residual_form_columns(at, candidate), strict=True):
         if not gains:
             seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN).any())
         gain, here = gain_at_null(at, form, white), 0.5 * (base.null.deviance - at.null.deviance)
@@ -145,7 +147,7 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
     """
 
     def gain(c: Candidate) -> float:
-        pairs = zip(c.forms, residuals(linear, c), strict=True)
+        pairs = zip(c.forms, residual_form_columns(linear, c), strict=True)
         return max(gain_at_null(linear, form, white).log_bayes_factor for form, white in pairs)
 
     gains = np.array(list(parallel(gain, candidates)))
@@ -154,10 +156,10 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
 
 def form_weights(candidate: Candidate) -> Array:
     """(F,) share of the prior of each form."""
-    return weights_of([form.keep for form in candidate.forms])
+    return weights_of_masks([form.keep for form in candidate.forms])
 
 
-def weights_of(masks: Sequence[Mask]) -> Array:
+def weights_of_masks(masks: Sequence[Mask]) -> Array:
     """(F,) the same by free parameters (P,): the full forms share one half, those of single joints the other."""
     kept = np.array([keep.sum() for keep in masks])
     whole = kept == kept[0]

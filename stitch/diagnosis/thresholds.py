@@ -19,25 +19,25 @@ MANY_VIEWS = 100
 # Beyond so many, columns of candidates take a megabyte each, and all of them half a gigabyte.
 MANY_POSES = 1000
 # Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
-AT_ONCE, TRIED = 6, 5
+MAX_JOINT_EFFECTS, CANDIDATES_TRIED = 6, 5
 
 # No arm that is fit for use scatters more than this (rad, mm): several times the repeatability of data sheets
 # (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
 IMPLAUSIBLE = (2.5e-4, 0.12)
 # Smallest share of an effect that must remain when one view is left out.
-STEADY = 0.25
+MIN_STEADINESS = 0.25
 # A p-value below which two halves of the views do not find one and the same: one right effect of a hundred is lost.
-BY_CHANCE = 0.01
+HALVES_P_VALUE = 0.01
 # An effect must shorten the distances on views left out by more than a hundredth to stay in a model (mean square).
-WORTH = 0.99**2
+MAX_REMAINING_SHARE = 0.99**2
 # New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.
-RISE, FALL = 1.05, 0.995
+HELDOUT_RISE, HELDOUT_FALL = 1.05, 0.995
 # An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
-CLEAR, FAINT = 4.0, 2.0
+CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
 
 # Effects whose patterns correlate more than this are aliases in these views.
-SIMILAR = 0.9
+ALIAS_CORRELATION = 0.9
 # λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
-TOLD_APART = 5.4
+SEPARATION_LAMBDA = 5.4
 # Candidates whose prediction on left-out views is computed; the others explain nothing.
-PREDICTED = 8
+CROSS_VALIDATED_CANDIDATES = 8

@@ -29,11 +29,11 @@ def require_effect(effect: Effect, where: str) -> None:
         if spec.kind == "twist":
             sizes |= {"translation": spec.typical_shift, "limit_translation": spec.limit_shift}
         for name, size in sizes.items():
-            if not _positive(size) or (size == np.inf and name in ("typical", "translation")):
+            if not _is_positive(size) or (size == np.inf and name in ("typical", "translation")):
                 raise InputError(f"{where}: {name} of {key} is {size!r}; to fix: write a positive number")
         if not all(isinstance(unit, str) for unit in (spec.unit, spec.unit_shift)):
             raise InputError(f"{where}: the unit of {key} is {spec.unit!r}; to fix: write it in quotes")
-        if not all(_number(value) and np.isfinite(value) for value in spec.grid):
+        if not all(_is_number(value) and np.isfinite(value) for value in spec.grid):
             raise InputError(f"{where}: the grid of {key} is {spec.grid!r}; to fix: write finite numbers")
     if not all(isinstance(need, str) for need in (*effect.needs, *effect.prefers)):
         raise InputError(f"{where}: needs and prefers are lists of names; to fix: write them in quotes")
@@ -45,7 +45,7 @@ def require_effect(effect: Effect, where: str) -> None:
         raise InputError(f"{where}: its function has no argument {missing[0]!r}; to fix: name it as the parameter")
 
 
-def sealed(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+def read_only_arguments(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """The arguments, arrays among them read-only: an effect returns what changes and leaves what it is given."""
     return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in arguments)
 
@@ -58,30 +58,32 @@ def require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, wher
     """
     if effect.place == "links":
         if not isinstance(result, Links):
-            raise InputError(f"{where} returns {_told(result)}; to fix: return dataclasses.replace(links, …)")
+            raise InputError(
+                f"{where} returns {_describe_result(result)}; to fix: return dataclasses.replace(links, …)"
+            )
         for name, given, value in zip(vars(result), vars(arguments[0]).values(), vars(result).values(), strict=True):
-            _numbers(value, given, f"{where} returns {name} as")
+            _require_numbers(value, given, f"{where} returns {name} as")
         return result
     if effect.place in ("mount", "part"):
-        return _numbers(result, np.zeros((arguments[0].count, 6)), f"{where} returns")
-    return _numbers(result, arguments[0], f"{where} returns")
+        return _require_numbers(result, np.zeros((arguments[0].count, 6)), f"{where} returns")
+    return _require_numbers(result, arguments[0], f"{where} returns")
 
 
-def _numbers(result: Any, like: Array, where: str) -> Array:
+def _require_numbers(result: Any, like: Array, where: str) -> Array:
     """`result` as numbers of the shape of `like`; where `like` is not finite, it need not be."""
     try:
         values = np.asarray(result)
     except ValueError:
         values = np.empty(0)
     if values.shape != like.shape or values.dtype.kind not in "fiu":
-        raise InputError(f"{where} {_told(result)}; to fix: return real numbers of shape {like.shape}")
+        raise InputError(f"{where} {_describe_result(result)}; to fix: return real numbers of shape {like.shape}")
     wrong = ~np.isfinite(values) & np.isfinite(like)
     if wrong.any():
         raise InputError(f"{where} NaN or infinity in {wrong.sum()} of {values.size} numbers; to fix: keep them finite")
     return values.astype(np.float64, copy=False)
 
 
-def _told(result: Any) -> str:
+def _describe_result(result: Any) -> str:
     if isinstance(result, np.ndarray):
         kind = {"c": "complex numbers", "O": "objects", "b": "truth values"}.get(result.dtype.kind, "an array")
         return f"{kind} of shape {result.shape}"
@@ -94,9 +96,9 @@ def _read_only(values: Array) -> Array:
     return view
 
 
-def _number(value: Any) -> bool:
+def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
 
 
-def _positive(value: Any) -> bool:
-    return _number(value) and bool(value > 0)
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and bool(value > 0)

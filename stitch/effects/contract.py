@@ -17,7 +17,7 @@ import numpy as np
 
 from stitch.effects.specs import Spec
 from stitch.errors import InputError
-from stitch.units import Amount, amount
+from stitch.units import Amount, format_amount
 
 PLACES = {
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
@@ -56,10 +56,12 @@ class Parameter:
         return self.unit == "view"
 
     @property
-    def told(self) -> Amount:
+    def formatted(self) -> Amount:
         """As people read it; the view of an event by its name."""
         name = self.view
-        return Amount(name, "–", "") if name else amount(self.value, self.sigma if self.fitted else None, self.unit)
+        return (
+            Amount(name, "–", "") if name else format_amount(self.value, self.sigma if self.fitted else None, self.unit)
+        )
 
     @property
     def view(self) -> str:
@@ -107,7 +109,11 @@ class Effect:
 
     def parameters(self, joints: int, torques: Sequence[str], length_unit: str) -> tuple[Parameter, ...]:
         """All parameters for an arm of n joints at zero, in the session's unit."""
-        named = [(key, spec, name) for key, spec in self.specs.items() for name in _names(key, spec, joints, torques)]
+        named = [
+            (key, spec, name)
+            for key, spec in self.specs.items()
+            for name in _parameter_names(key, spec, joints, torques)
+        ]
         return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
 
     def arguments(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
@@ -119,7 +125,7 @@ class Effect:
         return {key: float(own[0]) if key in single else np.array(own, float) for key, own in values.items()}
 
 
-def _names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
+def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
     """Names of the parameters that an argument stands for."""
     match spec.kind:
         case "number":

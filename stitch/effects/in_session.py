@@ -19,12 +19,12 @@ _WHERE_FROM = {
 }
 
 
-def where_from(need: str) -> str:
+def describe_need(need: str) -> str:
     """What an effect needs, as somebody who writes a session knows it."""
     return _WHERE_FROM.get(need, f"a column {need} in views.csv")
 
 
-def known(name: str) -> Effect:
+def find_effect(name: str) -> Effect:
     """An effect of the library or of a user's file.
 
     Raises:
@@ -53,7 +53,7 @@ def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:
     return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
 
 
-def lacking(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
+def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     """What an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
     views = measurement.views
     known_here = {
@@ -67,15 +67,15 @@ def lacking(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     return tuple(missing)
 
 
-def require(measurement: Measurement, effect: Effect) -> None:
+def require_available(measurement: Measurement, effect: Effect) -> None:
     """Refuse an effect that a session cannot have.
 
     Raises:
         InputError: names what is missing.
     """
-    missing = lacking(measurement, effect)
+    missing = missing_need(measurement, effect)
     if missing:
-        words = " and ".join(map(where_from, missing))
+        words = " and ".join(map(describe_need, missing))
         raise InputError(
             f"effect {effect.name} needs {words}, which session {measurement.capture.name} does not have"
             "; to fix: state it, or leave the effect out"

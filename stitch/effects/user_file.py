@@ -10,10 +10,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from stitch.effects.checked import require_effect, require_result, sealed
+from stitch.effects.checked import read_only_arguments, require_effect, require_result
 from stitch.effects.contract import EFFECTS, Effect
 from stitch.errors import InputError
-from stitch.system.time_limit import within
+from stitch.system.time_limit import time_limit
 
 # Seconds for the file and for every call of an effect; a call on a million points takes less than one.
 _SECONDS = 5.0
@@ -38,7 +38,7 @@ def load(path: Path) -> list[str]:
     for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
         del EFFECTS[name]
     try:
-        with _named(path, ""):
+        with _name_errors(path, ""):
             _execute(path, importlib.util.module_from_spec(spec))
         names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
         if not names:
@@ -50,7 +50,7 @@ def load(path: Path) -> list[str]:
         EFFECTS.update(before)
         raise
     for name in names:
-        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guarded(EFFECTS[name], path))
+        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guard_function(EFFECTS[name], path))
     return names
 
 
@@ -59,20 +59,20 @@ def _execute(path: Path, module: ModuleType) -> None:
     exec(compile(path.read_bytes(), path, "exec"), vars(module))
 
 
-def _guarded(effect: Effect, path: Path) -> Callable[..., Any]:
+def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
     """The effect's function; what goes wrong in it names the file and the line, and so does a result that cannot be."""
 
     @wraps(effect.function)
     def function(*arguments: Any, **parameters: Any) -> Any:
-        with _named(path, f" effect {effect.name}:"):
-            result = effect.function(*sealed(arguments), **parameters)
+        with _name_errors(path, f" effect {effect.name}:"):
+            result = effect.function(*read_only_arguments(arguments), **parameters)
         return require_result(effect, arguments, result, f"{path}: effect {effect.name}")
 
     return function
 
 
 @contextmanager
-def _named(path: Path, what: str) -> Iterator[None]:
+def _name_errors(path: Path, what: str) -> Iterator[None]:
     """Errors, ends of the program and endless loops in a user's file as one line."""
     seconds = _seconds()
     late = (
@@ -80,7 +80,7 @@ def _named(path: Path, what: str) -> Iterator[None]:
         f"environment variable {_LIMIT}"
     )
     try:
-        with within(seconds, late):
+        with time_limit(seconds, late):
             yield
     except InputError as error:
         told = str(error)
@@ -89,7 +89,7 @@ def _named(path: Path, what: str) -> Iterator[None]:
         raise
     except BaseException as error:  # whatever a user's file may raise, the end of the program too
         reason = "ends the program" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}{_line(error, path)}:{what} {reason}; to fix: correct it there") from None
+        raise InputError(f"{path}{_error_line(error, path)}:{what} {reason}; to fix: correct it there") from None
 
 
 def _seconds() -> float:
@@ -102,7 +102,7 @@ def _seconds() -> float:
     return seconds
 
 
-def _line(error: BaseException, path: Path) -> str:
+def _error_line(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
         return "" if error.lineno is None else f" line {error.lineno}"
     trace, found = error.__traceback__, ""

@@ -14,8 +14,8 @@ from stitch.frames import Array
 from stitch.measurement.views import Views
 from stitch.model.term import Term, term_of
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import Surfaces
-from stitch.observations.targets.target_model import Targets
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.targets.target_model import TargetObservation
 from stitch.units import METRES
 
 
@@ -53,7 +53,7 @@ class Dictionary:
 
     def columns(self, ingredients: Sequence[Ingredient]) -> Array:
         """(·, k) responses to one of each, scaled."""
-        values = np.stack([scaled(i.quantity) for i in ingredients], axis=1)
+        values = np.stack([scaled_values(i.quantity) for i in ingredients], axis=1)
         bases = np.stack([self.base(i) for i in ingredients], axis=1)
         # Blocks beyond the views (a drawing) know nothing of them.
         factors = np.zeros((len(bases) // self.rows, len(ingredients)))
@@ -61,24 +61,25 @@ class Dictionary:
         return np.asarray(bases * np.repeat(factors, self.rows, axis=0))
 
 
-def dictionary(linear: LinearModel, found: Sequence[Quantity]) -> Dictionary:
+def build_dictionary(linear: LinearModel, factors: Sequence[Quantity]) -> Dictionary:
     """All M ingredients of these quantities.
 
     A joint may follow any quantity, and its own angle or direction times any other joint's angle; mount and part what
     does not turn with the arm.
     """
     joints = linear.measurement.views.joints.shape[1]
-    of_arm = [Ingredient("robot", i, q) for i in range(joints) for q in _for_joint(i, found)]
-    elsewhere = [q for q in found if q.kind in ("time", "course", "covariate", "torque")]
+    of_arm = [Ingredient("robot", i, q) for i in range(joints) for q in _joint_quantities(i, factors)]
+    elsewhere = [q for q in factors if q.kind in ("time", "course", "covariate", "torque")]
     places = [Ingredient(p, axis, q) for p in ("mount", "part") for axis, q in product(range(6), elsewhere)]
     ingredients = of_arm + places
     bases = {
-        place: linear.responses([_everywhere(linear, place)])[0].columns for place in {i.place for i in ingredients}
+        place: linear.responses([_displacement_term(linear, place)])[0].columns
+        for place in {i.place for i in ingredients}
     }
     return Dictionary(ingredients, bases, _rows_per_view(linear))
 
 
-def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
+def group_addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
     """Numbers of the ingredients that come together: sine and cosine of one wave, a spring and how it stiffens, all six
     axes of what moves."""
     found = defaultdict[tuple[str | int, ...], list[int]](list)
@@ -91,12 +92,12 @@ def addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
     return [tuple(own) for own in found.values()]
 
 
-def _for_joint(i: int, found: Sequence[Quantity]) -> list[Quantity]:
-    own = [q for q in found if q.joint == i and q.kind in ("angle", "direction")]
-    others = [q for q in found if q.joint != i and q.kind == "angle"]
-    slow = [q for q in found if q.kind in ("time", "covariate")]
+def _joint_quantities(i: int, factors: Sequence[Quantity]) -> list[Quantity]:
+    own = [q for q in factors if q.joint == i and q.kind in ("angle", "direction")]
+    others = [q for q in factors if q.joint != i and q.kind == "angle"]
+    slow = [q for q in factors if q.kind in ("time", "covariate")]
     # Teeth are of a joint's own drive.
-    plain = [q for q in found if q.kind != "teeth" or q.joint == i]
+    plain = [q for q in factors if q.kind != "teeth" or q.joint == i]
     return [*plain, *(a.times(b) for a in own for b in (*others, *slow))]
 
 
@@ -105,7 +106,7 @@ def _scale(quantity: Quantity) -> float:
     return max(float(np.abs(quantity.values).max()), 1e-300)
 
 
-def scaled(quantity: Quantity) -> Array:
+def scaled_values(quantity: Quantity) -> Array:
     """(V,) values of at most one."""
     return quantity.values / _scale(quantity)
 
@@ -116,7 +117,7 @@ def coefficient(ingredient: Ingredient, of_scaled: float, length_unit: str) -> f
     return to_mm * of_scaled / _scale(ingredient.quantity)
 
 
-def _everywhere(linear: LinearModel, place: str) -> Term:
+def _displacement_term(linear: LinearModel, place: str) -> Term:
     """A displacement of the same size in every view, one parameter a joint or axis."""
     if place == "robot":
         effect = Effect("each_joint", place, {"d": per_joint("rad", 1e-3, 1.0)}, _joints, ("joints",), (), "user")
@@ -137,7 +138,7 @@ def _twists(views: Views, xi: Array) -> Array:
 
 def _rows_per_view(linear: LinearModel) -> int:
     observation = linear.observation
-    if isinstance(observation, Surfaces):
+    if isinstance(observation, SurfaceObservation):
         return 6
-    assert isinstance(observation, Targets)
+    assert isinstance(observation, TargetObservation)
     return int(observation.rows.residual.shape[1])

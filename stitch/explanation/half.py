@@ -5,18 +5,18 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.diagnosis.validation.halves import explained_beside
-from stitch.explanation.dictionary import Dictionary, Ingredient, scaled
+from stitch.diagnosis.validation.halves import explained_basis
+from stitch.explanation.dictionary import Dictionary, Ingredient, scaled_values
 from stitch.frames import Array, Indices
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import Surfaces
+from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.statistics.least_squares import column_space
 
 # Of a number a view two views show one difference: in that all that differ are alike, but for their size.
-_ALIKE = 2
+_MIN_VIEWS = 2
 
 
-class Half:
+class HalfModel:
     """Numbers (n,) of some views in units of their scatter, without what the model explains there."""
 
     def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices) -> None:
@@ -29,10 +29,10 @@ class Half:
     def _explained(self) -> Array:
         """(n, r) orthonormal."""
         linear = self._linear
-        if isinstance(linear.observation, Surfaces):
+        if isinstance(linear.observation, SurfaceObservation):
             if not len(self._out):
                 return column_space(linear.white_design)
-            return explained_beside(linear, linear.observation, self._out)
+            return explained_basis(linear, linear.observation, self._out)
         return column_space(linear.white_design[self._rows])
 
     @cached_property
@@ -44,7 +44,7 @@ class Half:
     @cached_property
     def z(self) -> Array:
         """(n,) what was seen."""
-        surfaces = isinstance(self._linear.observation, Surfaces)
+        surfaces = isinstance(self._linear.observation, SurfaceObservation)
         white = self._linear.white_z if surfaces else self._linear.white_z[self._rows]
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
@@ -55,16 +55,16 @@ class Half:
 
     def has_room(self, numbers: int = 1) -> bool:
         """True if these views can tell a sum of so many numbers from others, and leave numbers free beside it."""
-        return len(self._keep) > _ALIKE and self.free > numbers
+        return len(self._keep) > _MIN_VIEWS and self.free > numbers
 
     @property
     def views(self) -> Indices:
         """Numbers of those kept."""
         return self._keep
 
-    def seen(self, response: Array) -> Array:
+    def residual_columns(self, response: Array) -> Array:
         """(n, k) whitened columns of a response (·, k), without what the model explains."""
-        surfaces = isinstance(self._linear.observation, Surfaces)
+        surfaces = isinstance(self._linear.observation, SurfaceObservation)
         white = self._linear.whiten(self._linear.reduce(response), None if surfaces else self._keep)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
@@ -74,7 +74,7 @@ class Half:
         at = [(i.place, i.index) for i in ingredients]
         for own in dict.fromkeys(at):
             which = [k for k, other in enumerate(at) if other == own]
-            values = np.stack([scaled(ingredients[k].quantity)[self._keep] for k in which], axis=1)
+            values = np.stack([scaled_values(ingredients[k].quantity)[self._keep] for k in which], axis=1)
             out[:, which] = self._view_by_view(ingredients[which[0]]) @ values
         return out
 
@@ -85,5 +85,5 @@ class Half:
             base = self._terms.base(ingredient).reshape(-1, self._terms.rows)
             alone = np.zeros((*base.shape, len(self._keep)))
             alone[self._keep, :, np.arange(len(self._keep))] = base[self._keep]
-            self._of_view[own] = self.seen(alone.reshape(-1, len(self._keep)))
+            self._of_view[own] = self.residual_columns(alone.reshape(-1, len(self._keep)))
         return self._of_view[own]

@@ -6,7 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.explanation.quantity import Quantity
-from stitch.explanation.shapes import behind, beside_line, bump_in_time, bump_of_joint, saw_of_joint, swing, warming
+from stitch.explanation.shapes import (
+    backlash_lag,
+    bump_in_time,
+    bump_of_joint,
+    nonlinear_torque,
+    oscillation,
+    saw_of_joint,
+    warm_up,
+)
 from stitch.frames import Array
 from stitch.measurement.views import Views
 
@@ -28,9 +36,9 @@ _STILL = 1e-9
 _SPRING = "spring under"  # label of what comes together: its zero, its pull, and how that stiffens
 
 
-def quantities(views: Views) -> list[Quantity]:
+def view_quantities(views: Views) -> list[Quantity]:
     """All factors: what differs from view to view, and one that does not."""
-    found = [*_of_joints(views), *_of_time(views)]
+    found = [*_joint_quantities_of(views), *_time_quantities(views)]
     for name in views.covariates:
         code, values = f'views.since_first("{name}")', views.since_first(name)
         found.append(Quantity(name, code, name, "covariate", None, values, columns=(name,)))
@@ -43,46 +51,46 @@ def quantities(views: Views) -> list[Quantity]:
     return [zero, *told]
 
 
-def _of_joints(views: Views) -> Iterator[Quantity]:
+def _joint_quantities_of(views: Views) -> Iterator[Quantity]:
     for k in range(views.joints.shape[1]):
         q, at = views.joints[:, k], f"views.joints[:, {k}]"
         for periods in (1, 2):
             angle, inner = (f"q{k + 1}", at) if periods == 1 else (f"2q{k + 1}", f"2 * {at}")
-            yield from _wave(angle, inner, "angle", k, periods * q)
-        yield from _of_gear(views, k)
+            yield from _wave_quantities(angle, inner, "angle", k, periods * q)
+        yield from _gear_quantities(views, k)
         yield Quantity(
             f"approach{k + 1}", f"views.approach[:, {k}]", "", "direction", k, views.approach[:, k].astype(float)
         )
         moved = q - views.previous[:, k]
         yield Quantity(f"move{k + 1}", f"({at} - views.previous[:, {k}])", "", "move", k, moved)
         for share in _PLAYS:
-            yield behind(views, k, float(f"{share * np.ptp(views.path[:, k]):.3g}"))
+            yield backlash_lag(views, k, float(f"{share * np.ptp(views.path[:, k]):.3g}"))
         if views.velocity is not None:
             yield Quantity(f"speed{k + 1}", f"views.velocity[:, {k}]", "rad/s", "speed", k, views.velocity[:, k])
     for k, (name, joint) in enumerate(zip(views.torques.names, views.torques.joint, strict=True)):
         torque, at = views.torques.values[:, k], f"views.torques.values[:, {k}]"
-        yield from _of_torque(Quantity(f"τ{name}", at, "N m", "torque", joint, torque))
+        yield from _torque_quantities(Quantity(f"τ{name}", at, "N m", "torque", joint, torque))
 
 
-def _of_torque(plain: Quantity) -> Iterator[Quantity]:
+def _torque_quantities(plain: Quantity) -> Iterator[Quantity]:
     """A spring's pull, how it yields more one way, and how it stiffens."""
     torque, text = plain.values, plain.text
     spring = f"{_SPRING} {text}"
     yield replace(plain, together=(text, spring))
     if np.ptp(torque) > _STILL:
-        square = beside_line(plain, lambda x: x * np.abs(x), "x|x|", "x * np.abs(x)")
-        cube = beside_line(plain, lambda x: x**3, "x³", "x**3")
+        square = nonlinear_torque(plain, lambda x: x * np.abs(x), "x|x|", "x * np.abs(x)")
+        cube = nonlinear_torque(plain, lambda x: x**3, "x³", "x**3")
         if square is not None:
             yield square
         if cube is not None:
             yield replace(cube, together=(cube.text, spring))
 
 
-def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
+def _gear_quantities(views: Views, k: int) -> Iterator[Quantity]:
     """Higher harmonics of a joint's angle, bumps at places of its range, and teeth of a belt."""
     q, at = views.joints[:, k], f"views.joints[:, {k}]"
     for n in _PERIODS:
-        yield from _wave(f"{n}q{k + 1}", f"{n} * {at}", "gear", k, n * q)
+        yield from _wave_quantities(f"{n}q{k + 1}", f"{n} * {at}", "gear", k, n * q)
     for middle in np.arange(q.min(), q.max() + _APART, _APART).round(3):
         yield bump_of_joint(views, k, float(middle), _WIDTH)
     whole = float(np.ptp(q))
@@ -92,17 +100,17 @@ def _of_gear(views: Views, k: int) -> Iterator[Quantity]:
             yield saw_of_joint(views, k, float(f"{whole / teeth:.4g}"), float(f"{whole / teeth * jump:.4g}"))
 
 
-def _of_time(views: Views) -> Iterator[Quantity]:
+def _time_quantities(views: Views) -> Iterator[Quantity]:
     if not views.has("time"):
         return
     yield Quantity("t", "views.hours", "h", "time", None, views.hours)
     for hours in _WARMING:
-        yield warming(views, hours)
+        yield warm_up(views, hours)
     whole = float(views.hours[-1]) or 1.0
     most = min(_SWINGS, _FASTEST * (views.count - 1))
     for swings in np.arange(1.0, most, 0.5):
         for phase in _PHASES:
-            yield swing(views, float(f"{whole / swings:.6g}"), float(f"{np.radians(phase):.6g}"))
+            yield oscillation(views, float(f"{whole / swings:.6g}"), float(f"{np.radians(phase):.6g}"))
     for width in _STRETCHES:
         for middle in np.arange(width, 1.0, width):
             yield bump_in_time(views, float(f"{middle * whole:.4g}"), float(f"{width * whole:.4g}"))
@@ -112,7 +120,7 @@ def _of_time(views: Views) -> Iterator[Quantity]:
         yield Quantity(text, code, "", "time", None, (views.hours > since).astype(float))
 
 
-def _wave(of: str, code: str, kind: str, joint: int, angle: Array) -> Iterator[Quantity]:
+def _wave_quantities(of: str, code: str, kind: str, joint: int, angle: Array) -> Iterator[Quantity]:
     """Sine and cosine of an angle (V,): of any phase a wave takes both."""
     yield Quantity(f"sin {of}", f"np.sin({code})", "", kind, joint, np.sin(angle), together=(of,))
     yield Quantity(f"cos {of}", f"np.cos({code})", "", kind, joint, np.cos(angle), together=(of,))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stitch.explanation.dictionary import Ingredient
-from stitch.explanation.half import Half
+from stitch.explanation.half import HalfModel
 from stitch.explanation.quantity import Quantity
 from stitch.frames import Array
 
@@ -21,34 +21,34 @@ _MOST = 20  # steps
 _TEETH, _JUMPS = np.linspace(-2, 2, 13), np.linspace(-5, 5, 20, endpoint=False)
 
 
-def refined(ingredients: Sequence[Ingredient], half: Half) -> tuple[Ingredient, ...]:
+def refine_parameters(ingredients: Sequence[Ingredient], half: HalfModel) -> tuple[Ingredient, ...]:
     """The same ingredients, their quantities as some views want them."""
-    ingredients = _scanned(ingredients, half)
+    ingredients = _scan_teeth(ingredients, half)
     tuned = [q for q in quantities_of(ingredients) if q.nonlinear]
     count = sum(len(q.nonlinear) for q in tuned)
     if not count:
         return tuple(ingredients)
-    scatter = left_beside(ingredients, half)
+    scatter = sum_residual(ingredients, half)
     # Beside its sum what is left is scatter: of about one where the scatter was known.
     scale = np.sqrt(float(scatter @ scatter) / max(half.free - len(ingredients) - count, 1))
 
     def off(steps: Array) -> Array:
-        return np.append(left_beside(_moved(ingredients, tuned, steps), half) / scale, steps)
+        return np.append(sum_residual(_with_moved_parameters(ingredients, tuned, steps), half) / scale, steps)
 
     found = least_squares(off, np.zeros(count), method="lm", max_nfev=_MOST * (count + 1))
-    return _moved(ingredients, tuned, found.x)
+    return _with_moved_parameters(ingredients, tuned, found.x)
 
 
-def _scanned(ingredients: Sequence[Ingredient], half: Half) -> Sequence[Ingredient]:
+def _scan_teeth(ingredients: Sequence[Ingredient], half: HalfModel) -> Sequence[Ingredient]:
     """With teeth tried over a grid: where a view passes a jump no slope shows it."""
     for q in quantities_of(ingredients):
         if q.kind == "teeth":
-            tried = [_moved(ingredients, [q], np.array(steps)) for steps in product(_TEETH, _JUMPS)]
-            ingredients = min(tried, key=lambda own: float(np.sum(left_beside(own, half) ** 2)))
+            tried = [_with_moved_parameters(ingredients, [q], np.array(steps)) for steps in product(_TEETH, _JUMPS)]
+            ingredients = min(tried, key=lambda own: float(np.sum(sum_residual(own, half) ** 2)))
     return ingredients
 
 
-def rounded(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
+def round_parameters(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
     """With nonlinear parameters that a person can read."""
     return tuple(replace(i, quantity=i.quantity.rounded()) for i in ingredients)
 
@@ -58,13 +58,15 @@ def quantities_of(ingredients: Sequence[Ingredient]) -> list[Quantity]:
     return list({i.quantity.text: i.quantity for i in ingredients}.values())
 
 
-def _moved(ingredients: Sequence[Ingredient], tuned: Sequence[Quantity], steps: Array) -> tuple[Ingredient, ...]:
+def _with_moved_parameters(
+    ingredients: Sequence[Ingredient], tuned: Sequence[Quantity], steps: Array
+) -> tuple[Ingredient, ...]:
     ends = np.cumsum([len(q.nonlinear) for q in tuned])[:-1]
     new = {q.text: q.moved(own) for q, own in zip(tuned, np.split(steps, ends), strict=True)}
     return tuple(replace(i, quantity=new.get(i.quantity.text, i.quantity)) for i in ingredients)
 
 
-def left_beside(ingredients: Sequence[Ingredient], half: Half) -> Array:
+def sum_residual(ingredients: Sequence[Ingredient], half: HalfModel) -> Array:
     """(n,) what a sum leaves, with the best sizes."""
     columns = half.columns(ingredients)
     return np.asarray(half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0])

@@ -13,13 +13,13 @@ from stitch.measurement.views import Views
 
 # By about what share the true width, play or time constant may differ from one that is tried; how far a bump's middle
 # may lie off, in its widths; by how many swings in the session there may be more or fewer, and rad of their phase.
-_WIDTH, _PLAY, _CONSTANT = 0.4, 0.2, 0.7
-_MIDDLE, _SWINGS, _PHASE = 0.5, 0.25, 0.8
+_WIDTH_SPREAD, _PLAY_SPREAD, _CONSTANT_SPREAD = 0.4, 0.2, 0.7
+_MIDDLE_SPREAD, _PERIOD_SPREAD, _PHASE_SPREAD = 0.5, 0.25, 0.8
 # By what share of itself a tooth, and by what share of a tooth its jump, may lie off.
 _TOOTH, _JUMP = 0.05, 0.1
 # Share of what a power changes, below which rounding may be all that is beside its line; torques that any power may
 # have on a line, or nearly.
-_SHOWN, _AS_A_LINE = 1e-6, 3
+_MIN_CURVATURE, _AS_A_LINE = 1e-6, 3
 
 
 def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity:
@@ -49,7 +49,7 @@ def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
     )
 
 
-def beside_line(torque: Quantity, power: Callable[[Array], Array], text: str, code: str) -> Quantity | None:
+def nonlinear_torque(torque: Quantity, power: Callable[[Array], Array], text: str, code: str) -> Quantity | None:
     """What a power of a torque does that no line does, in these views: the line is the part of the zero and of a
     spring that does not stiffen, and far from zero nearly all of the power. None where the views show nothing of it.
 
@@ -61,7 +61,7 @@ def beside_line(torque: Quantity, power: Callable[[Array], Array], text: str, co
     share = torque.values / largest
     slope, zero = np.polyfit(share, power(share), 1)
     values = np.asarray(power(share) - slope * share - zero, float)
-    if np.abs(values).max() < _SHOWN * np.ptp(power(share)) or len(np.unique(share)) <= _AS_A_LINE:
+    if np.abs(values).max() < _MIN_CURVATURE * np.ptp(power(share)) or len(np.unique(share)) <= _AS_A_LINE:
         return None
     x = f"({torque.code} / {largest:g})"
     return replace(
@@ -80,7 +80,7 @@ def bump_in_time(views: Views, middle: float, width: float) -> Quantity:
     return _bump(text, views.hours, "views.hours", middle, width, kind="course", joint=None, family=family)
 
 
-def behind(views: Views, k: int, play: float) -> Quantity:
+def backlash_lag(views: Views, k: int, play: float) -> Quantity:
     """What stays behind joint k, from 0, within a play of so many rad."""
     return Quantity(
         f"stays ({np.degrees(play):.2g}° of play) behind q{k + 1}",
@@ -89,12 +89,12 @@ def behind(views: Views, k: int, play: float) -> Quantity:
         "move",
         k,
         views.behind(k, play),
-        nonlinear=(Nonlinear(play, _PLAY, positive=True),),
-        family=partial(behind, views, k),
+        nonlinear=(Nonlinear(play, _PLAY_SPREAD, positive=True),),
+        family=partial(backlash_lag, views, k),
     )
 
 
-def swing(views: Views, period: float, late: float) -> Quantity:
+def oscillation(views: Views, period: float, late: float) -> Quantity:
     """cos(2π t/period − late); h, rad."""
     whole = float(views.hours[-1]) or 1.0
     return Quantity(
@@ -104,12 +104,12 @@ def swing(views: Views, period: float, late: float) -> Quantity:
         "course",
         None,
         np.cos(2 * np.pi * views.hours / period - late),
-        nonlinear=(Nonlinear(period, _SWINGS * period / whole, positive=True), Nonlinear(late, _PHASE)),
-        family=partial(swing, views),
+        nonlinear=(Nonlinear(period, _PERIOD_SPREAD * period / whole, positive=True), Nonlinear(late, _PHASE_SPREAD)),
+        family=partial(oscillation, views),
     )
 
 
-def warming(views: Views, constant: float) -> Quantity:
+def warm_up(views: Views, constant: float) -> Quantity:
     """1 − exp(−t/constant); h."""
     return Quantity(
         f"(1 − exp(−t/{constant:.2g} h))",
@@ -118,8 +118,8 @@ def warming(views: Views, constant: float) -> Quantity:
         "time",
         None,
         1 - np.exp(-views.hours / constant),
-        nonlinear=(Nonlinear(constant, _CONSTANT, positive=True),),
-        family=partial(warming, views),
+        nonlinear=(Nonlinear(constant, _CONSTANT_SPREAD, positive=True),),
+        family=partial(warm_up, views),
     )
 
 
@@ -129,6 +129,6 @@ def _bump(
     code = f"np.exp(-0.5 * (({at} - {middle:.6g}) / {width:.6g}) ** 2)"
     # A bump of whose flank alone is seen could be of any height.
     there = float(x.min()), float(x.max())
-    free = Nonlinear(middle, _MIDDLE * width, within=there), Nonlinear(width, _WIDTH, positive=True)
+    free = Nonlinear(middle, _MIDDLE_SPREAD * width, within=there), Nonlinear(width, _WIDTH_SPREAD, positive=True)
     values = np.exp(-0.5 * ((x - middle) / width) ** 2)
     return Quantity(text, code, "", kind, joint, values, nonlinear=free, family=family)

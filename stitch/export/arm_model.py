@@ -5,18 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.effects.in_session import known, lacking
+from stitch.effects.in_session import find_effect, missing_need
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Session
 from stitch.measurement.torques import PAYLOAD, Torques, torques_of
 from stitch.measurement.views import Views, no_torques, views_of
-from stitch.model.arm import ARM
-from stitch.model.bound import bound, in_unit
+from stitch.model.arm import ARM_PLACES
+from stitch.model.bound import bind_to_session, convert_unit
 from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.forward import perturbed_frames
 from stitch.model.model_toml import ModelFile
@@ -35,7 +35,7 @@ class ArmModel:
     terms: tuple[Term, ...]  # effects of the arm
     length_unit: str
     joints: Array  # (V, n) rad, where the model was fitted
-    elsewhere: tuple[str, ...] = ()  # effects of the model that are not the arm's
+    other_effects: tuple[str, ...] = ()  # effects of the model that are not the arm's
     payload: float | None = None  # kg at the last view, where it is a column
     torques_measured: bool = False
     covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # of all parameters together
@@ -43,7 +43,7 @@ class ArmModel:
     def at_rest(self) -> tuple["ArmModel", tuple[str, ...]]:
         """The arm with what joint angles alone decide, and the names of effects that hang on time, speed or heat."""
         still = _measurement(self, self.joints[:1], self.joints[:1], np.zeros_like(self.joints[:1]))
-        here = tuple(term for term in self.terms if not lacking(still, term.effect))
+        here = tuple(term for term in self.terms if not missing_need(still, term.effect))
         return replace(self, terms=here), tuple(term.name for term in self.terms if term not in here)
 
     def true_flange(self, joints: Array, previous: Array, approach: Array) -> Array:
@@ -57,7 +57,7 @@ class ArmModel:
         return left
 
 
-def arm_of(folder: Path, effects_file: Path | None = None, trust: bool = False) -> ArmModel:
+def arm_of_run(folder: Path, effects_file: Path | None = None, trust: bool = False) -> ArmModel:
     """The arm of a run folder; of its session robot and joint angles are read, no scans.
 
     Args:
@@ -83,9 +83,9 @@ def arm_from(session: Session, file: ModelFile) -> ArmModel:
     if session.robot is None or not views.joints.shape[1]:
         raise InputError(f"{session.path}: no joint angles or no [robot]; where the arm goes needs both")
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    measurement = _bare(session.name, session.robot, T_base_flange, views, session.length_unit)
-    own = {name: values for name, values in file.effects.items() if known(name).place in ARM}
-    model = bound(in_unit(replace(file, effects=own), session.length_unit), measurement)
+    measurement = _arm_measurement(session.name, session.robot, T_base_flange, views, session.length_unit)
+    own = {name: values for name, values in file.effects.items() if find_effect(name).place in ARM_PLACES}
+    model = bind_to_session(convert_unit(replace(file, effects=own), session.length_unit), measurement)
     return ArmModel(
         session=session.name,
         robot=session.robot,
@@ -95,7 +95,7 @@ def arm_from(session: Session, file: ModelFile) -> ArmModel:
         torques_measured=views.torques.measured,
         length_unit=session.length_unit,
         joints=views.joints,
-        elsewhere=tuple(name for name in file.effects if name not in own),
+        other_effects=tuple(name for name in file.effects if name not in own),
     )
 
 
@@ -109,24 +109,24 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
         previous=previous,
         approach=approach,
         velocity=None,
-        torques=_torques(arm, joints),
+        torques=_gravity_torques(arm, joints),
         covariates={},
         standoff=1.0,
         first={},
         number=np.arange(count),
         path=joints,
     )
-    return _bare(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
+    return _arm_measurement(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
 
 
-def _torques(arm: ArmModel, joints: Array) -> Torques:
+def _gravity_torques(arm: ArmModel, joints: Array) -> Torques:
     """Of gravity; none where the model follows what drives report: a program does not have that."""
     if arm.torques_measured:
         return no_torques(len(joints))
     return torques_of(arm.robot, joints, None if arm.payload is None else np.full(len(joints), arm.payload))
 
 
-def _bare(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:
+def _arm_measurement(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:
     """A measurement of the arm alone; what carries the scanner does not matter."""
-    capture = place(name, (), T_base_flange, "eye_in_hand")
+    capture = build_capture(name, (), T_base_flange, "eye_in_hand")
     return Measurement(capture, T_base_flange, False, robot, views, (), length_unit)

@@ -10,10 +10,10 @@ from stitch import frames
 from stitch.controllers.program import Program
 from stitch.errors import InputError, NoResultError
 from stitch.export.arm_model import ArmModel
-from stitch.export.compensation import Compensation, compensated
+from stitch.export.compensation import ProgramCompensation, compensate_targets
 from stitch.export.export_options import LIMIT_MM
-from stitch.export.program_copy import moved_texts
-from stitch.export.program_targets import Targets, targets_of
+from stitch.export.program_copy import compensated_texts
+from stitch.export.program_targets import ProgramTargets, program_targets
 from stitch.frames import Array
 
 # The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
@@ -21,9 +21,9 @@ _MRAD_PER_MM = 2.0
 # Largest turn of one joint, rad: near a singular pose joints turn far for a small move.
 _LARGEST_TURN = np.radians(3.0)
 # Joint angles this far beyond those of the run's views are worth a word (rad).
-_BEYOND = np.radians(15.0)
+_MAX_JOINT_EXCESS = np.radians(15.0)
 # Effects that hang on where a joint comes from.
-_BY_WAY = ("backlash", "settling")
+_HISTORY_EFFECTS = ("backlash", "settling")
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class CompensatedProgram:
 
     program: Program
     arm: ArmModel
-    targets: Targets
-    found: Compensation
+    targets: ProgramTargets
+    compensation: ProgramCompensation
     texts: dict[Path, str]
     beyond: tuple[str, ...]  # effects of the arm that a program's targets do not decide
     notes: tuple[str, ...]
@@ -45,16 +45,16 @@ class CompensatedProgram:
 
     def rows(self) -> list[dict[str, Any]]:
         """One per target: moved, left under the model, U (k = 2)."""
-        sizes = _sizes(frames.log(self.found.move), self.mm)
-        left = _sizes(self.found.left, self.mm)
-        turned = np.degrees(self.found.joints - self.targets.joints)
+        sizes = _move_sizes(frames.log(self.compensation.move), self.mm)
+        left = _move_sizes(self.compensation.residual, self.mm)
+        turned = np.degrees(self.compensation.joints - self.targets.joints)
         return [
             {
                 "target": point.name,
                 "line": point.line,
                 "moved_mm": float(sizes[k, 0]),
                 "moved_mrad": float(sizes[k, 1]),
-                "U_mm": float(self.found.U[k] * self.mm),
+                "U_mm": float(self.compensation.U[k] * self.mm),
                 "left_mm": float(left[k, 0]),
                 "left_mrad": float(left[k, 1]),
                 "joints_deg": turned[k].tolist(),
@@ -87,24 +87,26 @@ def compensated_program(
             + (f" but {', '.join(beyond)}, which hangs on more than the targets" if beyond else "")
             + ": a copy would be the same; diagnose, and add what is missing"
         )
-    targets = targets_of(program, arm, near, j2_in_j3)
-    found = compensated(still, targets.joints, targets.T_flange_tool)
+    targets = program_targets(program, arm, near, j2_in_j3)
+    found = compensate_targets(still, targets.joints, targets.T_flange_tool)
     mm = arm.robot.metres_per_unit * 1e3
     _require_believable(program, targets, found, limit_mm, mm)
     moves = found.move.copy()
     moves[:, :3, 3] *= mm
-    texts = moved_texts(program, moves, found.joints - targets.joints, j2_in_j3)
-    notes = _notes(program, arm, targets, found, beyond)
+    texts = compensated_texts(program, moves, found.joints - targets.joints, j2_in_j3)
+    notes = _program_notes(program, arm, targets, found, beyond)
     return CompensatedProgram(program, still, targets, found, texts, beyond, notes)
 
 
-def _sizes(twists: Array, mm: float) -> Array:
+def _move_sizes(twists: Array, mm: float) -> Array:
     """(K, 2) mm and mrad of twists (K, 6)."""
     return np.column_stack([np.linalg.norm(twists[:, 3:], axis=1) * mm, np.linalg.norm(twists[:, :3], axis=1) * 1e3])
 
 
-def _require_believable(program: Program, targets: Targets, found: Compensation, limit: float, mm: float) -> None:
-    sizes, turned = _sizes(frames.log(found.move), mm), np.abs(found.joints - targets.joints)
+def _require_believable(
+    program: Program, targets: ProgramTargets, compensation: ProgramCompensation, limit: float, mm: float
+) -> None:
+    sizes, turned = _move_sizes(frames.log(compensation.move), mm), np.abs(compensation.joints - targets.joints)
     for k, point in enumerate(program.points):
         where = f"{program.file} line {point.line}: {point.name}"
         if not (sizes[k] <= (limit, _MRAD_PER_MM * limit)).all():
@@ -120,39 +122,39 @@ def _require_believable(program: Program, targets: Targets, found: Compensation,
             )
 
 
-def _notes(
-    program: Program, arm: ArmModel, targets: Targets, found: Compensation, beyond: tuple[str, ...]
+def _program_notes(
+    program: Program, arm: ArmModel, targets: ProgramTargets, compensation: ProgramCompensation, beyond: tuple[str, ...]
 ) -> tuple[str, ...]:
     notes = []
     if beyond:
         notes.append(f"not compensated, since it hangs on time, speed or temperature: {', '.join(beyond)}")
-    if arm.elsewhere:
-        notes.append(f"not in a program's targets: {', '.join(arm.elsewhere)}")
+    if arm.other_effects:
+        notes.append(f"not in a program's targets: {', '.join(arm.other_effects)}")
     if program.unread:
         told = ", ".join(str(line) for line in program.unread)
         notes.append(f"not moved, since these motions are not read (arcs, registers, computed targets): lines {told}")
     if program.other:
         notes.append(f"no targets of a motion, left as they are: {', '.join(program.other)}")
-    sided = [term.name for term in arm.terms if term.name in _BY_WAY]
-    if sided and program.again:
+    sided = [term.name for term in arm.terms if term.name in _HISTORY_EFFECTS]
+    if sided and program.repeated:
         told = f"moved to more than once, {' and '.join(sided)} undone for the first time alone"
-        notes.append(f"{told}: {', '.join(program.again)}")
-    low, high = arm.joints.min(axis=0) - _BEYOND, arm.joints.max(axis=0) + _BEYOND
+        notes.append(f"{told}: {', '.join(program.repeated)}")
+    low, high = arm.joints.min(axis=0) - _MAX_JOINT_EXCESS, arm.joints.max(axis=0) + _MAX_JOINT_EXCESS
     outside = (targets.joints < low) | (targets.joints > high)
     names = [point.name for point, out in zip(program.points, outside.any(axis=1), strict=True) if out]
     if names:
         told = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
         notes.append(
-            f"beyond the joint angles on which the model was fitted, by more than {np.degrees(_BEYOND):.0f}°: {told}"
+            f"beyond the joint angles on which the model was fitted, by more than {np.degrees(_MAX_JOINT_EXCESS):.0f}°: {told}"
         )
-    crossing = _crossing(program, targets, found)
+    crossing = _configuration_note(program, targets, compensation)
     if crossing:
         notes.append(f"a joint passes a multiple of 90°, so that its configuration may have to be set anew: {crossing}")
     return tuple(notes)
 
 
-def _crossing(program: Program, targets: Targets, found: Compensation) -> str:
+def _configuration_note(program: Program, targets: ProgramTargets, compensation: ProgramCompensation) -> str:
     """Cartesian targets whose joints pass what configurations count: quadrants, signs, half turns."""
-    quadrants = [np.floor(q / (np.pi / 2)) for q in (targets.joints, found.joints)]
+    quadrants = [np.floor(q / (np.pi / 2)) for q in (targets.joints, compensation.joints)]
     moved = (quadrants[0] != quadrants[1]).any(axis=1) & np.array(targets.cartesian)
     return ", ".join(point.name for point, has in zip(program.points, moved, strict=True) if has)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.controllers.pose_numbers import NUMBERS
-from stitch.export.hand_eye import HandEye
+from stitch.export.hand_eye import ExportedHandEye
 from stitch.export.text_lines import commented
 from stitch.frames import Array
 
@@ -54,16 +54,16 @@ _CONTROLLERS = {
 }
 
 
-def controller_frame(eye: HandEye, controller: str) -> str:
+def controller_frame(eye: ExportedHandEye, controller: str) -> str:
     """The frame as a controller writes it, by "kuka", "fanuc", "abb" or "ur"."""
-    form, near = _CONTROLLERS[controller], _numbers(eye.T_mount, controller)
-    head = eye.head(lambda T: _numbers(T, controller, near), form.labels, form.units)
+    form, near = _CONTROLLERS[controller], _frame_numbers(eye.T_mount, controller)
+    head = eye.head(lambda T: _frame_numbers(T, controller, near), form.labels, form.units)
     lines = [*head, f"Entered as {form.place[eye.mount]}, in the controller's own base and flange"]
     text = form.template.format(*(f"{x + 0.0:.9f}" for x in near), name=eye.name)
     return f"{commented(form.comment, lines)}{text}\n"
 
 
-def _numbers(T: Array, controller: str, near: Array | None = None) -> Array:
+def _frame_numbers(T: Array, controller: str, near: Array | None = None) -> Array:
     """Of a pose (4, 4) in m; the controllers' functions take mm."""
     T = T.copy()
     T[:3, 3] *= 1000

@@ -10,19 +10,19 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR, numbers_covariance, stands_for
+from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR, numbers_covariance, uncertainty_scope
 from stitch.model.model_toml import ModelFile, read_model
 from stitch.stored.run_documents import read_diagnosis, read_result
 from stitch.units import METRES, length_text
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
-_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
+_PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
 # Characters that a frame's name may have in every format: those of a link in URDF and of a name in YAML.
-_PLAIN = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
+_PLAIN_LETTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
 
 
 @dataclass(frozen=True)
-class HandEye:
+class ExportedHandEye:
     """A hand-eye with the names that other programs need."""
 
     session: str
@@ -37,7 +37,7 @@ class HandEye:
     @property
     def name(self) -> str:
         """T_base_scanner or T_flange_scanner."""
-        return f"T_{_WORDS[self.mount]}_scanner"
+        return f"T_{_PARENT_WORDS[self.mount]}_scanner"
 
     def head(self, numbers: Callable[[Array], Array], labels: Sequence[str], units: Sequence[str]) -> list[str]:
         """Lines for comments: what it is, U (k = 2) of each number that the format states, and the notes.
@@ -64,7 +64,7 @@ class HandEye:
         return T
 
 
-def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner") -> HandEye:
+def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scanner") -> ExportedHandEye:
     """The corrected hand-eye of a run folder.
 
     Args:
@@ -81,7 +81,7 @@ def hand_eye_of(folder: Path, parent: str | None = None, child: str = "scanner")
 
 def hand_eye_from(
     result: dict[str, Any], model: ModelFile, told: dict[str, Any], parent: str | None = None, child: str = "scanner"
-) -> HandEye:
+) -> ExportedHandEye:
     """Return the corrected hand-eye of a result and its model.
 
     Args:
@@ -95,34 +95,34 @@ def hand_eye_from(
     metres = METRES[model.length_unit]
     T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
     T[:3, 3] *= metres
-    return HandEye(
+    return ExportedHandEye(
         session=str(result.get("name") or Path(result["session"]).name),
         T_mount=T,
         covariance=model.covariance * np.outer(scale, scale),
         length_unit=model.length_unit,
         mount=model.mount,
-        parent=_plain("--parent", parent or _PARENTS[model.mount]),
-        child=_plain("--child", child),
+        parent=_require_plain_name("--parent", parent or _PARENTS[model.mount]),
+        child=_require_plain_name("--child", child),
         notes=(
-            stands_for(told.get("verdict")).rstrip("."),
-            *_unseen(told.get("candidates", []), model.length_unit),
-            *_hidden(result["unobservable"]),
-            *_left_behind(model),
+            uncertainty_scope(told.get("verdict")).rstrip("."),
+            *_undetectable_notes(told.get("candidates", []), model.length_unit),
+            *_unobservable_notes(result["unobservable"]),
+            *_omitted_effect_notes(model),
         ),
     )
 
 
-def _plain(flag: str, name: str) -> str:
-    if not name or not set(name) <= _PLAIN or name[0].isdigit():
+def _require_plain_name(flag: str, name: str) -> str:
+    if not name or not set(name) <= _PLAIN_LETTERS or name[0].isdigit():
         raise InputError(f"{flag} {name!r}: to fix: a name of letters, digits and _, as links in URDF have it")
     return name
 
 
-def _hidden(directions: Sequence[str]) -> list[str]:
+def _unobservable_notes(directions: Sequence[str]) -> list[str]:
     return [f"Not observable from these motions, left at the coarse value: {direction}" for direction in directions]
 
 
-def _unseen(candidates: Sequence[dict[str, Any]], length_unit: str) -> list[str]:
+def _undetectable_notes(candidates: Sequence[dict[str, Any]], length_unit: str) -> list[str]:
     """How far an effect that the views do not show could push the hand-eye: U is that of the model."""
     known = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
     if not known:
@@ -132,6 +132,6 @@ def _unseen(candidates: Sequence[dict[str, Any]], length_unit: str) -> list[str]
     return [f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"]
 
 
-def _left_behind(model: ModelFile) -> list[str]:
+def _omitted_effect_notes(model: ModelFile) -> list[str]:
     """Effects of the model that one rigid hand-eye does not hold."""
     return [f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}"] if model.effects else []

@@ -9,7 +9,7 @@ import numpy as np
 from stitch import frames
 from stitch.controllers.pose_numbers import fixed_xyz_numbers, quaternion_w_first_numbers
 from stitch.export.controller_frames import controller_frame
-from stitch.export.hand_eye import HandEye
+from stitch.export.hand_eye import ExportedHandEye
 from stitch.export.text_lines import commented, row, xml_comment
 from stitch.frames import Array
 from stitch.units import METRES
@@ -18,9 +18,9 @@ from stitch.writing.urdf_file import roll_pitch_yaw
 _QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
-def ros_yaml(eye: HandEye) -> str:
+def ros_yaml(eye: ExportedHandEye) -> str:
     """A launch file of ROS 2 in YAML that publishes the transform: what MoveIt's own calibration saves."""
-    numbers = zip(_QUATERNION, _pose(eye.T_mount).tolist(), strict=True)
+    numbers = zip(_QUATERNION, _pose_quaternion(eye.T_mount).tolist(), strict=True)
     flags = " ".join(f"--{key} {row([x])}" for key, x in numbers)
     return (
         f"{commented('# ', _quaternion_head(eye))}launch:\n  - node:\n      pkg: tf2_ros\n"
@@ -29,9 +29,9 @@ def ros_yaml(eye: HandEye) -> str:
     )
 
 
-def ros_launch(eye: HandEye) -> str:
+def ros_launch(eye: ExportedHandEye) -> str:
     """The same as a launch file of ROS 1."""
-    args = f"{row(_pose(eye.T_mount))} {eye.parent} {eye.child}"
+    args = f"{row(_pose_quaternion(eye.T_mount))} {eye.parent} {eye.child}"
     return (
         f"{xml_comment(_quaternion_head(eye))}<launch>\n"
         f'  <node pkg="tf2_ros" type="static_transform_publisher" name="{eye.parent}_to_{eye.child}"\n'
@@ -39,7 +39,7 @@ def ros_launch(eye: HandEye) -> str:
     )
 
 
-def urdf(eye: HandEye) -> str:
+def urdf(eye: ExportedHandEye) -> str:
     """A link and a fixed joint, to be included in the robot's URDF; m and rad."""
     near = _roll_pitch_yaw(eye.T_mount)
     labels, units = ("x", "y", "z", "roll", "pitch", "yaw"), ("m",) * 3 + ("rad",) * 3
@@ -55,7 +55,7 @@ def urdf(eye: HandEye) -> str:
     return f"{head}{ElementTree.tostring(root, encoding='unicode')}\n"
 
 
-def opencv(eye: HandEye) -> str:
+def opencv(eye: ExportedHandEye) -> str:
     """YAML of cv::FileStorage: the matrix and its covariance in the session's length_unit."""
     unit = eye.length_unit
     scale = np.repeat([1.0, 1 / METRES[unit]], 3)
@@ -69,14 +69,14 @@ def opencv(eye: HandEye) -> str:
     )
 
 
-def zivid(eye: HandEye) -> str:
+def zivid(eye: ExportedHandEye) -> str:
     """YAML as Zivid's SDK saves a Matrix4x4; mm."""
     rows = ",\n".join(f"      [{row(line, ', ')}]" for line in eye.lengths("mm"))
     head = commented("# ", _matrix_head(eye, "mm"))
     return f"{head}__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n{rows}\n    ]\n"
 
 
-FORMATS: dict[str, Callable[[HandEye], str]] = {
+HAND_EYE_FORMATS: dict[str, Callable[[ExportedHandEye], str]] = {
     "ros": ros_yaml,
     "urdf": urdf,
     "opencv": opencv,
@@ -88,12 +88,12 @@ FORMATS: dict[str, Callable[[HandEye], str]] = {
 }
 
 
-def _pose(T: Array) -> Array:
+def _pose_quaternion(T: Array) -> Array:
     """(7,) x, y, z, qx, qy, qz, qw."""
     return np.append(T[:3, 3], frames.to_quaternion(T))
 
 
-def _quaternion_head(eye: HandEye) -> list[str]:
+def _quaternion_head(eye: ExportedHandEye) -> list[str]:
     near = quaternion_w_first_numbers(eye.T_mount)
     order = [0, 1, 2, 4, 5, 6, 3]
     return eye.head(lambda T: quaternion_w_first_numbers(T, near)[order], _QUATERNION, ("m",) * 3 + ("",) * 4)
@@ -105,7 +105,7 @@ def _roll_pitch_yaw(T: Array, near: Array | None = None) -> Array:
     return np.asarray(fixed_xyz_numbers(T, None if near is None else near * turned) / turned)
 
 
-def _matrix_head(eye: HandEye, unit: str) -> list[str]:
+def _matrix_head(eye: ExportedHandEye, unit: str) -> list[str]:
     """For matrices U of position, and of a small turn about the axes of the parent."""
 
     def numbers(T: Array) -> Array:

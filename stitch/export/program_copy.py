@@ -9,17 +9,17 @@ from stitch import frames
 from stitch.controllers.pose_numbers import NUMBERS
 from stitch.controllers.program import Program
 from stitch.controllers.taught import Span
-from stitch.export.program_targets import coupled
+from stitch.export.program_targets import couple_j2_j3
 from stitch.frames import Array
 
 # Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not
 # rounded away where its number was written short. FANUC listings have three, whatever they show.
 _DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7)}
 # A move below this (mm and rad together) is none: numbers are not written anew for rounding's sake.
-_STILL = 1e-9
+_NEGLIGIBLE_CHANGE = 1e-9
 
 
-def moved_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = False) -> dict[Path, str]:
+def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = False) -> dict[Path, str]:
     """The program's texts with its targets moved.
 
     Args:
@@ -32,17 +32,17 @@ def moved_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = F
     for point, move, step in zip(program.points, moves, turns, strict=True):
         file = point.file or program.file
         text = program.texts[file]
-        if point.T_frame_tool is not None and np.abs(frames.log(move)).max() > _STILL:
-            old = _values(text, point.pose_at)
+        if point.T_frame_tool is not None and np.abs(frames.log(move)).max() > _NEGLIGIBLE_CHANGE:
+            old = _span_values(text, point.pose_at)
             new = NUMBERS[program.controller](point.T_frame_tool @ move, old)
             new = _in_half_turns(new, old) if program.controller in ("kuka", "fanuc") else new
             edits[file] += _edits(text, point.pose_at, new, [place] * 3 + [turn] * (len(new) - 3))
-        if point.joints is not None and np.abs(step).max() > _STILL:
-            own = coupled(step, -1.0) if j2_in_j3 else step
+        if point.joints is not None and np.abs(step).max() > _NEGLIGIBLE_CHANGE:
+            own = couple_j2_j3(step, -1.0) if j2_in_j3 else step
             angles = own if program.controller == "ur" else np.degrees(own)
-            new = _values(text, point.joints_at) + angles
+            new = _span_values(text, point.joints_at) + angles
             edits[file] += _edits(text, point.joints_at, new, [joint] * len(new))
-    return {file: _edited(text, edits[file]) for file, text in program.texts.items()}
+    return {file: _apply_edits(text, edits[file]) for file, text in program.texts.items()}
 
 
 def number_text(old: str, value: float, decimals: int) -> str:
@@ -56,7 +56,7 @@ def number_text(old: str, value: float, decimals: int) -> str:
     return "+" + text if old.startswith("+") and value >= 0 else text
 
 
-def _values(text: str, spans: Sequence[Span]) -> Array:
+def _span_values(text: str, spans: Sequence[Span]) -> Array:
     return np.array([float(text[begin:end]) for begin, end in spans])
 
 
@@ -73,7 +73,7 @@ def _edits(text: str, spans: Sequence[Span], new: Array, decimals: Sequence[int]
     ]
 
 
-def _edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
+def _apply_edits(text: str, edits: Sequence[tuple[Span, str]]) -> str:
     """From behind, so that places before an edit stay."""
     for (begin, end), new in sorted(edits, reverse=True):
         text = text[:begin] + new + text[end:]

@@ -6,10 +6,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.controllers.program import Program
-from stitch.controllers.taught import Taught
+from stitch.controllers.taught import TaughtPoint
 from stitch.errors import InputError
 from stitch.export.arm_model import ArmModel
-from stitch.export.inverse_kinematics import joints_at
+from stitch.export.inverse_kinematics import joint_solutions
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 
@@ -22,7 +22,7 @@ _AGREE = 0.02
 
 
 @dataclass(frozen=True)
-class Targets:
+class ProgramTargets:
     """K targets of a program. Lengths in the session's length_unit."""
 
     joints: Array  # (K, n) rad, of the session's arm
@@ -30,14 +30,16 @@ class Targets:
     cartesian: tuple[bool, ...]  # the joint angles are those of the inverse kinematics
 
 
-def coupled(joints: Array, sign: float = 1.0) -> Array:
+def couple_j2_j3(joints: Array, sign: float = 1.0) -> Array:
     """FANUC's J3 counts from the horizontal: the third joint of DH rows is J2 + J3 (sign −1 for the way back)."""
     out = np.array(joints, float)
     out[..., 2] += sign * out[..., 1]
     return out
 
 
-def targets_of(program: Program, arm: ArmModel, near: Array | None = None, j2_in_j3: bool = False) -> Targets:
+def program_targets(
+    program: Program, arm: ArmModel, near: Array | None = None, j2_in_j3: bool = False
+) -> ProgramTargets:
     """Joint angles that the nominal arm takes at each target.
 
     Those of a pose are found from the target before, the first from `near` or from the poses of the run: that arm
@@ -51,31 +53,31 @@ def targets_of(program: Program, arm: ArmModel, near: Array | None = None, j2_in
         InputError: joints of another arm, a pose out of reach, a waypoint whose joints and pose contradict each other.
     """
     unit = 1e-3 / arm.robot.metres_per_unit
-    T_base_frame, T_flange_tool = (_scaled(T, unit) for T in (program.T_base_frame, program.T_flange_tool))
+    T_base_frame, T_flange_tool = (_scaled_pose(T, unit) for T in (program.T_base_frame, program.T_flange_tool))
     starts = arm.joints[:: max(1, len(arm.joints) // _STARTS)] if near is None else near[None]
     found: list[Array] = []
     for point in program.points:
         if point.T_frame_tool is None:
             assert point.joints is not None
-            found.append(_own(program, arm, point, j2_in_j3))
+            found.append(_taught_joints(program, arm, point, j2_in_j3))
             continue
-        T = T_base_frame @ _scaled(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
+        T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
         if point.joints is not None:
-            found.append(_own(program, arm, point, j2_in_j3))
+            found.append(_taught_joints(program, arm, point, j2_in_j3))
             _require_agreement(program, arm, point, kinematics.forward(arm.robot, found[-1]), T)
         else:
-            found.append(_reached(program, arm, point, T, found[-1] if found else None, starts))
+            found.append(_nearest_solution(program, arm, point, T, found[-1] if found else None, starts))
     cartesian = tuple(point.joints is None for point in program.points)
-    return Targets(np.array(found), T_flange_tool, cartesian)
+    return ProgramTargets(np.array(found), T_flange_tool, cartesian)
 
 
-def _scaled(T: Array, unit: float) -> Array:
+def _scaled_pose(T: Array, unit: float) -> Array:
     out = T.copy()
     out[:3, 3] *= unit
     return out
 
 
-def _own(program: Program, arm: ArmModel, point: Taught, j2_in_j3: bool) -> Array:
+def _taught_joints(program: Program, arm: ArmModel, point: TaughtPoint, j2_in_j3: bool) -> Array:
     assert point.joints is not None
     n = arm.robot.n_joints
     if len(point.joints) != n:
@@ -83,16 +85,18 @@ def _own(program: Program, arm: ArmModel, point: Taught, j2_in_j3: bool) -> Arra
             f"{program.file} line {point.line}: {point.name} has {len(point.joints)} joints, the arm of session "
             f"{arm.session} has {n}; to fix: name a program of that arm"
         )
-    return coupled(point.joints) if j2_in_j3 else point.joints
+    return couple_j2_j3(point.joints) if j2_in_j3 else point.joints
 
 
-def _reached(program: Program, arm: ArmModel, point: Taught, T: Array, before: Array | None, starts: Array) -> Array:
+def _nearest_solution(
+    program: Program, arm: ArmModel, point: TaughtPoint, T: Array, before: Array | None, starts: Array
+) -> Array:
     """The solution nearest to the target before, or to the poses of the run."""
     if before is not None:
-        onward = joints_at(arm.robot, T, before[None])
+        onward = joint_solutions(arm.robot, T, before[None])
         if len(onward) and np.abs(onward[0] - before).max() < _SAME:
             return np.asarray(onward[0])
-    found = joints_at(arm.robot, T, starts if before is None else np.vstack([before[None], starts]))
+    found = joint_solutions(arm.robot, T, starts if before is None else np.vstack([before[None], starts]))
     if not len(found):
         raise InputError(
             f"{program.file} line {point.line}: {point.name} is out of reach of the arm of session {arm.session}; to "
@@ -103,7 +107,7 @@ def _reached(program: Program, arm: ArmModel, point: Taught, T: Array, before: A
     return np.asarray(found[turn.argmin()])
 
 
-def _require_agreement(program: Program, arm: ArmModel, point: Taught, T_joints: Array, T_pose: Array) -> None:
+def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_joints: Array, T_pose: Array) -> None:
     off = float(np.linalg.norm(T_joints[:3, 3] - T_pose[:3, 3])) * arm.robot.metres_per_unit
     if off > _AGREE:
         raise InputError(

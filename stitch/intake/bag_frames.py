@@ -23,7 +23,7 @@ class BagFrames:
     hand_eye_known: bool  # tf says where the scanner sits
 
 
-def frames_of(tree: TransformTree, scanner: str, named: Sequence[str]) -> BagFrames:
+def identify_frames(tree: TransformTree, scanner: str, named: Sequence[str]) -> BagFrames:
     """Tell the frames.
 
     Args:
@@ -45,10 +45,10 @@ def frames_of(tree: TransformTree, scanner: str, named: Sequence[str]) -> BagFra
         carried = bool(moving) and flange in path
     elif moving:
         first, last = moving[0], moving[-1]
-        base = _named(path[:first], _BASES) or path[first - 1]
+        base = _most_usual_name(path[:first], _BASES) or path[first - 1]
         # Tools that are fixed to the last link beside the scanner's way count too.
-        fixed = [f for f in tree.names if path[last] in tree.above(f) and _rigid(tree, f, path[last])]
-        flange = _named(fixed, _FLANGES) or path[last]
+        fixed = [f for f in tree.names if path[last] in tree.above(f) and _is_rigid(tree, f, path[last])]
+        flange = _most_usual_name(fixed, _FLANGES) or path[last]
         carried, reason = True, f"the scanner's frame {scanner} moves with it"
     else:
         ends = [f for f in tree.names if tree.moves(f)]
@@ -57,24 +57,24 @@ def frames_of(tree: TransformTree, scanner: str, named: Sequence[str]) -> BagFra
         last_end = max(ends, key=lambda f: len(tree.above(f)))
         chain = tree.above(last_end)[::-1]
         first = next(i for i in range(1, len(chain)) if tree.moves(chain[i]))
-        base = _named(chain[:first], _BASES) or chain[first - 1]
-        fixed = [f for f in tree.names if last_end in tree.above(f) and _rigid(tree, f, last_end)]
-        flange = _named(fixed, _FLANGES) or last_end
+        base = _most_usual_name(chain[:first], _BASES) or chain[first - 1]
+        fixed = [f for f in tree.names if last_end in tree.above(f) and _is_rigid(tree, f, last_end)]
+        flange = _most_usual_name(fixed, _FLANGES) or last_end
         carried, reason = False, f"the scanner's frame {scanner} does not move"
         known = known and bool(set(path) & set(chain))
     return BagFrames(base, flange, scanner, "eye_in_hand" if carried else "eye_to_hand", reason, known)
 
 
-def _named(found: Sequence[str], usual: Sequence[str]) -> str | None:
+def _most_usual_name(frames: Sequence[str], usual_names: Sequence[str]) -> str | None:
     """The frame with the most usual name; names may have a prefix of their robot."""
-    for name in usual:
-        fitting = [frame for frame in found if frame == name or frame.endswith(f"_{name}")]
+    for name in usual_names:
+        fitting = [frame for frame in frames if frame == name or frame.endswith(f"_{name}")]
         if fitting:
             return fitting[-1]
     return None
 
 
-def _rigid(tree: TransformTree, frame: str, link: str) -> bool:
+def _is_rigid(tree: TransformTree, frame: str, link: str) -> bool:
     """Whether nothing moves between a link and a frame above which it lies."""
     path = tree.above(frame)
     return not any(tree.moves(f) for f in path[: path.index(link)])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.intake.transform_tree import Recording
-from stitch.reading.extras import package
+from stitch.reading.extras import import_extra
 from stitch.reading.text_file import shortened
 
 CLOUD, IMAGE, CAMERA = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
@@ -22,7 +22,7 @@ _DEPTH = ("16UC1", "32FC1", "mono16")
 
 
 @dataclass
-class Recorded:
+class BagContents:
     """Everything but the scans themselves; times in s, lengths in m, angles in rad."""
 
     edges: list[Recording]  # of tf
@@ -41,14 +41,14 @@ def is_bag(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_bag(path: Path) -> Iterator[Any]:
     """The bag for reading.
 
     Raises:
         InputError: rosbags is not installed, or the file is no bag; names it.
     """
-    highlevel = package("rosbags.highlevel", path, "bags")
-    typesys = package("rosbags.typesys", path, "bags")
+    highlevel = import_extra("rosbags.highlevel", path, "bags")
+    typesys = import_extra("rosbags.typesys", path, "bags")
     try:
         with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)) as reader:
             yield reader
@@ -59,43 +59,43 @@ def opened(path: Path) -> Iterator[Any]:
         raise InputError(f"{path}: cannot be read as a bag ({reason}); to fix: record or convert it again") from None
 
 
-def recorded(path: Path) -> Recorded:
+def read_bag(path: Path) -> BagContents:
     """Read all but the scans' own data."""
-    out = Recorded([], {}, {})
+    out = BagContents([], {}, {})
     wanted = {*_TF, _JOINTS, _TEXT, CLOUD, IMAGE, CAMERA}
-    with opened(path) as reader:
+    with open_bag(path) as reader:
         for connection, stamp, raw in reader.messages([c for c in reader.connections if c.msgtype in wanted]):
             message = reader.deserialize(raw, connection.msgtype)
             topic, kind = connection.topic, connection.msgtype
             if kind in _TF:
-                out.edges += [_edge(t, "static" in topic) for t in message.transforms]
+                out.edges += [_transform_recording(t, "static" in topic) for t in message.transforms]
             elif kind == _JOINTS:
                 angles = {n: float(q) for n, q in zip(message.name, message.position, strict=False)}
-                out.joints.append((time_of(message.header, stamp), angles))
+                out.joints.append((message_time(message.header, stamp), angles))
             elif kind == _TEXT:
                 out.urdf = message.data if "robot_description" in topic else out.urdf
             elif kind == CAMERA:
                 out.cameras[topic] = message
             elif kind == CLOUD or message.encoding in _DEPTH:
-                out.scans.setdefault(topic, []).append(time_of(message.header, stamp))
-                out.frame_of[topic] = _plain(message.header.frame_id)
+                out.scans.setdefault(topic, []).append(message_time(message.header, stamp))
+                out.frame_of[topic] = _frame_name(message.header.frame_id)
     out.joints.sort(key=lambda item: item[0])
     return out
 
 
-def time_of(header: Any, recorded_ns: int) -> float:
+def message_time(header: Any, recorded_ns: int) -> float:
     """Of the measurement, s; of the recording where it has none."""
     stamp = float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)
     return stamp or 1e-9 * recorded_ns
 
 
-def _edge(message: Any, static: bool) -> Recording:
+def _transform_recording(message: Any, static: bool) -> Recording:
     turn, shift = message.transform.rotation, message.transform.translation
     R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     T = frames.make(R, np.array([shift.x, shift.y, shift.z]))
-    parent, child = _plain(message.header.frame_id), _plain(message.child_frame_id)
-    return time_of(message.header, 0), parent, child, T, static
+    parent, child = _frame_name(message.header.frame_id), _frame_name(message.child_frame_id)
+    return message_time(message.header, 0), parent, child, T, static
 
 
-def _plain(frame: str) -> str:
+def _frame_name(frame: str) -> str:
     return frame.lstrip("/")

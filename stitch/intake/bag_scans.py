@@ -10,7 +10,7 @@ from stitch.frames import Array
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Depth in whole numbers counts millimetres (REP 118).
-_MM = 1e-3
+_METRES_PER_MM = 1e-3
 
 
 def cloud_array(message: Any, where: str) -> Array:
@@ -38,7 +38,7 @@ def cloud_array(message: Any, where: str) -> Array:
     points = np.ascontiguousarray(rows[:, : message.point_step * message.width]).view(layout)
     columns = [np.asarray(points[axis], float) for axis in "xyz"] + _brightness(points)
     table: Array = np.stack(columns, axis=-1).reshape(message.height, message.width, len(columns))
-    return table if message.height > 1 else _measured(table[0])
+    return table if message.height > 1 else _without_empty_points(table[0])
 
 
 def _brightness(points: NDArray[np.void]) -> list[Array]:
@@ -50,23 +50,23 @@ def _brightness(points: NDArray[np.void]) -> list[Array]:
     return [np.asarray(points["intensity"], float)] if "intensity" in names else []
 
 
-def _measured(table: Array) -> Array:
+def _without_empty_points(table: Array) -> Array:
     return table[np.isfinite(table[:, :3]).all(axis=1) & table[:, :3].any(axis=1)]
 
 
 def depth_array(message: Any, camera: Any) -> Array:
     """(H, W, 3) points of a depth image by its CameraInfo, which must be of an image without distortion."""
     order = ">" if message.is_bigendian else "<"
-    kind, scale = ("f4", 1.0) if message.encoding == "32FC1" else ("u2", _MM)
+    kind, scale = ("f4", 1.0) if message.encoding == "32FC1" else ("u2", _METRES_PER_MM)
     rows = np.ascontiguousarray(message.data, np.uint8).reshape(message.height, message.step)
     width = message.width * np.dtype(kind).itemsize
     z = np.ascontiguousarray(rows[:, :width]).view(order + kind).astype(float) * scale
     z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
-    fx, cx, fy, cy = (float(_matrix(camera)[i]) for i in (0, 2, 4, 5))
+    fx, cx, fy, cy = (float(_camera_matrix(camera)[i]) for i in (0, 2, 4, 5))
     v, u = np.mgrid[: message.height, : message.width]
     return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
 
 
-def _matrix(camera: Any) -> Any:
+def _camera_matrix(camera: Any) -> Any:
     """K, in ROS 1 and 2."""
     return camera.k if hasattr(camera, "k") else camera.K

@@ -31,7 +31,7 @@ class ClockTimes:
     first_s: float = 0.0  # the first since the calendar's beginning, or since midnight where no date stands beside it
 
 
-def clock_of(labels: Sequence[tuple[str, ...]]) -> ClockTimes | None:
+def find_clock_column(labels: Sequence[tuple[str, ...]]) -> ClockTimes | None:
     """The one column of times of day among the texts beside the rows of a table; None without, or with several."""
     if len({len(texts) for texts in labels}) != 1:
         return None
@@ -44,7 +44,7 @@ def clock_times(cells: Sequence[str]) -> ClockTimes | None:
 
     Dates whose order nobody states are read both ways. What runs backwards one way is read the other way.
     """
-    both = [_moments(cells, day_first) for day_first in (True, False)]
+    both = [_column_seconds(cells, day_first) for day_first in (True, False)]
     known = [moments for moments in both if moments is not None]
     if not known or all((moments == moments[0]).all() for moments in known):
         return None
@@ -63,19 +63,19 @@ def clock_times(cells: Sequence[str]) -> ClockTimes | None:
     return ClockTimes(np.asarray(since_first[0]), words, float(forwards[0][0]))
 
 
-def _moments(cells: Sequence[str], day_first: bool) -> Array | None:
-    told = [_seconds(cell.strip(), day_first) for cell in cells]
+def _column_seconds(cells: Sequence[str], day_first: bool) -> Array | None:
+    told = [_time_of_day_seconds(cell.strip(), day_first) for cell in cells]
     if not told or any(t is None for t in told):
         return None
     moments: Array = np.array(told, float)
     return moments
 
 
-def _seconds(cell: str, day_first: bool) -> float | None:
+def _time_of_day_seconds(cell: str, day_first: bool) -> float | None:
     found = _CLOCK.fullmatch(cell)
     if not found:
         return None
-    day = _ordinal(found["date"], day_first) if found["date"] else 0
+    day = _date_ordinal(found["date"], day_first) if found["date"] else 0
     if day is None:
         return None
     hour = int(found["h"])
@@ -84,7 +84,7 @@ def _seconds(cell: str, day_first: bool) -> float | None:
     return DAY_S * day + 3600.0 * hour + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
 
 
-def _ordinal(text: str, day_first: bool) -> int | None:
+def _date_ordinal(text: str, day_first: bool) -> int | None:
     """Days; None where it is no date. With dots the day always stands first."""
     if found := _YEAR_FIRST.fullmatch(text):
         year, month, day = map(int, found.groups())

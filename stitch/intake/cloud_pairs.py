@@ -54,17 +54,17 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
         same: tuple[int | None, ...] = tuple(range(N))
         out = [Pairing(same, "in the order of the names of the clouds", False)]
         out.append(Pairing(same[::-1], "the poses in reverse order", False))
-        return out + [_shifted(N, by) for by in _SHIFTS if N - abs(by) >= 4]
-    return _lacking(N, M)
+        return out + [_shifted_pairing(N, by) for by in _SHIFTS if N - abs(by) >= 4]
+    return _incomplete_pairings(N, M)
 
 
-def _shifted(count: int, by: int) -> Pairing:
+def _shifted_pairing(count: int, by: int) -> Pairing:
     rows = tuple(i + by if 0 <= i + by < count else None for i in range(count))
     side = "below" if by > 0 else "above"
     return Pairing(rows, f"each cloud with the pose {abs(by)} row{'s' * (abs(by) > 1)} {side}", False)
 
 
-def _lacking(N: int, M: int) -> list[Pairing]:
+def _incomplete_pairings(N: int, M: int) -> list[Pairing]:
     """One list lacks one or two: every way, the end first."""
     out = []
     if N < M:
@@ -112,8 +112,8 @@ def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
 
 def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
     """The last number in the cloud's name is that in the name of the pose: view_07 and robot_pose_7."""
-    own = [_number(cloud.stem) for cloud in clouds]
-    theirs = [_number(Path(texts[0]).stem) if texts else None for texts in labels]
+    own = [_last_number(cloud.stem) for cloud in clouds]
+    theirs = [_last_number(Path(texts[0]).stem) if texts else None for texts in labels]
     if None in own or None in theirs or len(set(own)) < len(own) or len(set(theirs)) < len(theirs):
         return None
     if not set(own) <= set(theirs):
@@ -123,7 +123,7 @@ def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pai
 
 def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:
     """The one column of whole numbers, no two alike, in which the last numbers of the clouds' names stand."""
-    own = [_number(cloud.stem) for cloud in clouds]
+    own = [_last_number(cloud.stem) for cloud in clouds]
     if numbers is None or None in own or len(set(own)) < len(own):
         return None
     counted = [list(c) for c in numbers.T if len(set(c)) == len(c) and {*own} <= {*c}]
@@ -132,6 +132,6 @@ def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:
     return Pairing(tuple(counted[0].index(number) for number in own), "by the numbers in a column", True)
 
 
-def _number(name: str) -> int | None:
+def _last_number(name: str) -> int | None:
     found = re.findall(r"\d+", name)
     return int(found[-1]) if found else None

@@ -40,7 +40,7 @@ _NAMED = {
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedColumns:
     """Columns whose meaning their names tell; indices into the columns."""
 
     position: tuple[int, ...] = ()
@@ -52,20 +52,20 @@ class Named:
     rest: dict[str, int] = field(default_factory=dict)  # other named columns: times, temperatures
 
 
-def read_names(header: Sequence[str]) -> Named:
+def read_names(header: Sequence[str]) -> NamedColumns:
     """What a header says."""
-    plain, units = zip(*(_plain(name) for name in header), strict=True)
+    plain, units = zip(*(_bare_name(name) for name in header), strict=True)
     where: dict[str, int] = {}
     for i, name in enumerate(plain):
         where.setdefault(name, i)
-    joints = _joints(header)
+    joints = _joint_columns(header)
     position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
-    rotation, convention = _rotation(where, set(position) | set(joints))
-    matrix = _matrix(header) if not rotation else ()
+    rotation, convention = _rotation_columns(where, set(position) | set(joints))
+    matrix = _matrix_columns(header) if not rotation else ()
     if matrix:
         rotation, position, convention = matrix, (), None
     used = {*position, *rotation, *joints}
-    return Named(
+    return NamedColumns(
         position=position,
         rotation=rotation,
         joints=joints,
@@ -76,7 +76,7 @@ def read_names(header: Sequence[str]) -> Named:
     )
 
 
-def _plain(name: str) -> tuple[str, str]:
+def _bare_name(name: str) -> tuple[str, str]:
     """A name without its unit and fillers, and its unit."""
     found = _UNIT.search(name.strip())
     unit = (found[1] or found[2] or "").strip().lower() if found else ""
@@ -103,7 +103,7 @@ def _plain(name: str) -> tuple[str, str]:
     return (f"rot{last}" if turned else last), unit
 
 
-def _rotation(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
+def _rotation_columns(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
     for names, convention in sorted(_NAMED.items(), key=lambda item: -len(item[0])):
         index = [where.get(name, -1) for name in names]
         # Angles by place: the triple counts in the order in which its columns stand.
@@ -113,7 +113,7 @@ def _rotation(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], 
     return (), None
 
 
-def _joints(header: Sequence[str]) -> tuple[int, ...]:
+def _joint_columns(header: Sequence[str]) -> tuple[int, ...]:
     found: dict[int, int] = {}
     for i, name in enumerate(header):
         lower = name.strip().lower()
@@ -130,7 +130,7 @@ def _joints(header: Sequence[str]) -> tuple[int, ...]:
     )
 
 
-def _matrix(header: Sequence[str]) -> tuple[int, ...]:
+def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
     """Columns m00 … m33, r11 … t3 or 0 … 15 in the order of the file, if they are 12 or 16."""
     named = [
         i for i, name in enumerate(header) if re.search(r"(?:^|[._])(?:[mtr]?_?\d{1,2}|t[xyz1-3])\]?$", name.lower())

@@ -13,13 +13,13 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import Pairing, pairings
-from stitch.intake.doctor import Decided, decide
-from stitch.intake.found_files import Found, look_into
+from stitch.intake.doctor import ConventionChoice, choose_convention
+from stitch.intake.found_files import FolderFiles, find_folder_files
 from stitch.intake.guesses import Guess
 from stitch.intake.header_poses import header_poses
 from stitch.intake.joint_poses import JOINT_ANGLES, joint_layouts, joint_readings
-from stitch.intake.layouts import layouts
-from stitch.intake.mounting import Mounting, mounting
+from stitch.intake.layouts import possible_layouts
+from stitch.intake.mounting import Mounting, choose_mounting
 from stitch.intake.one_frame import require_own_frames
 from stitch.intake.plausible_units import CLOUD_UNITS, cloud_units, pose_units
 from stitch.intake.program_poses import is_program, program_poses
@@ -27,15 +27,15 @@ from stitch.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.intake.readings import Reading, readings
 from stitch.intake.stated import StatedFolder, StatedTable
 from stitch.intake.target_motions import target_motions
-from stitch.intake.targets_of_folder import targets_of_folder
+from stitch.intake.targets_of_folder import find_folder_targets
 from stitch.intake.ways import MM
-from stitch.intake.why import guesses_of
-from stitch.integrity.relative_scans import relative_scans
+from stitch.intake.why import session_guesses
+from stitch.integrity.relative_scans import register_scan_pairs
 from stitch.measurement.capture import Capture
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.session import Scanner, Session, View
-from stitch.measurement.thinning import thinned
+from stitch.measurement.thinning import thin_session
 from stitch.reading.clouds import read_cloud
 
 # Enough points a view to tell conventions.
@@ -47,10 +47,10 @@ _FEWEST = 3
 class FirstSession:
     """What was found in a folder and how it is to be taken."""
 
-    found: Found
+    files: FolderFiles
     raw: RawPoses
     cloud_unit: str
-    decided: Decided
+    choice: ConventionChoice
     mounting: Mounting
     guesses: tuple[Guess, ...]
     optical_axis: str
@@ -59,7 +59,7 @@ class FirstSession:
     @property
     def pairing(self) -> Pairing:
         """Which row belongs to which cloud."""
-        return self.decided.best.way.pairing
+        return self.choice.best.interpretation.pairing
 
 
 def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
@@ -68,8 +68,8 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     Raises:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
     """
-    found = look_into(folder, stated.poses)
-    raw = _raw(found)
+    found = find_folder_files(folder, stated.poses)
+    raw = _read_folder_poses(found)
     raw = raw.renamed(stated.columns) if stated.columns else raw
     ways_to_read = all_readings(raw, found.urdf, stated)
     clouds = [read_cloud(file) for file in found.clouds]
@@ -80,27 +80,27 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
     pairs = pairings(found.clouds, raw.labels, raw.numbers)
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
-    units = open_units(ways_to_read, stated)
-    seen, of_targets = targets_of_folder(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
-    motions = cache(lambda: relative_scans(capture))
+    units = candidate_units(ways_to_read, stated)
+    seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
+    motions = cache(lambda: register_scan_pairs(capture))
     shown = target_motions(seen) if seen else None
-    decided = decide(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
+    decided = choose_convention(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
     require_own_frames(folder, motions, decided)
-    of_joints = decided.best.way.reading.rotation == JOINT_ANGLES
-    settled = mounting(decided, stated.mount, stated.inverse, of_joints)
-    axis, axis_guess = optical_axis(clouds)
-    told = guesses_of(found, raw, decided, points, own_units, stated)
+    of_joints = decided.best.interpretation.reading.rotation == JOINT_ANGLES
+    settled = choose_mounting(decided, stated.mount, stated.inverse, of_joints)
+    axis, axis_guess = guess_optical_axis(clouds)
+    told = session_guesses(found, raw, decided, points, own_units, stated)
     guesses = (*told, settled.guess, axis_guess, *of_targets)
     return FirstSession(found, raw, own_units[0], decided, settled, guesses, optical_axis=axis, sightings=seen)
 
 
-def _raw(found: Found) -> RawPoses:
-    if not found.poses:
-        return header_poses(found.clouds)
-    first = found.poses[0]
+def _read_folder_poses(files: FolderFiles) -> RawPoses:
+    if not files.poses:
+        return header_poses(files.clouds)
+    first = files.poses[0]
     if is_program(first):
         return program_poses(first)
-    return read_raw_poses(found.poses)
+    return read_raw_poses(files.poses)
 
 
 def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:
@@ -113,7 +113,7 @@ def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[
         InputError: columns that hold no pose.
     """
     out: list[Reading] = []
-    for layout in layouts(raw):
+    for layout in possible_layouts(raw):
         if layout.rotation.shape[1]:
             out += readings(layout, stated.rotation, stated.angle_unit)
         else:
@@ -123,11 +123,11 @@ def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[
     return out
 
 
-def open_units(found: Sequence[Reading], stated: StatedTable) -> list[str]:
+def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[str]:
     """Units that positions can have of which the file does not say it: stated, or plausible."""
     if stated.length_unit:
         return [stated.length_unit]
-    open_ = [r for r in found if r.layout.length_unit is None]
+    open_ = [r for r in readings if r.layout.length_unit is None]
     return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3]))) or ["mm"]
 
 
@@ -157,10 +157,10 @@ def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
         cad_unit=None,
         views=views,
     )
-    return thinned(session, _POINTS)[1]
+    return thin_session(session, _POINTS)[1]
 
 
-def optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:
+def guess_optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:
     """The side of z on which the points lie."""
     middle: Array = np.mean([np.median(c.points, axis=0) for c in clouds], axis=0)
     axis = "-z" if middle[2] < 0 and abs(middle[2]) > np.linalg.norm(middle[:2]) else "+z"

@@ -10,7 +10,7 @@ from natsort import natsorted, ns
 
 from stitch.errors import InputError
 from stitch.intake.cloud_files import clouds_among
-from stitch.intake.layouts import layouts
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.program_poses import PROGRAMS, is_program, read_by_its_program
 from stitch.intake.raw_poses import STRUCTURED, TABLES, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
@@ -26,18 +26,18 @@ _OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
 
 
 @dataclass(frozen=True)
-class Found:
+class FolderFiles:
     """Files of one folder; clouds in the order of their names, numbers by size."""
 
     folder: Path
     clouds: tuple[Path, ...]
     poses: tuple[Path, ...]  # one table, or a file for each pose; none: they stand in the headers of the scans
     urdf: Path | None
-    aside: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
+    unused: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
 
 
 @readable()
-def look_into(folder: Path, poses: Path | None = None) -> Found:
+def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     """Find clouds and poses in a folder and below it.
 
     Args:
@@ -49,27 +49,27 @@ def look_into(folder: Path, poses: Path | None = None) -> Found:
     _require_folder(folder)
     if poses is not None and not poses.exists():
         raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
-    files = _files(folder, 0)
+    files = _list_files(folder, 0)
     named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
     clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
-        raise InputError(_no_clouds(folder, files))
+        raise InputError(_no_clouds_message(folder, files))
     taken = {*clouds, *other_clouds}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
     _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
     chosen: list[Path] = []
     rest: list[Path] = []
     if poses is not None:
-        chosen, rest = _named(poses, taken)
+        chosen, rest = _stated_pose_files(poses, taken)
     elif candidates or poses_in_scans(clouds) is None:
-        chosen, rest = _poses(folder, candidates, len(clouds))
+        chosen, rest = _choose_pose_files(folder, candidates, len(clouds))
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
-    return Found(
+    return FolderFiles(
         folder=folder,
         clouds=tuple(clouds),
         poses=tuple(chosen),
         urdf=urdfs[0] if len(urdfs) == 1 else None,
-        aside=(*other_clouds, *rest),
+        unused=(*other_clouds, *rest),
     )
 
 
@@ -83,7 +83,7 @@ def _require_folder(folder: Path) -> None:
     raise InputError(f"{folder}: is a file; to fix: name the folder that it lies in, {folder.parent}")
 
 
-def _no_clouds(folder: Path, files: Sequence[Path]) -> str:
+def _no_clouds_message(folder: Path, files: Sequence[Path]) -> str:
     """Why, and what to do: an archive that nobody has unpacked, or files of other kinds."""
     packed = next((f for f in files if f.suffix.lower() in _PACKED), None)
     if packed is not None:
@@ -93,7 +93,7 @@ def _no_clouds(folder: Path, files: Sequence[Path]) -> str:
     return f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}"
 
 
-def _files(folder: Path, depth: int) -> list[Path]:
+def _list_files(folder: Path, depth: int) -> list[Path]:
     """Files in a folder and below, hidden ones and folders of runs left out."""
     out = []
     for entry in natsorted(folder.iterdir(), alg=ns.IGNORECASE):
@@ -102,7 +102,7 @@ def _files(folder: Path, depth: int) -> list[Path]:
         if entry.is_file():
             out.append(entry)
         elif entry.is_dir() and depth < _DEEPEST and not (entry / "result.json").exists():
-            out += _files(entry, depth + 1)
+            out += _list_files(entry, depth + 1)
     return out
 
 
@@ -111,7 +111,7 @@ def _may_hold_poses(file: Path) -> bool:
     return file.suffix.lower() in kinds and file.stat().st_size < _LARGEST_TABLE_MB * 1e6
 
 
-def _named(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
+def _stated_pose_files(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
     if poses.is_dir():
         inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
         if not inside:
@@ -126,14 +126,14 @@ def _require_no_workbook(folder: Path, files: Sequence[Path]) -> None:
         raise InputError(f"{book}: workbooks are not read; to fix: save the sheet of the poses as CSV in {folder}")
 
 
-def _poses(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
+def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
     """The one table, or the files that are named alike and are about as many as the clouds."""
     alike: dict[tuple[Path, str, str], list[Path]] = {}
     for file in candidates:
         alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
     sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
     single = [files for files in alike.values() if len(files) == 1]
-    groups = sets or [g for g in single if _says_pose(g[0])]
+    groups = sets or [g for g in single if _names_pose(g[0])]
     groups = groups or (len(single) > 1 and [g for g in single if _holds_poses(g[0])]) or single
     if not groups and alike:
         most = max(alike.values(), key=len)
@@ -155,10 +155,10 @@ def _holds_poses(file: Path) -> bool:
         return True
     try:
         raw = read_raw_poses([file])
-        return len(raw.numbers) > 1 and bool(layouts(raw))
+        return len(raw.numbers) > 1 and bool(possible_layouts(raw))
     except InputError:
         return False
 
 
-def _says_pose(file: Path) -> bool:
+def _names_pose(file: Path) -> bool:
     return bool(re.search(r"pose|robot|flange|tcp|joint|trajector", file.stem.lower()))

@@ -11,14 +11,14 @@ class Guess:
     what: str  # "rotation", "mount" …
     value: str
     reason: str
-    told: bool  # the files or the scans tell it; False: it cannot be told from these views
+    determined: bool  # the files or the scans tell it; False: it cannot be told from these views
     flag: str  # that overrules it
     runner_up: str | None = None
 
     @property
     def line(self) -> str:
         """For a comment or a terminal."""
-        untold = "" if self.told else f" cannot be told from these views, {self.flag} overrules it;"
+        untold = "" if self.determined else f" cannot be told from these views, {self.flag} overrules it;"
         other = f"; next best: {self.runner_up}" if self.runner_up else ""
         return f"{self.what}: {self.value};{untold} {self.reason}{other}"
 
@@ -28,7 +28,7 @@ class Guess:
             "what": self.what,
             "value": self.value,
             "reason": self.reason,
-            "told": self.told,
+            "told": self.determined,
             "flag": self.flag,
             "runner_up": self.runner_up,
         }

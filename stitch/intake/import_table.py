@@ -7,11 +7,11 @@ import numpy as np
 
 from stitch import frames
 from stitch.controllers import tracker_csv, universal
-from stitch.controllers.imported_rows import POSE, csv_text, pose_cells, unique
-from stitch.controllers.importer import Imported
+from stitch.controllers.imported_rows import POSE_COLUMNS, csv_text, numbered_names, pose_cells
+from stitch.controllers.importer import ImportedTable
 from stitch.errors import InputError
 from stitch.intake.covariates import covariate_columns
-from stitch.intake.layouts import Layout, layouts
+from stitch.intake.layouts import ColumnLayout, possible_layouts
 from stitch.intake.number_table import read_number_table
 from stitch.intake.plausible_units import POSE_UNITS, pose_units
 from stitch.intake.program_poses import PROGRAMS
@@ -36,11 +36,11 @@ def is_table_of_poses(file: Path) -> bool:
     if suffix != ".csv" or table.header is None:
         return True
     told = file.read_text(encoding="utf-8-sig", errors="replace")
-    names, _ = tracker_csv.columns(told)
+    names, _ = tracker_csv.split_header(told)
     return not universal.is_recording(told) and not all(axis in names for axis in "xyz")
 
 
-def import_table(file: Path, unit: str, stated: StatedTable) -> Imported:
+def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:
     """Read a table of poses, or of joint angles, or of both.
 
     Args:
@@ -53,26 +53,26 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> Imported:
         raise InputError(f"--unit {unit}: use mm or m")
     raw = read_raw_poses([file])
     raw = raw.renamed(stated.columns) if stated.columns else raw
-    found = layouts(raw)
+    found = possible_layouts(raw)
     if len(found) > 1:
         ways = "; or ".join(layout.words for layout in found)
         raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
     layout = found[0]
-    header, cells, words = ["view"], [[name] for name in _names(raw)], []
-    clouds = _clouds(raw)
+    header, cells, words = ["view"], [[name] for name in _view_names(raw)], []
+    clouds = _cloud_names(raw)
     if clouds is not None:
         header, cells = [*header, "cloud"], [[*row, cloud] for row, cloud in zip(cells, clouds, strict=True)]
     if layout.joints is not None:
-        degrees = _joints(file, layout, stated)
+        degrees = _table_joints(file, layout, stated)
         header += [f"j{i + 1}_deg" for i in range(degrees.shape[1])]
         cells = [[*row, *(f"{q:.9g}" for q in values)] for row, values in zip(cells, degrees, strict=True)]
         words.append("joint angles")
     if layout.rotation.shape[1]:
-        reading = _reading(file, layout, stated)
-        file_unit = _unit(file, layout, stated)
+        reading = _table_reading(file, layout, stated)
+        file_unit = _table_unit(file, layout, stated)
         T = frames.inverse(reading.T) if stated.inverse else reading.T
         scale = POSE_UNITS[file_unit] / METRES[unit]
-        header += POSE
+        header += POSE_COLUMNS
         cells = [[*row, *pose_cells(pose, scale)] for row, pose in zip(cells, T, strict=True)]
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
@@ -80,7 +80,7 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> Imported:
     rest = covariate_columns(layout, range(len(cells)), raw.time_s)
     header += rest
     cells = [[*row, *(column[i] for column in rest.values())] for i, row in enumerate(cells)]
-    return Imported("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), _warnings(raw))
+    return ImportedTable("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), _warnings(raw))
 
 
 def _warnings(raw: RawPoses) -> tuple[str, ...]:
@@ -88,12 +88,12 @@ def _warnings(raw: RawPoses) -> tuple[str, ...]:
     return (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
 
 
-def _names(raw: RawPoses) -> list[str]:
+def _view_names(raw: RawPoses) -> list[str]:
     """Names of the views: the first text beside each pose, else numbers."""
-    return unique(texts[0] if texts else f"v{i + 1:03d}" for i, texts in enumerate(raw.labels))
+    return numbered_names(texts[0] if texts else f"v{i + 1:03d}" for i, texts in enumerate(raw.labels))
 
 
-def _clouds(raw: RawPoses) -> list[str] | None:
+def _cloud_names(raw: RawPoses) -> list[str] | None:
     """The column of texts that names clouds, if one does."""
     for texts in zip(*raw.labels, strict=False):
         if all(Path(text).suffix.lower() in CLOUD_SUFFIXES for text in texts):
@@ -101,7 +101,7 @@ def _clouds(raw: RawPoses) -> list[str] | None:
     return None
 
 
-def _reading(file: Path, layout: Layout, stated: StatedTable) -> Reading:
+def _table_reading(file: Path, layout: ColumnLayout, stated: StatedTable) -> Reading:
     found = readings(layout, stated.rotation, stated.angle_unit)
     if len({r.rotation for r in found}) > 1:
         usual = ", ".join(dict.fromkeys(r.rotation for r in found[:4]))
@@ -114,7 +114,7 @@ def _reading(file: Path, layout: Layout, stated: StatedTable) -> Reading:
     return found[0]
 
 
-def _joints(file: Path, layout: Layout, stated: StatedTable) -> np.ndarray:
+def _table_joints(file: Path, layout: ColumnLayout, stated: StatedTable) -> np.ndarray:
     assert layout.joints is not None
     units: Sequence[str] = angle_units(layout.joints, stated.angle_unit or layout.angle_unit)
     if len(units) > 1:
@@ -124,7 +124,7 @@ def _joints(file: Path, layout: Layout, stated: StatedTable) -> np.ndarray:
     return np.asarray(layout.joints if units[0] == "deg" else np.degrees(layout.joints))
 
 
-def _unit(file: Path, layout: Layout, stated: StatedTable) -> str:
+def _table_unit(file: Path, layout: ColumnLayout, stated: StatedTable) -> str:
     if stated.length_unit or layout.length_unit:
         return str(stated.length_unit or layout.length_unit)
     found = pose_units(layout.position)

@@ -7,16 +7,16 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.layouts import Layout
+from stitch.intake.layouts import ColumnLayout
 from stitch.intake.raw_poses import RawPoses
 from stitch.intake.readings import Reading, angle_units
-from stitch.intake.urdf_links import arm_of
+from stitch.intake.urdf_links import arm_from_urdf
 from stitch.measurement.robot import forward
 
 JOINT_ANGLES = "joint angles"
 
 
-def joint_readings(layout: Layout, urdf: Path | None, angle_unit: str | None) -> list[Reading]:
+def joint_readings(layout: ColumnLayout, urdf: Path | None, angle_unit: str | None) -> list[Reading]:
     """Poses of joint angles, mm, in every unit that the angles can have.
 
     Raises:
@@ -29,7 +29,7 @@ def joint_readings(layout: Layout, urdf: Path | None, angle_unit: str | None) ->
             "joint angles need the robot: put its URDF into the folder, or give poses; with DH rows write session.toml "
             "by hand"
         )
-    robot, _, _ = arm_of(urdf, joints.shape[1])
+    robot, _, _ = arm_from_urdf(urdf, joints.shape[1])
     out = []
     for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
         T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)
@@ -37,9 +37,9 @@ def joint_readings(layout: Layout, urdf: Path | None, angle_unit: str | None) ->
     return out
 
 
-def joint_layouts(raw: RawPoses) -> list[Layout]:
+def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
     """The meaning of columns without names as joint angles."""
     nothing = np.zeros((len(raw.numbers), 0))
     if raw.numbers.shape[1] not in (6, 7):
         return []
-    return [Layout(nothing, nothing, raw.numbers, "columns are joint angles")]
+    return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]

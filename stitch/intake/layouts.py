@@ -18,7 +18,7 @@ _DEGREES = 360.5
 
 
 @dataclass(frozen=True)
-class Layout:
+class ColumnLayout:
     """Columns of one meaning; positions (V, 3) in the file's unit, rotations (V, k) as the file writes them."""
 
     position: Array  # (V, 3); (V, 0) for joint angles alone
@@ -37,19 +37,19 @@ class Layout:
         return self.rotation if self.rotation.shape[1] == 3 or self.joints is None else self.joints
 
 
-def layouts(raw: RawPoses) -> list[Layout]:
+def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
     """Every meaning that the columns can have, the usual first.
 
     Raises:
         InputError: columns that hold no pose, with the flag that names them.
     """
     if raw.header is not None:
-        found = _by_name(raw)
+        found = _layout_by_name(raw)
         if found is not None:
             return [found]
     x, rest = _without_time(_without_index(raw.numbers))
     count = x.shape[1]
-    tried = {6: _six, 7: _seven, 12: _twelve, 16: _sixteen}
+    tried = {6: _six_column_layouts, 7: _seven_column_layouts, 12: _twelve_column_layouts, 16: _sixteen_column_layouts}
     found_all = tried[count](x) if count in tried else []
     if not found_all:
         called = "" if raw.header is None else f", called {', '.join(raw.header)},"
@@ -61,18 +61,20 @@ def layouts(raw: RawPoses) -> list[Layout]:
     return [replace(layout, rest=rest) for layout in found_all]
 
 
-def _by_name(raw: RawPoses) -> Layout | None:
+def _layout_by_name(raw: RawPoses) -> ColumnLayout | None:
     named = read_names(raw.header or ())
     x = raw.numbers
     if len(named.rotation) in (12, 16):
-        matrices = (_sixteen if len(named.rotation) == 16 else _twelve)(x[:, named.rotation])
+        matrices = (_sixteen_column_layouts if len(named.rotation) == 16 else _twelve_column_layouts)(
+            x[:, named.rotation]
+        )
         rest = {name: x[:, i] for name, i in named.rest.items()}
         return replace(matrices[0], rest=rest) if matrices else None
     posed = bool(named.position and named.rotation)
     if not posed and not named.joints:
         return None
     nothing = np.zeros((len(x), 0))
-    return Layout(
+    return ColumnLayout(
         position=x[:, named.position] if posed else nothing,
         rotation=x[:, named.rotation] if posed else nothing,
         joints=x[:, named.joints] if named.joints else None,
@@ -97,17 +99,17 @@ def _without_time(x: Array) -> tuple[Array, dict[str, Array]]:
     return (x[:, 1:], {"time": x[:, 0]}) if timed else (x, {})
 
 
-def _six(x: Array) -> list[Layout]:
+def _six_column_layouts(x: Array) -> list[ColumnLayout]:
     """A position and three angles, either first: both where both can be angles in degrees, as small positions can."""
     first, last = x[:, :3], x[:, 3:]
-    ahead = Layout(first, last, None, "columns 1 to 3 are the position, 4 to 6 the angles")
-    behind = Layout(last, first, None, "columns 1 to 3 are the angles, 4 to 6 the position")
+    ahead = ColumnLayout(first, last, None, "columns 1 to 3 are the position, 4 to 6 the angles")
+    behind = ColumnLayout(last, first, None, "columns 1 to 3 are the angles, 4 to 6 the position")
     return [layout for layout in (ahead, behind) if np.abs(layout.rotation).max() <= _DEGREES]
 
 
-def _seven(x: Array) -> list[Layout]:
-    ahead = Layout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 7 the quaternion")
-    behind = Layout(x[:, 4:], x[:, :4], None, "columns 1 to 4 are the quaternion, 5 to 7 the position")
+def _seven_column_layouts(x: Array) -> list[ColumnLayout]:
+    ahead = ColumnLayout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 7 the quaternion")
+    behind = ColumnLayout(x[:, 4:], x[:, :4], None, "columns 1 to 4 are the quaternion, 5 to 7 the position")
     return [layout for layout in (ahead, behind) if _is_quaternion(layout.rotation)]
 
 
@@ -115,23 +117,23 @@ def _is_quaternion(q: Array) -> bool:
     return bool((np.abs(np.linalg.norm(q, axis=1) - 1) < _UNIT_LENGTH).all())
 
 
-def _twelve(x: Array) -> list[Layout]:
+def _twelve_column_layouts(x: Array) -> list[ColumnLayout]:
     """3×4 matrices by rows, or a rotation by rows and the position behind it or before it."""
     rows = x.reshape(-1, 3, 4)
     forms = (
-        Layout(rows[:, :, 3], rows[:, :, :3].reshape(-1, 9), None, "3×4 matrices by rows", "matrix"),
-        Layout(x[:, 9:], x[:, :9], None, "columns 1 to 9 are the rotation, 10 to 12 the position"),
-        Layout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 12 the rotation"),
+        ColumnLayout(rows[:, :, 3], rows[:, :, :3].reshape(-1, 9), None, "3×4 matrices by rows", "matrix"),
+        ColumnLayout(x[:, 9:], x[:, :9], None, "columns 1 to 9 are the rotation, 10 to 12 the position"),
+        ColumnLayout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 12 the rotation"),
     )
     return [layout for layout in forms if _is_rotation(layout.rotation)]
 
 
-def _sixteen(x: Array) -> list[Layout]:
+def _sixteen_column_layouts(x: Array) -> list[ColumnLayout]:
     """4×4 matrices by rows, or by columns: the row 0 0 0 1 tells."""
     T = x.reshape(-1, 4, 4)
     for words, M in (("4×4 matrices by rows", T), ("4×4 matrices by columns", T.transpose(0, 2, 1))):
         if np.allclose(M[:, 3], [0, 0, 0, 1], atol=1e-6) and _is_rotation(M[:, :3, :3].reshape(-1, 9)):
-            return [Layout(M[:, :3, 3], M[:, :3, :3].reshape(-1, 9), None, words, "matrix")]
+            return [ColumnLayout(M[:, :3, 3], M[:, :3, :3].reshape(-1, 9), None, words, "matrix")]
     return []
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.intake.doctor import Decided
+from stitch.intake.doctor import ConventionChoice
 from stitch.intake.guesses import Guess
 
 _WORDS = {"eye_in_hand": "the scanner sits at the flange", "eye_to_hand": "the part sits at the flange"}
@@ -28,15 +28,15 @@ class Mounting:
         return frames.inverse(T) if self.inverted else T
 
 
-def mounting(decided: Decided, mount: str | None, inverse: bool | None, of_joints: bool) -> Mounting:
+def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool | None, of_joints: bool) -> Mounting:
     """Settle it, by what a person states, else by where things lie.
 
     Args:
         mount, inverse: as stated; None where they are not.
         of_joints: poses are from joint angles, so that their direction is known.
     """
-    direct = "eye_in_hand" if decided.best.way.carries else "eye_to_hand"
-    other = "eye_to_hand" if decided.best.way.carries else "eye_in_hand"
+    direct = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
+    other = "eye_to_hand" if decided.best.interpretation.carries else "eye_in_hand"
     nearer = "eye_in_hand" if decided.scanner_at_flange else "eye_to_hand"
     scanner, part = (f"{mm:.0f} mm" for mm in (decided.scanner_away, decided.part_away))
     placed = (
@@ -48,12 +48,14 @@ def mounting(decided: Decided, mount: str | None, inverse: bool | None, of_joint
     elif inverse is not None or of_joints:
         chosen = other if inverse else direct
         reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")
-    elif decided.told and decided.mount_told:
+    elif decided.determined and decided.mount_determined:
         chosen, reason = nearer, f"{placed}: what lies nearer sits at the flange"
     else:
         chosen, told = direct, False
         reason = (
-            f"{placed}; poses are usually those of the flange in the base" if decided.told else "as poses usually are"
+            f"{placed}; poses are usually those of the flange in the base"
+            if decided.determined
+            else "as poses usually are"
         )
     inverted = chosen != direct
     value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"

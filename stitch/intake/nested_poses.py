@@ -2,57 +2,57 @@
 
 from typing import Any
 
-Row = tuple[tuple[str, ...], dict[str, float]]  # texts beside a pose, and its numbers by name
+PoseRow = tuple[tuple[str, ...], dict[str, float]]  # texts beside a pose, and its numbers by name
 
 # Sizes of a bare list of numbers that can be a pose or joint angles.
 _SIZES = (5, 6, 7, 8, 9, 12, 16)
 _MATRICES = ((3, 3), (3, 4), (4, 4), (1, 3), (3, 1), (1, 4), (4, 1))
 
 
-def nested_rows(document: Any) -> list[Row]:
+def nested_rows(document: Any) -> list[PoseRow]:
     """Rows of a document; numbers without names are called 0, 1, 2 … Empty if it holds no poses.
 
     A pose may be a list of numbers, a matrix, or a mapping; poses may stand in a list, or in a mapping by name.
     """
     if isinstance(document, dict):
-        named = [((str(key), *_texts(value)), _row(value)) for key, value in document.items()]
+        named = [((str(key), *_texts(value)), _pose_numbers(value)) for key, value in document.items()]
         direct = [(texts, row) for texts, row in named if row is not None]
         if len(direct) > 1 and len({tuple(row) for _, row in direct}) == 1:
             return direct
-    own = _row(document)
+    own = _pose_numbers(document)
     if own is not None:
         return [(_texts(document), own)]
     if isinstance(document, list):
-        rows: list[Row] = []
+        rows: list[PoseRow] = []
         for item in document:
-            row = _row(item)
+            row = _pose_numbers(item)
             rows += [(_texts(item), row)] if row is not None else nested_rows(item)
         return rows
     deeper = [nested_rows(value) for value in document.values()] if isinstance(document, dict) else []
     return max(deeper, key=len, default=[])
 
 
-def _row(value: Any) -> dict[str, float] | None:
+def _pose_numbers(value: Any) -> dict[str, float] | None:
     """The numbers of one pose by name, or None if a value is none."""
-    flat = _flat(value)
+    flat = _flat_numbers(value)
     if flat is not None:
         return {str(i): x for i, x in enumerate(flat)} if len(flat) in _SIZES else None
     if not isinstance(value, dict):
         return None
-    data = _matrix(value)
+    data = _matrix_numbers(value)
     if data is not None:
         return {str(i): x for i, x in enumerate(data)}
-    inner = next((row for v in value.values() if isinstance(v, dict) and (row := _row(v)) is not None), None)
+    inner = next((row for v in value.values() if isinstance(v, dict) and (row := _pose_numbers(v)) is not None), None)
     if inner is not None:
         # The pose stands one level deeper, beside a time, a temperature or a name.
         unnamed = all(name.isdigit() for name in inner)
-        beside = _stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
+        beside = _ros_stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
         return inner if unnamed else beside | inner
-    out = _named(value)
+    out = _named_numbers(value)
     return out if len(out) >= _SIZES[0] else None
 
 
-def _stamp(value: dict[str, Any]) -> dict[str, float]:
+def _ros_stamp(value: dict[str, Any]) -> dict[str, float]:
     """The time of a message of ROS, 1 or 2, from its header; nothing where none is written."""
     header = value.get("header")
     stamp = header.get("stamp") if isinstance(header, dict) else None
@@ -64,45 +64,45 @@ def _stamp(value: dict[str, Any]) -> dict[str, float]:
     return {"time_s": whole + 1e-9 * part}
 
 
-def _matrix(value: dict[str, Any]) -> list[float] | None:
+def _matrix_numbers(value: dict[str, Any]) -> list[float] | None:
     """16 numbers that stand alone in a mapping: OpenCV's and Zivid's layouts."""
     inner = [v for v in value.values() if isinstance(v, (list, dict))]
     if len(inner) != 1 and not {"rows", "cols", "data"} <= {*value}:
-        lists = [flat for v in inner if (flat := _flat(v)) is not None and len(flat) == 16]
+        lists = [flat for v in inner if (flat := _flat_numbers(v)) is not None and len(flat) == 16]
         return lists[0] if len(lists) == 1 else None
     if len(inner) != 1:
         return None
-    flat = _flat(inner[0])
+    flat = _flat_numbers(inner[0])
     if flat is not None:
         return flat if len(flat) in (12, 16) else None
-    return _matrix(inner[0]) if isinstance(inner[0], dict) else None
+    return _matrix_numbers(inner[0]) if isinstance(inner[0], dict) else None
 
 
-def _flat(value: Any) -> list[float] | None:
+def _flat_numbers(value: Any) -> list[float] | None:
     """The numbers of a list, or of a matrix row by row; None if it is neither."""
     if not isinstance(value, list) or not value:
         return None
     if all(_is_number(item) for item in value):
         return [float(item) for item in value]
-    rows = [_flat(item) for item in value if isinstance(item, list) and all(_is_number(x) for x in item)]
+    rows = [_flat_numbers(item) for item in value if isinstance(item, list) and all(_is_number(x) for x in item)]
     shape = (len(value), *{len(row) for row in rows if row is not None})
     if len(rows) < len(value) or shape not in _MATRICES:
         return None
     return [x for row in rows if row is not None for x in row]
 
 
-def _named(value: dict[str, Any], prefix: str = "") -> dict[str, float]:
+def _named_numbers(value: dict[str, Any], prefix: str = "") -> dict[str, float]:
     """Numbers of a mapping by their path: position.x, rotation.0 …"""
     out: dict[str, float] = {}
     for key, item in value.items():
         name = f"{prefix}{key}"
-        flat = _flat(item)
+        flat = _flat_numbers(item)
         if _is_number(item):
             out[name] = float(item)
         elif flat is not None:
             out |= {f"{name}.{i}": x for i, x in enumerate(flat)}
         elif isinstance(item, dict) and name.count(".") < 5:
-            out |= _named(item, f"{name}.")
+            out |= _named_numbers(item, f"{name}.")
     return out
 
 

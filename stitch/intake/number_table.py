@@ -9,13 +9,13 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.table_cells import DECIMAL_COMMA, cells_of, value
-from stitch.intake.table_rows import below_titles, levelled, with_units
+from stitch.intake.table_cells import DECIMAL_COMMA, parse_number, split_cells
+from stitch.intake.table_rows import names_with_units, rows_below_titles, trimmed_rows
 from stitch.reading.text_file import read_any_text, shortened
 
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
-_LARGEST_MB = 50
+_MAX_TABLE_MB = 50
 
 
 @dataclass(frozen=True)
@@ -36,25 +36,27 @@ def read_number_table(file: Path) -> NumberTable:
     Raises:
         InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
     """
-    return parse_number_table(file, read_any_text(file, "name a table of poses", _LARGEST_MB))
+    return parse_number_table(file, read_any_text(file, "name a table of poses", _MAX_TABLE_MB))
 
 
-def parse_number_table(file: Path, told: str) -> NumberTable:
+def parse_number_table(file: Path, content: str) -> NumberTable:
     """The same of a text that was read from a file."""
-    kept = [(i, line.strip()) for i, line in enumerate(told.splitlines(), 1) if line.strip()]
+    kept = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1) if line.strip()]
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    separator = max(_SEPARATORS, key=lambda s: sum(value(c) is not None for _, line in body for c in cells_of(line, s)))
-    read = levelled([(i, cells_of(line, separator)) for i, line in body])
-    rows = below_titles(read)
+    separator = max(
+        _SEPARATORS, key=lambda s: sum(parse_number(c) is not None for _, line in body for c in split_cells(line, s))
+    )
+    read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
+    rows = rows_below_titles(read)
     above = len(read) - len(rows)
     comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
-    text, numeric = _columns(rows)
+    text, numeric = _text_and_number_columns(rows)
     if len(numeric) < 3:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    numbers = np.array([[_number(file, i, row[c]) for c in numeric] for i, row in rows])
+    numbers = np.array([[_cell_number(file, i, row[c]) for c in numeric] for i, row in rows])
     _require_one_decimal_mark(file, rows, numeric)
     decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
@@ -71,8 +73,8 @@ def parse_number_table(file: Path, told: str) -> NumberTable:
     )
 
 
-def _number(file: Path, line: int, cell: str) -> float:
-    found = value(cell)
+def _cell_number(file: Path, line: int, cell: str) -> float:
+    found = parse_number(cell)
     if found is None or not abs(found) < 1e30:
         raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
     return found
@@ -100,16 +102,18 @@ def _split_header(
     top, first = rows[0]
     below = rows[1:] or rows
     width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
-    typical = next((row for _, row in below if len(row) == width and any(value(c) is not None for c in row)), first)
-    texts = [value(cell) is None for cell in first]
-    if len(rows) > 1 and any(t and value(c) is not None for t, c in zip(texts, typical, strict=False)):
+    typical = next(
+        (row for _, row in below if len(row) == width and any(parse_number(c) is not None for c in row)), first
+    )
+    texts = [parse_number(cell) is None for cell in first]
+    if len(rows) > 1 and any(t and parse_number(c) is not None for t, c in zip(texts, typical, strict=False)):
         header, rows = first, rows[1:]
-        units = with_units(header, rows[0][1]) if len(rows) > 1 else None
+        units = names_with_units(header, rows[0][1]) if len(rows) > 1 else None
         if units is not None:
             header, rows = units, rows[1:]
     elif comment:
-        names = cells_of(comment.lstrip("#%/ "), separator)
-        header = names if len(names) == width and all(value(name) is None for name in names) else None
+        names = split_cells(comment.lstrip("#%/ "), separator)
+        header = names if len(names) == width and all(parse_number(name) is None for name in names) else None
     odd = next(((i, row) for i, row in rows if len(row) != width), None)
     if odd is not None:
         raise InputError(
@@ -120,8 +124,8 @@ def _split_header(
     return header, rows
 
 
-def _columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
+def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
     """Columns of text, and of numbers: a column with numbers in more than half of its cells is one of numbers."""
     width = len(rows[0][1])
-    share = [sum(value(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
+    share = [sum(parse_number(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
     return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.intake.doctor import Decided
+from stitch.intake.doctor import ConventionChoice
 from stitch.intake.ways import MM
-from stitch.integrity.motion_fit import FEWEST, ROTATION, TRANSLATION_M, turn_angles
+from stitch.integrity.motion_fit import FEWEST, ROTATION, TRANSLATION_M, rotation_angles
 from stitch.integrity.relative_scans import RelativeScans
 
 
-def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decided: Decided) -> None:
+def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decided: ConventionChoice) -> None:
     """Refuse scans that no reading of the poses brings together, and most of which meet their neighbours as they are.
 
     Args:
@@ -21,13 +21,13 @@ def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decid
     Raises:
         InputError: the scans hardly move against each other, and not as the poses do.
     """
-    if decided.told:
+    if decided.determined:
         return
     T = motions().T
     if len(T) < FEWEST:
         return
     moved = np.linalg.norm(T[:, :3, 3], axis=1)
-    still = float(((turn_angles(T) < ROTATION) & (moved < TRANSLATION_M / MM)).mean())
+    still = float(((rotation_angles(T) < ROTATION) & (moved < TRANSLATION_M / MM)).mean())
     if still > max(0.5, decided.best.closed or 0.0):
         raise InputError(
             f"{folder}: {still:.0%} of neighbouring scans meet as they are, and not as the poses say: they lie in one "

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch.frames import Array
-from stitch.intake.clock_times import DAY_S, EPOCH_S, clock_of
+from stitch.intake.clock_times import DAY_S, EPOCH_S, find_clock_column
 
 _STAMP = re.compile(
     r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})[T_\- ]+(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?:[-_.,](\d{3}|\d{6}))?(?!\d)"
@@ -28,17 +28,19 @@ def rows_by_time(
         labels: per row the texts beside it: times of day, for clouds that have date and time in their names.
         numbers: (V, C) of the table: a column of seconds since 1970, for clouds that have these.
     """
-    clock, own = clock_of(labels), [_seconds(cloud.stem) for cloud in clouds]
+    clock, own = find_clock_column(labels), [_calendar_seconds(cloud.stem) for cloud in clouds]
     if clock is not None and clock.seconds is not None:
         # Times of day without a date are of any day.
         dated = clock.first_s >= DAY_S
         poses = clock.first_s + clock.seconds
-        return _nearest(own, poses if dated else poses % DAY_S, None if dated else DAY_S)
+        return _nearest_rows(own, poses if dated else poses % DAY_S, None if dated else DAY_S)
     columns = [] if numbers is None else [t for c in numbers.T if (t := since_1970(c)) is not None]
-    return _nearest([_stamp(cloud.stem) for cloud in clouds], columns[0], None) if len(columns) == 1 else None
+    return (
+        _nearest_rows([_unix_seconds(cloud.stem) for cloud in clouds], columns[0], None) if len(columns) == 1 else None
+    )
 
 
-def _nearest(own: Sequence[float | None], poses: Array, day: float | None) -> tuple[list[int], float] | None:
+def _nearest_rows(own: Sequence[float | None], poses: Array, day: float | None) -> tuple[list[int], float] | None:
     """Rows and the farthest of them, unless one is too far away or belongs to two."""
     if len(own) < 2 or None in own:
         return None
@@ -61,14 +63,14 @@ def since_1970(times: Array) -> Array | None:
     return None
 
 
-def _stamp(name: str) -> float | None:
+def _unix_seconds(name: str) -> float | None:
     """Seconds since 1970 of the one such number in a name; None where there is none, or several."""
     found = _SINCE_1970.findall(name)
     told = since_1970(np.array([float(found[0].replace("_", "."))])) if len(found) == 1 else None
     return None if told is None else float(told[0])
 
 
-def _seconds(name: str) -> float | None:
+def _calendar_seconds(name: str) -> float | None:
     """Seconds since the calendar's beginning of the one time in a name; None where there is none, or several."""
     found = _STAMP.findall(name)
     if len(found) != 1:

@@ -3,7 +3,7 @@
 import csv
 from pathlib import Path
 
-from stitch.controllers.imported_rows import POSE, csv_text
+from stitch.controllers.imported_rows import POSE_COLUMNS, csv_text
 from stitch.controllers.importer import import_file
 from stitch.intake.number_table import parse_number_table
 from stitch.intake.raw_poses import RawPoses
@@ -35,7 +35,7 @@ def program_poses(file: Path) -> RawPoses:
     """
     told = import_file(file, "mm")
     header, *body = list(csv.reader(told.text.splitlines()))
-    posed = POSE[-1] in header
+    posed = POSE_COLUMNS[-1] in header
     kept = [row for row in body if row[-1]] if posed else body
     columns = [i for i in range(len(header)) if all(row[i] for row in kept)]
     table = parse_number_table(file, csv_text([[row[i] for i in columns] for row in [header, *kept]]))

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.clock_times import ClockTimes, clock_of
+from stitch.intake.clock_times import ClockTimes, find_clock_column
 from stitch.intake.nested_poses import nested_rows
 from stitch.intake.number_table import NumberTable, read_number_table
 from stitch.reading.text_file import read_text, require_file, shortened
@@ -20,7 +20,7 @@ from stitch.reading.yaml_file import parse_yaml
 STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses")
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-_LARGEST_MB = 50
+_MAX_POSES_MB = 50
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class RawPoses:
     @property
     def clock(self) -> ClockTimes | None:
         """Times of day, where one of the texts beside the poses is one."""
-        return clock_of(self.labels)
+        return find_clock_column(self.labels)
 
     @property
     def time_s(self) -> Array | None:
@@ -66,8 +66,8 @@ def read_raw_poses(files: Sequence[Path]) -> RawPoses:
         InputError: no poses in a file, or files of different kinds; names file and line.
     """
     if len(files) == 1:
-        return _read(files[0])
-    rows = [_read(file) for file in files]
+        return _read_file(files[0])
+    rows = [_read_file(file) for file in files]
     odd = next((r for r in rows if len(r.numbers) != 1), None)
     if odd is not None:
         raise InputError(f"{odd.source}: holds {len(odd.numbers)} poses, one a file is expected; to fix: name one file")
@@ -85,21 +85,21 @@ def read_raw_poses(files: Sequence[Path]) -> RawPoses:
     )
 
 
-def _read(file: Path) -> RawPoses:
+def _read_file(file: Path) -> RawPoses:
     require_file(file, "name a file of poses")
     suffix = file.suffix.lower()
     if suffix in (".npy", ".npz"):
         return _from_numpy(file)
     if suffix in (".json", ".yaml", ".yml"):
-        told = read_text(file, "name a file of poses", _LARGEST_MB)
+        told = read_text(file, "name a file of poses", _MAX_POSES_MB)
         documents = [_from_json(file, told)] if suffix == ".json" else parse_yaml(file, told)
         document = documents[0] if len(documents) == 1 else documents
         return _from_rows(file, nested_rows(document), suffix[1:].upper())
     table = read_number_table(file)
-    return _blocks(table) or RawPoses(str(file), table.header, table.numbers, table.labels, table.words)
+    return _matrix_blocks(table) or RawPoses(str(file), table.header, table.numbers, table.labels, table.words)
 
 
-def _blocks(table: NumberTable) -> RawPoses | None:
+def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     """4×4 matrices, or 3×4 ones, over several lines each; None if the table is none of that."""
     x = table.numbers
     if x.shape[1] != 4:
@@ -115,9 +115,9 @@ def _blocks(table: NumberTable) -> RawPoses | None:
     return None
 
 
-def _from_json(file: Path, told: str) -> Any:
+def _from_json(file: Path, text: str) -> Any:
     try:
-        return json.loads(told)
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{file}: not valid JSON ({shortened(reason)}); to fix: correct it there") from None

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.layouts import Layout
+from stitch.intake.layouts import ColumnLayout
 from stitch.integrity.misread_rotations import ORDERS
 
 # The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
@@ -30,7 +30,7 @@ class Reading:
     T: Array  # (V, 4, 4) lengths as the file has them
     rotation: str  # as --rotation names it
     angle_unit: str | None  # "deg" or "rad" where there are angles
-    layout: Layout
+    layout: ColumnLayout
     rank: int  # of the usual, 0 first
 
     @property
@@ -39,7 +39,7 @@ class Reading:
         return self.rotation + (f", {'degrees' if self.angle_unit == 'deg' else 'radians'}" if self.angle_unit else "")
 
 
-def conventions() -> list[str]:
+def rotation_conventions() -> list[str]:
     """Every word that --rotation knows."""
     angles = [*_euler_words(), *(f"{o.lower()}-by-axis" for o in _BY_AXIS), "rotation-vector"]
     return [*angles, "quaternion-xyzw", "quaternion-wxyz", "matrix", "matrix-transposed"]
@@ -49,7 +49,7 @@ def _euler_words() -> list[str]:
     return [f"{order.lower()}-{how}" for order in ORDERS for how in ("intrinsic", "extrinsic")]
 
 
-def readings(layout: Layout, rotation: str | None = None, angle_unit: str | None = None) -> list[Reading]:
+def readings(layout: ColumnLayout, rotation: str | None = None, angle_unit: str | None = None) -> list[Reading]:
     """All readings of a layout that has a pose, the usual first; one where file or flags tell it.
 
     Args:
@@ -60,7 +60,7 @@ def readings(layout: Layout, rotation: str | None = None, angle_unit: str | None
         InputError: a convention that these columns cannot have.
     """
     stated = rotation or layout.convention
-    kinds = {3: _of_angles, 4: _of_quaternion, 9: _of_matrix}
+    kinds = {3: _angle_readings, 4: _quaternion_readings, 9: _matrix_readings}
     numbers = layout.rotation.shape[1]
     found = list(kinds[numbers](layout, angle_unit or layout.angle_unit))
     if stated is not None:
@@ -78,12 +78,12 @@ def angle_units(values: Array, stated: str | None) -> list[str]:
     return ["deg"] if np.abs(values).max(initial=0.0) > _RADIANS else ["rad", "deg"]
 
 
-def _of_angles(layout: Layout, stated: str | None) -> Iterator[Reading]:
+def _angle_readings(layout: ColumnLayout, stated: str | None) -> Iterator[Reading]:
     for place, unit in enumerate(angle_units(layout.rotation, stated)):
         angles = np.radians(layout.rotation) if unit == "deg" else layout.rotation
         for word, R in _rotations(angles):
             rank = _USUAL.index(word) if word in _USUAL else len(_USUAL)
-            yield _reading(layout, R, word, unit, rank + 100 * place)
+            yield _rotation_reading(layout, R, word, unit, rank + 100 * place)
 
 
 def _rotations(angles: Array) -> Iterator[tuple[str, Rotation]]:
@@ -97,19 +97,19 @@ def _rotations(angles: Array) -> Iterator[tuple[str, Rotation]]:
     yield "rotation-vector", Rotation.from_rotvec(angles)
 
 
-def _of_quaternion(layout: Layout, _: str | None) -> Iterator[Reading]:
+def _quaternion_readings(layout: ColumnLayout, _: str | None) -> Iterator[Reading]:
     q = layout.rotation / np.linalg.norm(layout.rotation, axis=1, keepdims=True)
-    yield _reading(layout, Rotation.from_quat(q), "quaternion-xyzw", None, 0)
+    yield _rotation_reading(layout, Rotation.from_quat(q), "quaternion-xyzw", None, 0)
     if layout.convention == "quaternion-wxyz" or layout.convention is None:
-        yield _reading(layout, Rotation.from_quat(q[:, [1, 2, 3, 0]]), "quaternion-wxyz", None, 1)
+        yield _rotation_reading(layout, Rotation.from_quat(q[:, [1, 2, 3, 0]]), "quaternion-wxyz", None, 1)
 
 
-def _of_matrix(layout: Layout, _: str | None) -> Iterator[Reading]:
+def _matrix_readings(layout: ColumnLayout, _: str | None) -> Iterator[Reading]:
     R = layout.rotation.reshape(-1, 3, 3)
-    yield _reading(layout, Rotation.from_matrix(R), "matrix", None, 0)
+    yield _rotation_reading(layout, Rotation.from_matrix(R), "matrix", None, 0)
     if layout.convention is None:
-        yield _reading(layout, Rotation.from_matrix(R.transpose(0, 2, 1)), "matrix-transposed", None, 1)
+        yield _rotation_reading(layout, Rotation.from_matrix(R.transpose(0, 2, 1)), "matrix-transposed", None, 1)
 
 
-def _reading(layout: Layout, R: Rotation, word: str, unit: str | None, rank: int) -> Reading:
+def _rotation_reading(layout: ColumnLayout, R: Rotation, word: str, unit: str | None, rank: int) -> Reading:
     return Reading(frames.make(R.as_matrix(), layout.position), word, unit, layout, rank)

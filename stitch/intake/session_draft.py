@@ -17,10 +17,10 @@ from stitch.intake.guesses import Guess
 from stitch.intake.joint_poses import JOINT_ANGLES
 from stitch.intake.plausible_units import POSE_UNITS
 from stitch.intake.targets_in_scans import points_columns
-from stitch.intake.urdf_links import arm_of
+from stitch.intake.urdf_links import arm_from_urdf
 from stitch.intake.ways import MM
-from stitch.reading.session_toml import FORMAT
-from stitch.system.whole_file import whole
+from stitch.reading.session_toml import SESSION_FORMAT
+from stitch.system.whole_file import whole_file
 from stitch.units import METRES
 from stitch.writing.session_files import pose_columns, write_table
 
@@ -49,32 +49,32 @@ def write_draft(folder: Path, first: FirstSession) -> None:
     """
     require_free(folder, bool(first.sightings))
     folder.mkdir(parents=True, exist_ok=True)
-    with whole(folder / "views.csv") as table, whole(folder / "session.toml") as toml:
+    with whole_file(folder / "views.csv") as table, whole_file(folder / "session.toml") as toml:
         table.write_text(views_text(folder, first), encoding="utf-8")
         toml.write_text(toml_text(folder, first), encoding="utf-8")
         if first.sightings:
-            with whole(folder / "points.csv") as points:
-                write_table(points, _points(first))
+            with whole_file(folder / "points.csv") as points:
+                write_table(points, _points_table(first))
 
 
-def _points(first: FirstSession) -> dict[str, list[object]]:
+def _points_table(first: FirstSession) -> dict[str, list[object]]:
     """points.csv of the views that have a pose, in the session's length_unit."""
-    used = _in_order(first)
-    names = _views([first.found.clouds[i] for i in used], first.found.folder)
+    used = _clouds_in_order(first)
+    names = _view_names([first.files.clouds[i] for i in used], first.files.folder)
     scale = MM / METRES[length_unit(first)]
     return points_columns(names, [first.sightings[i] for i in used], scale)
 
 
 def length_unit(first: FirstSession) -> str:
     """The session's: that of the poses, mm where it has no other."""
-    unit = first.decided.best.way.length_unit
+    unit = first.choice.best.interpretation.length_unit
     return unit if unit in METRES else "mm"
 
 
 def toml_text(folder: Path, first: FirstSession) -> str:
     """session.toml."""
     told = {guess.what: guess for guess in first.guesses}
-    lines = [f'format = "{FORMAT}"', f'name = "{_name(first.found.folder)}"']
+    lines = [f'format = "{SESSION_FORMAT}"', f'name = "{_session_name(first.files.folder)}"']
     for what in ("files", "pairing", "columns", "rotation"):
         lines += ["", *_comment(told[what])]
     unit = length_unit(first)
@@ -82,11 +82,11 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
     lines += ["", *_comment(told["mount"]), f'mount = "{first.mounting.mount}"']
     lines += ["", "[scanner]", *_comment(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
-    reading = first.decided.best.way.reading
-    urdf = first.found.urdf
+    reading = first.choice.best.interpretation.reading
+    urdf = first.files.urdf
     if reading.layout.joints is not None and urdf is not None:
         path = Path(os.path.relpath(urdf, folder)).as_posix()
-        _, base, flange = arm_of(urdf, reading.layout.joints.shape[1])
+        _, base, flange = arm_from_urdf(urdf, reading.layout.joints.shape[1])
         lines += ["", "[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
     return "\n".join(lines) + "\n"
 
@@ -101,26 +101,28 @@ def _comment(guess: Guess) -> list[str]:
     return [f"# {'  ' * bool(i)}{line}" for i, line in enumerate(lines)]
 
 
-def _name(folder: Path) -> str:
+def _session_name(folder: Path) -> str:
     """A name for the session that can be that of its run."""
     return re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "session"
 
 
 def views_text(folder: Path, first: FirstSession) -> str:
     """views.csv: a row for every cloud that has a pose."""
-    used = _in_order(first)
-    clouds = [first.found.clouds[i] for i in used]
+    used = _clouds_in_order(first)
+    clouds = [first.files.clouds[i] for i in used]
     rows = [int(first.pairing.rows[i] or 0) for i in used]
     columns: dict[str, list[str]] = {
-        "view": _views(clouds, first.found.folder),
+        "view": _view_names(clouds, first.files.folder),
         "cloud": [Path(os.path.relpath(cloud, folder)).as_posix() for cloud in clouds],
     }
-    reading = first.decided.best.way.reading
+    reading = first.choice.best.interpretation.reading
     if reading.layout.joints is not None:
-        joints = _degrees(first, reading.layout.joints)[rows]
+        joints = _joint_degrees(first, reading.layout.joints)[rows]
         columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
     if reading.rotation != JOINT_ANGLES:
-        columns |= {name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_poses(first, rows)).items()}
+        columns |= {
+            name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_flange_poses(first, rows)).items()
+        }
     columns |= covariate_columns(reading.layout, rows, first.raw.time_s)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -129,27 +131,27 @@ def views_text(folder: Path, first: FirstSession) -> str:
     return out.getvalue()
 
 
-def _in_order(first: FirstSession) -> tuple[int, ...]:
+def _clouds_in_order(first: FirstSession) -> tuple[int, ...]:
     """Clouds that have a pose, in the order of time: a table that names its clouds was written as the robot went."""
     pairing = first.pairing
     return tuple(sorted(pairing.used, key=lambda i: pairing.rows[i] or 0)) if pairing.by_name else pairing.used
 
 
-def _poses(first: FirstSession, rows: list[int]) -> Array:
+def _flange_poses(first: FirstSession, rows: list[int]) -> Array:
     """T_base_flange (V, 4, 4) in the session's length_unit."""
-    way = first.decided.best.way
+    way = first.choice.best.interpretation
     T = way.reading.T[rows]
     scale = POSE_UNITS[way.length_unit] / METRES[length_unit(first)]
     return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
 
 
-def _degrees(first: FirstSession, joints: Array) -> Array:
-    reading = first.decided.best.way.reading
+def _joint_degrees(first: FirstSession, joints: Array) -> Array:
+    reading = first.choice.best.interpretation.reading
     in_radians = reading.angle_unit == "rad" if reading.rotation == JOINT_ANGLES else np.abs(joints).max() <= 2 * np.pi
     return np.degrees(joints) if in_radians else joints
 
 
-def _views(clouds: list[Path], folder: Path) -> list[str]:
+def _view_names(clouds: list[Path], folder: Path) -> list[str]:
     """Names of views: those of the clouds' files, with their folders where two are called alike."""
     stems = [cloud.stem for cloud in clouds]
     if len(set(stems)) == len(stems):

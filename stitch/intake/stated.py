@@ -6,8 +6,8 @@ from pathlib import Path
 
 from stitch.errors import InputError
 from stitch.intake.plausible_units import CLOUD_UNITS, POSE_UNITS
-from stitch.intake.readings import conventions
-from stitch.intake.targets_in_scans import LookedFor
+from stitch.intake.readings import rotation_conventions
+from stitch.intake.targets_in_scans import TargetSearch
 
 _MOUNTS = ("eye_in_hand", "eye_to_hand")
 
@@ -28,9 +28,9 @@ class StatedTable:
         Raises:
             InputError: names the flag and what it knows.
         """
-        _known("--rotation", self.rotation, conventions())
-        _known("--angles", self.angle_unit, ("deg", "rad"))
-        _known("--unit, --file-unit", self.length_unit, POSE_UNITS)
+        _require_known_word("--rotation", self.rotation, rotation_conventions())
+        _require_known_word("--angles", self.angle_unit, ("deg", "rad"))
+        _require_known_word("--unit, --file-unit", self.length_unit, POSE_UNITS)
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class StatedFolder(StatedTable):
     poses: Path | None = None
     cloud_unit: str | None = None
     mount: str | None = None
-    targets: LookedFor = field(default_factory=LookedFor)  # boards and balls in the scans
+    targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
         """As of the table."""
         super().__post_init__()
-        _known("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
-        _known("--mount", self.mount, _MOUNTS)
+        _require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
+        _require_known_word("--mount", self.mount, _MOUNTS)
 
     @property
     def carries(self) -> bool | None:
@@ -56,6 +56,6 @@ class StatedFolder(StatedTable):
         return (self.mount == "eye_in_hand") != self.inverse
 
 
-def _known(flag: str, value: str | None, known: Collection[str]) -> None:
+def _require_known_word(flag: str, value: str | None, known: Collection[str]) -> None:
     if value is not None and value not in known:
         raise InputError(f"{flag} {value}: to fix: use {', '.join(known)}")

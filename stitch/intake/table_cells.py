@@ -10,7 +10,7 @@ _POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
 _BRACKETS = str.maketrans("[](){}", " " * 6)
 
 
-def cells_of(line: str, separator: str) -> list[str]:
+def split_cells(line: str, separator: str) -> list[str]:
     """Cells of a line, trimmed."""
     line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
@@ -19,7 +19,7 @@ def cells_of(line: str, separator: str) -> list[str]:
     return [cell.strip().strip('"') for cell in row]
 
 
-def value(cell: str) -> float | None:
+def parse_number(cell: str) -> float | None:
     """The number in a cell, with a point or a comma; None if there is none."""
     cell = cell.rstrip("°").strip()
     if _NUMBER.fullmatch(cell):
@@ -29,7 +29,7 @@ def value(cell: str) -> float | None:
     return None
 
 
-def filled(cells: list[str]) -> list[str]:
+def without_trailing_blanks(cells: list[str]) -> list[str]:
     """Cells without the empty ones at the end."""
     last = max((i for i, cell in enumerate(cells) if cell), default=-1)
     return cells[: last + 1]

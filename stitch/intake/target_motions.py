@@ -22,14 +22,14 @@ def target_motions(sightings: Sequence[Sighting]) -> RelativeScans:
     showing = [v for v, s in enumerate(sightings) if len(s.targets) >= _FEWEST]
     for place, v in enumerate(showing):
         for w in showing[place + 1 : place + 1 + _NEXT]:
-            T = _motion(sightings[v], sightings[w])
+            T = _relative_motion(sightings[v], sightings[w])
             if T is not None:
                 pairs.append((v, w))
                 motions.append(T)
     return RelativeScans(tuple(pairs), np.array(motions).reshape(-1, 4, 4))
 
 
-def _motion(first: Sighting, second: Sighting) -> Array | None:
+def _relative_motion(first: Sighting, second: Sighting) -> Array | None:
     """T (4, 4) that maps the second view's scanner frame into the first's."""
     common = [name for name in first.targets if name in second.targets]
     if len(common) < _FEWEST:

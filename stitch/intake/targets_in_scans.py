@@ -8,35 +8,35 @@ import numpy as np
 
 from stitch.detection.ball_points import ball_sightings
 from stitch.detection.board import Board
-from stitch.detection.board_points import PlacedBoard, boards_in, judged
+from stitch.detection.board_points import PlacedBoard, board_sightings, boards_in
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.session import Session
-from stitch.reading.extras import package
+from stitch.reading.extras import import_extra
 from stitch.reading.range_image import read_range_image
-from stitch.reading.session_toml import document
+from stitch.reading.session_toml import read_session_document
 from stitch.reading.views_csv import read_views
 from stitch.units import METRES
 
-_MM = 1e-3
+_METRES_PER_MM = 1e-3
 
 
 @dataclass(frozen=True)
-class LookedFor:
+class TargetSearch:
     """What a person says that the scans show."""
 
     boards: tuple[Board, ...] = ()
     balls: tuple[float, ...] | None = None  # radii, mm; empty for balls of any radius, None for no balls
 
     @property
-    def nothing(self) -> bool:
+    def is_empty(self) -> bool:
         """True where nothing is looked for."""
         return not self.boards and self.balls is None
 
 
 @dataclass(frozen=True)
-class Scans:
+class ViewScans:
     """The scans of V views."""
 
     where: Path  # for messages
@@ -49,14 +49,14 @@ class Scans:
     @property
     def to_mm(self) -> float:
         """Millimetres per unit."""
-        return self.unit / _MM
+        return self.unit / _METRES_PER_MM
 
 
-def scans_of(session: Session) -> Scans:
+def scans_of_session(session: Session) -> ViewScans:
     """The scans of a session, in its length_unit."""
     rows = read_views(session.path / "views.csv", session.robot)
-    cloud_unit = document(session.path / "session.toml").get("cloud_unit", session.length_unit)
-    return Scans(
+    cloud_unit = read_session_document(session.path / "session.toml").get("cloud_unit", session.length_unit)
+    return ViewScans(
         where=session.path,
         files=tuple(session.path / row.cloud if row.cloud else None for row in rows),
         file_unit=METRES[cloud_unit],
@@ -66,7 +66,7 @@ def scans_of(session: Session) -> Scans:
     )
 
 
-def targets_in(scans: Scans, wanted: LookedFor) -> tuple[list[Sighting], list[str]]:
+def find_targets(scans: ViewScans, search: TargetSearch) -> tuple[list[Sighting], list[str]]:
     """Find boards and balls in all views: a sighting a view, and what was left out, in words.
 
     Raises:
@@ -74,20 +74,20 @@ def targets_in(scans: Scans, wanted: LookedFor) -> tuple[list[Sighting], list[st
         NoResultError: no view shows one that is looked for.
     """
     parts, notes = [], list[str]()
-    for i, board in enumerate(wanted.boards):
-        alike = sum(other.kind == board.kind for other in wanted.boards[:i])
-        found, told = _of_board(scans, board, f"{board.kind}{alike + 1 if alike else ''}")
+    for i, board in enumerate(search.boards):
+        alike = sum(other.kind == board.kind for other in search.boards[:i])
+        found, told = _board_sightings(scans, board, f"{board.kind}{alike + 1 if alike else ''}")
         parts.append(found)
         notes += told
-    if wanted.balls is not None:
-        found, told = _of_balls(scans, wanted.balls)
+    if search.balls is not None:
+        found, told = _ball_sightings(scans, search.balls)
         parts.append(found)
         notes += told
-    return [_together(of_view) for of_view in zip(*parts, strict=True)], notes
+    return [_merged_sightings(of_view) for of_view in zip(*parts, strict=True)], notes
 
 
-def _of_board(scans: Scans, board: Board, label: str) -> tuple[list[Sighting], list[str]]:
-    cv2 = package("cv2", f"--board {board.stated}", "vision")
+def _board_sightings(scans: ViewScans, board: Board, label: str) -> tuple[list[Sighting], list[str]]:
+    cv2 = import_extra("cv2", f"--board {board.stated}", "vision")
     own, seen, images = board.scaled(1 / scans.to_mm), list[list[PlacedBoard]](), 0
     for file in scans.files:
         image = None if file is None else read_range_image(file, scans.file_unit / scans.unit)
@@ -103,10 +103,10 @@ def _of_board(scans: Scans, board: Board, label: str) -> tuple[list[Sighting], l
             f"{scans.where}: no view shows {board.stated}; to try: check the number of squares and the dictionary, and "
             "that the picture is neither dark nor blurred"
         )
-    return judged(seen, own, scans.to_mm, label)
+    return board_sightings(seen, own, scans.to_mm, label)
 
 
-def _of_balls(scans: Scans, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:
+def _ball_sightings(scans: ViewScans, radii: Sequence[float]) -> tuple[list[Sighting], list[str]]:
     stated = [radius / scans.to_mm for radius in radii]
     found, told = ball_sightings(scans.clouds, scans.rotations, stated, scans.to_mm)
     if not any(sighting.targets for sighting in found):
@@ -135,7 +135,7 @@ def points_columns(views: Sequence[str], sightings: Sequence[Sighting], scale: f
     return dict(zip(("view", "target", *"xyz", "sigma"), map(list, zip(*rows, strict=True)), strict=True))
 
 
-def _together(parts: Sequence[Sighting]) -> Sighting:
+def _merged_sightings(parts: Sequence[Sighting]) -> Sighting:
     return Sighting(
         tuple(name for part in parts for name in part.targets),
         np.vstack([part.points for part in parts]),

@@ -11,14 +11,14 @@ from stitch.errors import InputError
 from stitch.frames import Array
 
 # An edge moves if it turns (rad) or shifts (m) by more between its recordings.
-_TURN, _SHIFT = 1e-4, 1e-4
+_STATIC_TURN, _STATIC_SHIFT = 1e-4, 1e-4
 # Recordings this long (s) before or after a moment still say where things were.
-_STALE = 0.5
+_MAX_TRANSFORM_AGE = 0.5
 _LONGEST = 200
 
 
 @dataclass
-class _Edge:
+class _TreeEdge:
     parent: str
     times: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)  # T_parent_child, m
@@ -34,12 +34,12 @@ class TransformTree:
 
     def __init__(self, recordings: Iterable[Recording]) -> None:
         """Sort recordings by edge."""
-        self._edges: dict[str, _Edge] = {}
+        self._edges: dict[str, _TreeEdge] = {}
         for time, parent, child, T, static in recordings:
-            edge = self._edges.setdefault(child, _Edge(parent))
+            edge = self._edges.setdefault(child, _TreeEdge(parent))
             # What is published as fixed, or under another parent later, replaces what was said before.
             if static or parent != edge.parent:
-                edge = self._edges[child] = _Edge(parent, static=static)
+                edge = self._edges[child] = _TreeEdge(parent, static=static)
             edge.times.append(time)
             edge.poses.append(T)
         for edge in self._edges.values():
@@ -77,7 +77,7 @@ class TransformTree:
             return False
         step = frames.log(frames.inverse(edge.poses[0]) @ np.array(edge.poses))
         turn, shift = (np.linalg.norm(step[:, part], axis=1).max() for part in (slice(0, 3), slice(3, 6)))
-        return bool(turn > _TURN or shift > _SHIFT)
+        return bool(turn > _STATIC_TURN or shift > _STATIC_SHIFT)
 
     def pose(self, parent: str, child: str, times: Array) -> Array:
         """T_parent_child (M, 4, 4) at some times; NaN where nothing was recorded near.
@@ -101,7 +101,7 @@ class TransformTree:
             T = T @ self._at(self._edges[child], times)
         return T
 
-    def _at(self, edge: _Edge, times: Array) -> Array:
+    def _at(self, edge: _TreeEdge, times: Array) -> Array:
         """T_parent_child (M, 4, 4): turned by Slerp (Shoemake 1985), shifted along a line."""
         if edge.static or len(edge.poses) == 1:
             return np.broadcast_to(edge.poses[-1], (len(times), 4, 4))
@@ -113,5 +113,5 @@ class TransformTree:
         shift = np.stack([np.interp(asked, known, poses[:, i, 3]) for i in range(3)], axis=1)
         T = frames.make(Slerp(known, Rotation.from_matrix(poses[:, :3, :3]))(asked).as_matrix(), shift)
         nearest = np.abs(known[:, None] - np.asarray(times)[None]).min(axis=0)
-        T[nearest > _STALE] = np.nan
+        T[nearest > _MAX_TRANSFORM_AGE] = np.nan
         return T

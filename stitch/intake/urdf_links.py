@@ -14,14 +14,14 @@ _FLANGES = ("tool0", "flange", "ee_link", "tcp")
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-def arm_of(urdf: Path, joints: int) -> tuple[Robot, str, str]:
+def arm_from_urdf(urdf: Path, joints: int) -> tuple[Robot, str, str]:
     """The arm of so many joints, mm, with the links that it lies between.
 
     Raises:
         InputError: unreadable, or no chain of so many joints.
     """
     reasons = [f"{urdf}: not a readable URDF; to fix: export it as plain URDF"]
-    for base, flange in ends_of(urdf):
+    for base, flange in arm_link_pairs(urdf):
         try:
             robot = robot_from_urdf(urdf, base, flange, "mm", _GRAVITY)
         except InputError as error:
@@ -33,7 +33,7 @@ def arm_of(urdf: Path, joints: int) -> tuple[Robot, str, str]:
     raise InputError(reasons[-1])
 
 
-def ends_of(urdf: Path) -> list[tuple[str, str]]:
+def arm_link_pairs(urdf: Path) -> list[tuple[str, str]]:
     """Root and flange by name, else root and the child of each turning joint, the last first."""
     try:
         root = ElementTree.parse(urdf).getroot()

@@ -18,7 +18,7 @@ MM = 1e-3
 
 
 @dataclass(frozen=True)
-class Way:
+class Interpretation:
     """One way. `carries`: the poses as read take the mount's frame to the reference; else their inverse does."""
 
     reading: Reading
@@ -44,18 +44,18 @@ class Way:
         return Hypothesis(str(number), self.T, mount, "", used=None if complete else self.pairing.used)
 
 
-def all_ways(
-    found: Iterable[Reading], pairs: Sequence[Pairing], units: Sequence[str], directions: Sequence[bool]
-) -> list[Way]:
+def all_interpretations(
+    readings: Iterable[Reading], pairs: Sequence[Pairing], units: Sequence[str], directions: Sequence[bool]
+) -> list[Interpretation]:
     """Every combination, the usual first.
 
     Args:
         units: for readings of which the file does not tell it.
         directions: whether the poses carry the mount's frame.
     """
-    ranked = sorted(found, key=lambda r: r.rank)
+    ranked = sorted(readings, key=lambda r: r.rank)
     return [
-        Way(reading, pairing, unit, carries)
+        Interpretation(reading, pairing, unit, carries)
         for pairing in pairs
         for reading in ranked
         for unit in ([reading.layout.length_unit] if reading.layout.length_unit else units)

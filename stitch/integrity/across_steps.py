@@ -15,33 +15,33 @@ from stitch.integrity.pose_tests import pose_tests
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_model import view_model
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
 
 # Chance at which a step is tried.
-_ANY = 1.0
+_ANY_CHANCE = 1.0
 
 
-def across_steps(
-    capture: Capture, T_mount: Array, freed: FreePoses, usual: UsualEffects | None
-) -> tuple[Array, FreePoses]:
+def place_across_steps(
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
+) -> tuple[Array, UnconstrainedPoses]:
     """Where views are expected, and where overlaps put them: beside a step, if that links more of them.
 
     Args:
-        T_mount: (4, 4) hand-eye of the model poses from which `freed` is seen.
+        T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
 
     Returns:
         (V, 4, 4) T_reference_scanner, those of the model without a step; and the views freed, seen from these.
     """
-    model_poses, apart = capture.poses(T_mount), list(linkage(freed.overlaps).unlinked)
+    model_poses, apart = capture.poses(T_mount), list(linkage(unconstrained.overlaps).unlinked)
     if not apart:
-        return model_poses, freed
-    model = view_model(capture, T_mount, freed)
-    tests = pose_tests(model, freed, (apart, []), usual, _ANY)
+        return model_poses, unconstrained
+    model = view_model(capture, T_mount, unconstrained)
+    tests = pose_tests(model, unconstrained, (apart, []), usual, _ANY_CHANCE)
     if not tests.steps:
-        return model_poses, freed
-    expected = expected_poses(model, model_poses, freed, tests)
-    poses = np.array(freed.poses)
+        return model_poses, unconstrained
+    expected = expected_poses(model, model_poses, unconstrained, tests)
+    poses = np.array(unconstrained.poses)
     poses[apart] = expected[apart]
-    tried = [free_poses(capture, start, freed.overlaps.gate) for start in (expected, poses)]
-    best = min((freed, *tried), key=lambda found: len(linkage(found.overlaps).unlinked))
-    return (model_poses, freed) if best is freed else (expected, best.seen_from(expected))
+    tried = [unconstrained_poses(capture, start, unconstrained.overlaps.gate) for start in (expected, poses)]
+    best = min((unconstrained, *tried), key=lambda found: len(linkage(found.overlaps).unlinked))
+    return (model_poses, unconstrained) if best is unconstrained else (expected, best.relative_to(expected))

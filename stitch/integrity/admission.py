@@ -8,38 +8,38 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.integrity.arm_limits import (
+    apply_displacement_limits,
     beyond_any_arm,
-    contradicts,
-    doubtful,
-    judged_by_size,
-    stands_off,
+    displacement_in_words,
+    poses_contradict_scans,
+    scatter_is_doubtful,
 )
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.doubts import doubts_of
-from stitch.integrity.pairing import explain
-from stitch.integrity.problems import Problem
-from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained
+from stitch.integrity.doubts import snooping_warnings
+from stitch.integrity.pairing import explain_misplaced
+from stitch.integrity.problems import SessionProblem
+from stitch.integrity.refusals import refuse, refuse_whole, require_own_model, require_two_motions, unexplained_error
 from stitch.integrity.robot_lengths import length_problem
-from stitch.integrity.snooping import Misplaced, Snooping, snoop
-from stitch.integrity.steps import MANY_VIEWS
-from stitch.integrity.target_faults import said_of_targets
+from stitch.integrity.snooping import MisplacedView, Snooping, snoop_views
+from stitch.integrity.steps import MAX_VIEWS_WITH_EFFECTS
+from stitch.integrity.target_faults import target_warnings
 from stitch.integrity.targets import check_targets
 from stitch.integrity.usual_effects import UsualEffects
-from stitch.integrity.view_names import listed
+from stitch.integrity.view_names import list_views
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session, View
-from stitch.observations.targets.target_fit import TargetFit
-from stitch.runs.run import LeftOut, ViewLinks
+from stitch.observations.targets.target_fit import TargetModelFit
+from stitch.runs.run import ExcludedView, ViewLinks
 from stitch.stages.correction import Correction
 
 
 @dataclass(frozen=True)
-class Admission:
+class ViewScreening:
     """What may be fused of one session."""
 
-    left_out: tuple[LeftOut, ...] = ()
-    suspected: tuple[LeftOut, ...] = ()  # off by no more than an effect of an arm may cause: fused, and noted
+    left_out: tuple[ExcludedView, ...] = ()
+    suspected: tuple[ExcludedView, ...] = ()  # off by no more than an effect of an arm may cause: fused, and noted
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
 
@@ -52,14 +52,14 @@ class Admission:
         """What was left out and why; with the names of all views as they follow each other."""
         why = dict.fromkeys(item.why for item in self.left_out)
         alike = {w: [item.view for item in self.left_out if item.why == w] for w in why}
-        return "; ".join(f"{listed(views, order)}: {w}" for w, views in alike.items())
+        return "; ".join(f"{list_views(views, order)}: {w}" for w, views in alike.items())
 
     def indices(self, session: Session) -> list[int]:
         """Numbers of the views that are left out."""
         return [v for v, view in enumerate(session.views) if view.name in self.names]
 
 
-def admission(session: Session, measurement: Measurement, correction: Correction, index: int) -> Admission:
+def screen_views(session: Session, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
     """Examine the views of one session of a rig under a corrected model.
 
     Args:
@@ -72,61 +72,65 @@ def admission(session: Session, measurement: Measurement, correction: Correction
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
         require_own_model(session, correction, index)
-    found = _examined(session, measurement, correction, index)
-    if contradicts(session, found):
+    found = _snoop_session(session, measurement, correction, index)
+    if poses_contradict_scans(session, found):
         if not correction.given:
             require_two_motions(session)
         refuse(session, deep_check(session))
-        raise unexplained(session, found)
-    size = length_problem(found.model, own.T_reference_mount, found.found.further)
+        raise unexplained_error(session, found)
+    size = length_problem(found.model, own.T_reference_mount, found.blunder_search.mean_columns)
     if size is not None:
         # Other mistakes look like a factor on lengths too.
         refuse(session, deep_check(session))
         refuse(session, [size])
-    if doubtful(session, found):
+    if scatter_is_doubtful(session, found):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
-    told = (*said_of_targets(session, own.sightings), *doubts_of(session, own, found, T_mount))
+    told = (*target_warnings(session, own.sightings), *snooping_warnings(session, own, found, T_mount))
     if not any(beyond_any_arm(session, *step.at_least) for step in found.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         found = replace(found, steps=())
-    problems = explain(session, own, T_mount, found) if found.left_out else []
+    problems = explain_misplaced(session, own, T_mount, found) if found.left_out else []
     apart = next((p for p in problems if p.kind == "disconnected"), None)
     if apart is not None:
         raise NoResultError(f"{session.path}: {apart.line(session.names)}")
-    out = _not_belonging(session, own, found, T_mount, problems)
-    return Admission(
+    out = _excluded_views(session, own, found, T_mount, problems)
+    return ViewScreening(
         left_out=out,
-        suspected=tuple(_suspect(session, own, m, T_mount) for m in found.suspected),
-        links=_links(session, found),
+        suspected=tuple(_suspected_view(session, own, m, T_mount) for m in found.suspected),
+        links=_view_links(session, found),
         doubts=told,
     )
 
 
-def doubts(session: Session, measurement: Measurement, correction: Correction | None, index: int) -> tuple[str, ...]:
+def session_warnings(
+    session: Session, measurement: Measurement, correction: Correction | None, index: int
+) -> tuple[str, ...]:
     """What to say of a session as a whole under a model, whose views were admitted before.
 
     Args:
         correction: of surfaces; None where there are none.
     """
-    targets = said_of_targets(session, measurement.capture.sightings)
+    targets = target_warnings(session, measurement.capture.sightings)
     if correction is None:
         return targets
-    found = _examined(session, measurement, correction, index)
-    return (*targets, *doubts_of(session, correction.captures[index], found, correction.model.T_mount))
+    found = _snoop_session(session, measurement, correction, index)
+    return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.model.T_mount))
 
 
-def _examined(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
+def _snoop_session(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
     usual, gate = UsualEffects(measurement, correction.model), correction.overlaps[index].gate
-    found = snoop(correction.captures[index], correction.model.T_mount, gate, correction.freed[index], usual)
-    if len(session.views) >= MANY_VIEWS:
+    found = snoop_views(
+        correction.captures[index], correction.model.T_mount, gate, correction.unconstrained[index], usual
+    )
+    if len(session.views) >= MAX_VIEWS_WITH_EFFECTS:
         # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
         large = (step for step in found.steps if beyond_any_arm(session, *step.at_least))
         found = replace(found, steps=tuple(large))
-    return judged_by_size(session, found)
+    return apply_displacement_limits(session, found)
 
 
-def admission_of_targets(session: Session, found: TargetFit) -> Admission:
+def screen_targets(session: Session, found: TargetModelFit) -> ViewScreening:
     """Labelled points: outliers are taken out one by one; poses that contradict them all are refused.
 
     Raises:
@@ -136,31 +140,33 @@ def admission_of_targets(session: Session, found: TargetFit) -> Admission:
     rotation, translation = np.sqrt(found.variances[:2])
     if beyond_any_arm(session, rotation, translation):
         refuse(session, check_targets(session))
-    return Admission(doubts=said_of_targets(session, found.rows.sightings))
+    return ViewScreening(doubts=target_warnings(session, found.rows.sightings))
 
 
-def _suspect(session: Session, own: Capture, found: Misplaced, T_mount: Array) -> LeftOut:
+def _suspected_view(session: Session, own: Capture, found: MisplacedView, T_mount: Array) -> ExcludedView:
     view = session.views[found.view]
-    return LeftOut(view.name, stands_off(session, found), own.poses(T_mount)[found.view], _scanned(view))
+    return ExcludedView(
+        view.name, displacement_in_words(session, found), own.poses(T_mount)[found.view], _point_count(view)
+    )
 
 
-def _not_belonging(
-    session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[Problem]
-) -> tuple[LeftOut, ...]:
+def _excluded_views(
+    session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[SessionProblem]
+) -> tuple[ExcludedView, ...]:
     poses = own.poses(T_mount)
     out = []
     for v in found.left_out:
         name = session.views[v].name
         why = next((p.line(session.names) for p in problems if name in p.views), "it shares no surface with the others")
-        out.append(LeftOut(name, why, poses[v], _scanned(session.views[v])))
+        out.append(ExcludedView(name, why, poses[v], _point_count(session.views[v])))
     return tuple(out)
 
 
-def _scanned(view: View) -> int:
+def _point_count(view: View) -> int:
     return 0 if view.cloud is None else view.cloud.count
 
 
-def _links(session: Session, found: Snooping) -> ViewLinks:
+def _view_links(session: Session, found: Snooping) -> ViewLinks:
     names = session.names
     return ViewLinks(
         components=tuple(tuple(names[v] for v in part) for part in found.linkage.components),

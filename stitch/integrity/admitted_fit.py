@@ -5,32 +5,32 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from stitch.errors import NoResultError
-from stitch.integrity.admission import Admission, admission, admission_of_targets
+from stitch.integrity.admission import ViewScreening, screen_targets, screen_views
 from stitch.integrity.refusals import require_majority
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.stages.fitted import Fitted
+from stitch.stages.fitted import FittedRig
 
 # Blunders that hide behind others come out in the next round; three are enough to end or to give up.
-_ROUNDS = 3
+_MAX_ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Admitted:
+class ScreenedFit:
     """A rig with the views that belong, its fit, and what each session left out."""
 
     sessions: list[Session]
     measurements: list[Measurement]
-    fitted: Fitted
-    admissions: list[Admission]
+    fitted: FittedRig
+    screenings: list[ViewScreening]
 
 
-def admitted_fit(
+def fit_screened_views(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
-    fit: Callable[[Sequence[Session], Sequence[Measurement]], Fitted],
+    fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
     keep: bool = False,
-) -> Admitted:
+) -> ScreenedFit:
     """Fit all sessions with the views that belong.
 
     Args:
@@ -41,11 +41,11 @@ def admitted_fit(
         NoResultError: they do, and none does; too few views are left; groups of views share no surface.
     """
     own, measured = list(sessions), list(measurements)
-    taken = [Admission() for _ in own]
-    for _ in range(_ROUNDS):
-        with _said_of(sessions, taken):
+    taken = [ViewScreening() for _ in own]
+    for _ in range(_MAX_ROUNDS):
+        with _naming_excluded_views(sessions, taken):
             fitted = fit(own, measured)
-            found = [_examined(session, fitted, i) for i, session in enumerate(own)]
+            found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
         if keep or not any(a.left_out for a in found):
             break
@@ -60,11 +60,11 @@ def admitted_fit(
     else:
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)
-    return Admitted(own, measured, fitted, taken)
+    return ScreenedFit(own, measured, fitted, taken)
 
 
 @contextmanager
-def _said_of(sessions: Sequence[Session], taken: Sequence[Admission]) -> Iterator[None]:
+def _naming_excluded_views(sessions: Sequence[Session], taken: Sequence[ViewScreening]) -> Iterator[None]:
     """Where the views that are left lead nowhere, say which were left out before, and why."""
     try:
         yield
@@ -75,9 +75,9 @@ def _said_of(sessions: Sequence[Session], taken: Sequence[Admission]) -> Iterato
         raise NoResultError(f"{error}; left out before: {gone}") from error
 
 
-def _examined(session: Session, fitted: Fitted, index: int) -> Admission:
+def _screen_fitted_session(session: Session, fitted: FittedRig, index: int) -> ViewScreening:
     if fitted.correction is not None:
-        return admission(session, fitted.sessions[index].measurement, fitted.correction, index)
+        return screen_views(session, fitted.sessions[index].measurement, fitted.correction, index)
     found = fitted.sessions[index].targets
     # What says nothing about the poses cannot say which of them are wrong.
-    return Admission() if found is None else admission_of_targets(session, found)
+    return ViewScreening() if found is None else screen_targets(session, found)

@@ -12,18 +12,18 @@ import numpy as np
 from stitch.frames import Array
 from stitch.model.model_toml import ModelFile
 from stitch.stages.finish import per_view_rms
-from stitch.stages.fitted import Fitted
-from stitch.statistics.shares import clearly_less
+from stitch.stages.fitted import FittedRig
+from stitch.statistics.shares import significantly_smaller
 from stitch.units import length_text
 
 # That an arm which is right is doubted.
-_CHANCE = 0.01
+_ARM_CHANCE = 0.01
 # A fit of the sessions with an arm, or with the nominal one.
-FitWith = Callable[[ModelFile | None], Fitted]
+FitWithArm = Callable[[ModelFile | None], FittedRig]
 
 
 @dataclass(frozen=True)
-class ArmHere:
+class ArmTransfer:
     """Rms over all views with an arm, length_unit."""
 
     effects: tuple[str, ...]
@@ -52,28 +52,33 @@ class ArmHere:
         )
 
 
-def arm_here(fit: FitWith, arm: ModelFile, found: Fitted) -> ArmHere:
+def check_arm_transfer(fit: FitWithArm, arm: ModelFile, found: FittedRig) -> ArmTransfer:
     """Hold the arm that was kept against the nominal one, and against itself without one of its effects.
 
     Args:
         found: the fit with it.
     """
-    own, nominal = squares_of_views(found), squares_of_views(fit(None))
-    here = ArmHere(tuple(arm.effects), _rms(own), _rms(nominal), clearly_less(nominal, own, _CHANCE))
+    own, nominal = view_mean_squares(found), view_mean_squares(fit(None))
+    here = ArmTransfer(
+        tuple(arm.effects),
+        _rms_of_squares(own),
+        _rms_of_squares(nominal),
+        significantly_smaller(nominal, own, _ARM_CHANCE),
+    )
     if len(arm.effects) < 2:
         return here
     rest = {name: {e: p for e, p in arm.effects.items() if e != name} for name in arm.effects}
-    left = {name: squares_of_views(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
-    best = min(left, key=lambda name: _rms(left[name]))
-    less = clearly_less(left[best], own, _CHANCE / len(left))
-    return replace(here, better_without=best, without_rms=_rms(left[best])) if less else here
+    left = {name: view_mean_squares(fit(replace(arm, effects=effects))) for name, effects in rest.items()}
+    best = min(left, key=lambda name: _rms_of_squares(left[name]))
+    less = significantly_smaller(left[best], own, _ARM_CHANCE / len(left))
+    return replace(here, better_without=best, without_rms=_rms_of_squares(left[best])) if less else here
 
 
-def _rms(squares: Array) -> float:
+def _rms_of_squares(squares: Array) -> float:
     return float(np.sqrt(np.nanmean(squares)))
 
 
-def squares_of_views(fitted: Fitted) -> Array:
+def view_mean_squares(fitted: FittedRig) -> Array:
     """(ΣV,) mean square distance of the targets, or of the surfaces, in every view; NaN where nothing was seen."""
     if fitted.correction is not None:
         every = zip(fitted.captures, fitted.correction.overlaps, strict=True)

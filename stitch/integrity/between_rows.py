@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.fitted_positions import fitted_positions
+from stitch.integrity.fitted_positions import fit_positions
 from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.motion_fit import FEWEST, fit_motions
 from stitch.integrity.relative_scans import RelativeScans
@@ -23,7 +23,7 @@ _FIX = (
 _WORDS = {1: ("after", "next"), -1: ("before", "previous")}
 
 
-def between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
+def poses_between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
     """The poses that these would be midway between.
 
     Args:
@@ -48,12 +48,12 @@ def between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> I
             T[v] = T[v] @ X @ frames.exp(-half[v]) @ frames.inverse(X)
         fix = _FIX.format(*_WORDS[ahead])
         turned = T if stated.mount == "eye_in_hand" else frames.inverse(T)
-        along = _along_lines(stated, turned, motions, (ahead, used), X)
+        along = _positions_along_lines(stated, turned, motions, (ahead, used), X)
         for poses in (turned, frames.make(turned[:, :3, :3], along)):
             yield Hypothesis("shifted", poses, stated.mount, fix, (), used)
 
 
-def _along_lines(
+def _positions_along_lines(
     stated: Hypothesis, turned: Array, motions: RelativeScans, rows: tuple[int, tuple[int, ...]], T_mount: Array
 ) -> Array:
     """(V, 3) positions of which those stated are the middles."""
@@ -62,4 +62,4 @@ def _along_lines(
     p, Q = np.zeros((views, 3)), np.tile(np.eye(3), (views, 1, 1))
     for v in range(1, views):
         p[v], Q[v] = 2 * middle[v - 1 if ahead > 0 else v] - p[v - 1], -Q[v - 1]
-    return fitted_positions(turned[:, :3, :3], (p, Q), stated.mount, motions, used, T_mount[:3, :3])
+    return fit_positions(turned[:, :3, :3], (p, Q), stated.mount, motions, used, T_mount[:3, :3])

@@ -15,12 +15,12 @@ from stitch.frames import Array
 from stitch.integrity.hypotheses import Hypothesis
 
 _STARTS = 12
-_STEPS = 40
+_CENTROID_STEPS = 40
 # Problems minimised at a time: memory.
 _BATCH = 4000
 
 
-def centroids_meet(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
+def fit_centroids(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
     """Per hypothesis the rms distance of the placed centroids from their mean, and the hand-eye (4, 4).
 
     Args:
@@ -28,10 +28,10 @@ def centroids_meet(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[
     """
     per_batch = max(_BATCH // _STARTS, 1)
     groups = [tried[i : i + per_batch] for i in range(0, len(tried), per_batch)]
-    return [pair for group in groups for pair in _batch(group, centroids)]
+    return [pair for group in groups for pair in _fit_batch(group, centroids)]
 
 
-def _batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
+def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
     H, V = len(tried), len(centroids)
     poses = np.repeat(np.array([h.T_reference_mount for h in tried]), _STARTS, axis=0)
     used = np.ones((H, V))
@@ -43,12 +43,12 @@ def _batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, A
     starts = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_matrix()
     X = frames.make(np.tile(starts, (H, 1, 1)), np.zeros(3))
     X[:, :3, 3] = _best_translation(poses, X, centroids, share)
-    cost = _cost(poses, X, centroids, share)
+    cost = _centroid_cost(poses, X, centroids, share)
     damping = np.full(len(X), 1e-3)
-    for _ in range(_STEPS):
-        step = _step(poses, X, centroids, share, damping)
+    for _ in range(_CENTROID_STEPS):
+        step = _centroid_step(poses, X, centroids, share, damping)
         new = X @ frames.exp(step)
-        new_cost = _cost(poses, new, centroids, share)
+        new_cost = _centroid_cost(poses, new, centroids, share)
         better = new_cost < cost
         X = np.where(better[:, None, None], new, X)
         cost = np.where(better, new_cost, cost)
@@ -58,32 +58,32 @@ def _batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, A
     return [(float(np.sqrt(cost[i, b])), X[i * _STARTS + b]) for i, b in enumerate(best)]
 
 
-def _residual(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
+def _centroid_residual(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
     """(P, V, 3) placed centroids about their mean."""
     placed = frames.transform(poses @ X[:, None], centroids[None, :, None])[:, :, 0]
     return np.asarray(placed - np.einsum("pv,pvi->pi", share, placed)[:, None])
 
 
-def _cost(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
-    return np.asarray(np.einsum("pv,pvi->p", share, _residual(poses, X, centroids, share) ** 2))
+def _centroid_cost(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
+    return np.asarray(np.einsum("pv,pvi->p", share, _centroid_residual(poses, X, centroids, share) ** 2))
 
 
 def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
     """(P, 3) that brings the centroids closest together while the rotations stay."""
     R = poses[..., :3, :3]
     M = R - np.einsum("pv,pvij->pij", share, R)[:, None]
-    r = _residual(poses, X, centroids, share)
+    r = _centroid_residual(poses, X, centroids, share)
     normal = np.einsum("pv,pvki,pvkj->pij", share, M, M) + 1e-9 * np.eye(3)
     right = np.einsum("pv,pvki,pvk->pi", share, M, r)
     return np.asarray(-np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def _step(poses: Array, X: Array, centroids: Array, share: Array, damping: Array) -> Array:
+def _centroid_step(poses: Array, X: Array, centroids: Array, share: Array, damping: Array) -> Array:
     """(P, 6) right twists of the hand-eyes."""
     R = (poses @ X[:, None])[..., :3, :3]
     J = np.concatenate([-R @ frames.skew(centroids)[None], R], axis=3)
     J = J - np.einsum("pv,pvij->pij", share, J)[:, None]
-    r = _residual(poses, X, centroids, share)
+    r = _centroid_residual(poses, X, centroids, share)
     normal = np.einsum("pv,pvki,pvkj->pij", share, J, J, optimize=True)
     right = np.einsum("pv,pvki,pvk->pi", share, J, r, optimize=True)
     # Damped by its own diagonal: rotations and translations have scales of their own.

@@ -8,10 +8,10 @@ from stitch.frames import Array
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.measurement.session import Mount
 
-_STEPS = 12
+_POSITION_STEPS = 12
 
 
-def fitted_positions(
+def fit_positions(
     R: Array, known: tuple[Array, Array], mount: Mount, motions: RelativeScans, used: Collection[int], R_mount: Array
 ) -> Array:
     """(V, 3) positions p + Q·u of the flange with the u under which most motions close, least absolute sum (IRLS).
@@ -40,7 +40,7 @@ def fitted_positions(
 def _least_absolute(rows: Array, right: Array) -> Array:
     """(U,) least sum of the lengths of rows (M, 3, U) · x − right (M, 3)."""
     weight = np.ones(len(rows))
-    for _ in range(_STEPS):
+    for _ in range(_POSITION_STEPS):
         root = np.sqrt(weight)[:, None]
         x = np.linalg.lstsq(
             (root[..., None] * rows).reshape(-1, rows.shape[2]), (root * right).reshape(-1), rcond=1e-9

@@ -26,9 +26,9 @@ UNITS = {
     10.0: "mm where cm are stated",
     0.1: "cm where mm are stated",
 }
-_OTHER: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
+_OTHER_MOUNT: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
 _HANDED = "the scans, or the frames of the poses, are left-handed: two columns are exchanged, or one has the wrong sign"
-_AS_TEXT = "the {} are in the order of numbers as text (1, 10, 11, 2, …), the {} in that of numbers: pair by number"
+_TEXT_ORDER = "the {} are in the order of numbers as text (1, 10, 11, 2, …), the {} in that of numbers: pair by number"
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
@@ -55,19 +55,19 @@ def hypotheses(session: Session) -> list[Hypothesis]:
     T = np.array([view.T_base_flange for view in session.views])
     mount = session.mount
     out = [Hypothesis("stated", T, mount, "")]
-    out += _whole(session, T)
-    out += _rows(T, mount)
+    out += _session_mistakes(session, T)
+    out += _row_mistakes(T, mount)
     return out
 
 
-def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
+def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
     """Mistakes that change all poses alike."""
     mount, joints = session.mount, [view.joints for view in session.views]
     robot = session.robot
     known = robot is not None and all(q is not None for q in joints)
-    other = f'set mount = "{_OTHER[mount]}" in session.toml'
+    other = f'set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
     if known:
-        yield Hypothesis("mount", T, _OTHER[mount], other)
+        yield Hypothesis("mount", T, _OTHER_MOUNT[mount], other)
         q = np.array(joints)
         assert robot is not None
         for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
@@ -105,20 +105,20 @@ def _whole(session: Session, T: Array) -> Iterator[Hypothesis]:
 
 def _mount_or_inverse(mount: Mount) -> str:
     return (
-        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER[mount]}" in session.toml '
+        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER_MOUNT[mount]}" in session.toml '
         "(these scans cannot tell the two apart, the size of the hand-eye can)"
     )
 
 
-def _rows(T: Array, mount: Mount) -> Iterator[Hypothesis]:
+def _row_mistakes(T: Array, mount: Mount) -> Iterator[Hypothesis]:
     """Poses that belong to other rows."""
     V = len(T)
     index = np.arange(V)
     yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order: turn the list around")
     for first in (0, 1):
         as_text = np.argsort([str(v + first) for v in range(V)])
-        yield Hypothesis("shifted", T[as_text], mount, _AS_TEXT.format("clouds", "poses"))
-        yield Hypothesis("shifted", T[np.argsort(as_text)], mount, _AS_TEXT.format("poses", "clouds"))
+        yield Hypothesis("shifted", T[as_text], mount, _TEXT_ORDER.format("clouds", "poses"))
+        yield Hypothesis("shifted", T[np.argsort(as_text)], mount, _TEXT_ORDER.format("poses", "clouds"))
     for by in _SHIFTS:
         if abs(by) < V - 2:
             kept = index[(index + by >= 0) & (index + by < V)]

@@ -12,31 +12,31 @@ from pykdtree.kdtree import KDTree
 
 from stitch import frames
 from stitch.frames import Array, Mask
-from stitch.integrity.view_names import listed
+from stitch.integrity.view_names import list_views
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.match import sample_points
 
 # Points of a scan that are asked, and other scans, evenly over the session, that are asked for each.
-_PROBES, _ASKED = 400, 20
+_OCCLUDER_PROBES, _OCCLUDER_VIEWS_COMPARED = 400, 20
 # Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
 # through. Where poses err or an edge is seen aslant, scans differ by less; so do those whose points lie as far apart.
 _APART, _SPACINGS = 0.03, 2.0
 # Nearest looks of another scan that must all pass a point.
-_LOOKS = 8
+_LOOK_DIRECTIONS = 8
 # Share of a scan's points that is worth a word, and how many; scans of good sessions had 0.0025 at the most.
-_WORTH, _FEWEST = 0.01, 5
+_OCCLUDER_MIN_SHARE, _FEWEST = 0.01, 5
 
 
 @dataclass(frozen=True)
-class InTheWay:
+class Occluder:
     """What stands where others look through."""
 
     views: tuple[int, ...]
     share: float  # of the points of these views, at least: where no other scan looks, nobody can say
 
-    def said(self, names: Sequence[str]) -> str:
+    def describe(self, names: Sequence[str]) -> str:
         """In words, and what to do."""
-        where, verb = listed([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
+        where, verb = list_views([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
         return (
             f"At least {self.share:.0%} of what {where} {verb} stands where other scans look through and see none of "
             "it: something was in the way, a cable, an arm or a clamp, or these are stray points. It is in the "
@@ -44,7 +44,7 @@ class InTheWay:
         )
 
 
-def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | None:
+def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder | None:
     """What single scans show where others look through, if that is worth a word.
 
     Args:
@@ -56,8 +56,10 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
     shares = {}
     for v in views:
         others = [w for w in views if w != v]
-        asked = [others[i] for i in np.linspace(0, len(others) - 1, min(len(others), _ASKED)).astype(int)]
-        points = scans[v].points[sample(scans[v], _PROBES)]
+        asked = [
+            others[i] for i in np.linspace(0, len(others) - 1, min(len(others), _OCCLUDER_VIEWS_COMPARED)).astype(int)
+        ]
+        points = scans[v].points[sample_points(scans[v], _OCCLUDER_PROBES)]
         seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
         apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
         # Most are shown by the first scans that are asked; only the rest can be in the way.
@@ -70,8 +72,8 @@ def in_the_way(scans: Sequence[Scan], poses: Array, size: float) -> InTheWay | N
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
             through |= _looks_through(scans[w], looks[w], there, apart[w])
         shares[v] = through.sum() / count if through.sum() >= _FEWEST else 0.0
-    told = tuple(v for v, share in shares.items() if share > _WORTH)
-    return InTheWay(told, float(np.mean([shares[v] for v in told]))) if told else None
+    told = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
+    return Occluder(told, float(np.mean([shares[v] for v in told]))) if told else None
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
@@ -81,7 +83,7 @@ def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Ma
     Where that face is too steep to be seen, there are looks on one side of the point alone.
     """
     away, rays = np.linalg.norm(points - scan.eye, axis=1), scan.rays(points)
-    beside, partners = look.query(rays, k=min(_LOOKS, len(scan.points)))
+    beside, partners = look.query(rays, k=min(_LOOK_DIRECTIONS, len(scan.points)))
     beside, partners = beside.reshape(len(points), -1), partners.reshape(len(points), -1).astype(int)
     found = scan.points[partners]
     seen = np.linalg.norm(found - scan.eye, axis=2).min(axis=1)

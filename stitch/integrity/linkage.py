@@ -81,25 +81,25 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
         elif found.get((int(v), int(w))):
             count = int(overlaps.gram.count[i])
             links.append(Link(int(v), int(w), count, count / found[int(v), int(w)]))
-    return of_links(views, links)
+    return linkage_of_links(views, links)
 
 
-def of_links(views: int, links: Sequence[Link]) -> Linkage:
+def linkage_of_links(views: int, links: Sequence[Link]) -> Linkage:
     """The linkage of V views from their links."""
     near = np.zeros((views, views), bool)
     for link in links:
         near[link.v, link.w] = near[link.w, link.v] = link.holds
     single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
-    return Linkage(views, tuple(links), _parts(near), tuple(single))
+    return Linkage(views, tuple(links), _connected_components(near), tuple(single))
 
 
-def _parts(near: Mask) -> tuple[tuple[int, ...], ...]:
+def _connected_components(near: Mask) -> tuple[tuple[int, ...], ...]:
     """Connected components of an adjacency (V, V), largest first."""
     count, label = connected_components(coo_array(near), directed=False)
     parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]
     return tuple(sorted(parts, key=lambda part: (-len(part), part)))
 
 
-def only(indices: Indices | Sequence[int], names: Sequence[str]) -> list[str]:
+def names_of_views(indices: Indices | Sequence[int], names: Sequence[str]) -> list[str]:
     """Names of some views."""
     return [names[int(v)] for v in indices]

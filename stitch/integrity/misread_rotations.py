@@ -35,16 +35,16 @@ def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
         yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(_shortest(angles))
     for right in (*ORDERS, *(o.lower() for o in ORDERS)):
         yield (
-            f"the rotation vectors are Euler angles in the order {_named(right)}",
+            f"the rotation vectors are Euler angles in the order {_order_name(right)}",
             Rotation.from_euler(right, R.as_rotvec()),
         )
 
 
 def _order_fix(order: str, right: str) -> str:
-    return f"the Euler angles were turned in the order {_named(order)} and belong into {_named(right)}"
+    return f"the Euler angles were turned in the order {_order_name(order)} and belong into {_order_name(right)}"
 
 
-def _named(order: str) -> str:
+def _order_name(order: str) -> str:
     """Capitals turn about the axes that turned already (intrinsic)."""
     return f"{order.lower()}-{'intrinsic' if order.isupper() else 'extrinsic'}"
 
@@ -54,7 +54,7 @@ def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
     words = "the angles are radians, and were read as degrees"
     yield words, Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
     for order in ORDERS:
-        yield f"{words} ({_named(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
+        yield f"{words} ({_order_name(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
 
 
 def _angles(R: Rotation, order: str) -> Array:

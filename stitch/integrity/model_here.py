@@ -12,23 +12,23 @@ import numpy as np
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
-from stitch.integrity.admitted_fit import Admitted
+from stitch.integrity.admitted_fit import ScreenedFit
 from stitch.integrity.arm_limits import beyond_any_arm
 from stitch.measurement.session import Session
-from stitch.observations.targets.target_fit import TargetFit
-from stitch.stages.fitted import Fitted
+from stitch.observations.targets.target_fit import TargetModelFit
+from stitch.stages.fitted import FittedRig
 from stitch.stages.outlier_removal import FittedSession
-from stitch.statistics.shares import clearly_less
+from stitch.statistics.shares import significantly_smaller
 from stitch.statistics.tails import chi2_tail
 from stitch.units import length_text
 
 # That something which holds is doubted: half for the hand-eye, half for all targets.
-_CHANCE = 0.01
+_MODEL_CHANCE = 0.01
 _LISTED = 4
 
 
 @dataclass(frozen=True)
-class ModelHere:
+class ModelTransfer:
     """What of another run does not hold; lengths in length_unit, angles in rad."""
 
     turned: float  # of the hand-eye from there to here
@@ -55,7 +55,7 @@ class ModelHere:
         )
 
 
-def held_against_own(found: Admitted, fit: Callable[[], Fitted]) -> Admitted:
+def check_model_transfer(found: ScreenedFit, fit: Callable[[], FittedRig]) -> ScreenedFit:
     """Sessions under the model of another run, with what is to be doubted of it in each.
 
     Args:
@@ -68,17 +68,19 @@ def held_against_own(found: Admitted, fit: Callable[[], Fitted]) -> Admitted:
         own: list[FittedSession | None] = [*fit().sessions]
     except NoResultError:
         own = [None] * len(found.sessions)
-    every = zip(found.admissions, found.sessions, found.fitted.sessions, own, strict=True)
-    doubted = [replace(a, doubts=(*a.doubts, *_doubts(session, there, here))) for a, session, there, here in every]
-    return replace(found, admissions=doubted)
+    every = zip(found.screenings, found.sessions, found.fitted.sessions, own, strict=True)
+    doubted = [
+        replace(a, doubts=(*a.doubts, *_transfer_warnings(session, there, here))) for a, session, there, here in every
+    ]
+    return replace(found, screenings=doubted)
 
 
-def _doubts(session: Session, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
+def _transfer_warnings(session: Session, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
     """What to doubt; nothing where the other run holds."""
     there = applied.targets
     assert there is not None
     beyond = beyond_any_arm(session, *np.sqrt(there.variances[:2]))
-    found = None if own is None or own.targets is None else _compared(applied, own)
+    found = None if own is None or own.targets is None else _compare_with_own(applied, own)
     if found is not None and (found.hand_eye or found.targets):
         told = found.sentence(session.length_unit)
         if beyond:
@@ -93,20 +95,20 @@ def _doubts(session: Session, applied: FittedSession, own: FittedSession | None)
     return ()
 
 
-def _compared(applied: FittedSession, own: FittedSession) -> ModelHere | None:
+def _compare_with_own(applied: FittedSession, own: FittedSession) -> ModelTransfer | None:
     """None where what is fitted here leaves no less than chance would."""
     there, here = applied.targets, own.targets
     assert there is not None and here is not None
     squares = there.view_squares, here.view_squares
-    if not clearly_less(squares[1], squares[0], _CHANCE):
+    if not significantly_smaller(squares[1], squares[0], _MODEL_CHANCE):
         return None
     apart = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)
     covariance = there.model.covariance + here.model.covariance
-    away, names = _elsewhere(there, here)
-    return ModelHere(
+    away, names = _displaced_targets(there, here)
+    return ModelTransfer(
         turned=float(np.linalg.norm(apart[:3])),
         moved=float(np.linalg.norm(apart[3:])),
-        hand_eye=chi2_tail(_square(apart, covariance), 6) < _CHANCE / 2,
+        hand_eye=chi2_tail(_mahalanobis_square(apart, covariance), 6) < _MODEL_CHANCE / 2,
         targets=names,
         farthest=away,
         rms=float(np.sqrt(np.nanmean(squares[0]))),
@@ -114,19 +116,19 @@ def _compared(applied: FittedSession, own: FittedSession) -> ModelHere | None:
     )
 
 
-def _elsewhere(there: TargetFit, here: TargetFit) -> tuple[float, tuple[str, ...]]:
+def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> tuple[float, tuple[str, ...]]:
     """How far the farthest lies from where the other run has it, and the names of those that lie elsewhere."""
     sigmas, found = here.landmark_sigmas, dict[str, float]()
     known = {name: k for k, name in enumerate(here.rows.sightings.targets) if name in there.model.targets}
     for name, k in known.items():
         other = there.model.targets[name]
         apart, variance = here.landmarks.positions[k] - other.position, sigmas[k] ** 2 + other.sigma**2
-        if chi2_tail(float(np.sum(apart**2 / np.maximum(variance, 1e-300))), 3) < _CHANCE / 2 / len(known):
+        if chi2_tail(float(np.sum(apart**2 / np.maximum(variance, 1e-300))), 3) < _MODEL_CHANCE / 2 / len(known):
             found[name] = float(np.linalg.norm(apart))
     return max(found.values(), default=0.0), tuple(found)
 
 
-def _square(apart: Array, covariance: Array) -> float:
+def _mahalanobis_square(apart: Array, covariance: Array) -> float:
     """dᵀ C⁻¹ d; a direction that is known exactly counts nothing."""
     unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     inverse = np.linalg.pinv(covariance / np.outer(unit, unit), rcond=1e-9, hermitian=True)

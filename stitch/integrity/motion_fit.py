@@ -24,7 +24,7 @@ _SCREEN = 0.6
 
 
 @dataclass(frozen=True)
-class Explained:
+class MotionFit:
     """A hypothesis with the hand-eye that fits it best."""
 
     hypothesis: Hypothesis
@@ -34,27 +34,27 @@ class Explained:
     scale: float  # of the robot's lengths against the scans', where it was fitted; else 1
 
 
-def screened(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
+def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
     """The first hypothesis, and what could close: motions keep their angle under any hand-eye (Chen 1991)."""
     v, w = np.array(motions.pairs).T
-    seen = turn_angles(motions.T)
+    seen = rotation_angles(motions.T)
     share = []
     for h in tried:
         T = h.T_reference_mount
         used = np.ones(len(T), bool) if h.used is None else np.isin(np.arange(len(T)), h.used)
         kept = used[v] & used[w]
-        near = np.abs(turn_angles(frames.inverse(T[v]) @ T[w]) - seen) < ROTATION
+        near = np.abs(rotation_angles(frames.inverse(T[v]) @ T[w]) - seen) < ROTATION
         share.append(float(near[kept].mean()) if kept.any() else 0.0)
     limit = _SCREEN * max(share)
     return [tried[0]] + [h for h, agree in zip(tried[1:], share[1:], strict=True) if agree >= limit]
 
 
-def turn_angles(T: Array) -> Array:
+def rotation_angles(T: Array) -> Array:
     """Angles of rotation (M,) of motions (M, 4, 4)."""
     return np.asarray(np.arccos(np.clip((np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
 
 
-def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *, scaled: bool = False) -> Explained:
+def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *, scaled: bool = False) -> MotionFit:
     """The hand-eye of one hypothesis.
 
     Args:
@@ -65,14 +65,14 @@ def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *
     keep = [i for i, (v, w) in enumerate(motions.pairs) if v in used and w in used]
     T = hypothesis.T_reference_mount
     if len(keep) < FEWEST:
-        return Explained(hypothesis, np.eye(4), 0.0, 1.0, 1.0)
+        return MotionFit(hypothesis, np.eye(4), 0.0, 1.0, 1.0)
     A = np.array([frames.inverse(T[v]) @ T[w] for v, w in (motions.pairs[i] for i in keep)])
     B = motions.T[keep]
     R, turned = _rotation(A, B)
     t, s, moved = _translation(A, B, R, turned < ROTATION, scaled)
     near = (turned < ROTATION) & (moved < length)
     left = np.minimum(1.0, (turned / ROTATION) ** 2 + (moved / length) ** 2)
-    return Explained(hypothesis, frames.make(R, t), float(near.mean()), float(left.mean()), s)
+    return MotionFit(hypothesis, frames.make(R, t), float(near.mean()), float(left.mean()), s)
 
 
 def _rotation(A: Array, B: Array) -> tuple[Array, Array]:

@@ -11,9 +11,9 @@ import numpy as np
 
 from stitch.frames import Array, Indices
 from stitch.measurement.sightings import Sightings
-from stitch.observations.targets.distances import MANY, distance_sigma, distances, places_of
+from stitch.observations.targets.distances import COMPARED_TARGETS, distance_sigma, target_distances, target_positions
 from stitch.observations.targets.outliers import LIMIT_TARGET
-from stitch.statistics.robust import MAD_TO_SIGMA, median_of_known
+from stitch.statistics.robust import MAD_TO_SIGMA, nan_median
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
 _SIDE, _TARGETS = 2, 3
@@ -22,7 +22,7 @@ _MEDIAN = 1.25
 # Targets that are looked at closely, and how far a single distance pulls where all are looked at, in sigmas.
 _LIKELIEST, _CLIPPED = 8, 10.0
 # What creeps leaves so much less about a straight line than about a step.
-_CREEPS = 0.7
+_DRIFT_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class MovedTarget:
     target: str
     start: int
     distance: float  # length_unit: by which its distances to the others change at the most
-    creeps: bool = False
+    drifts: bool = False
 
-    def said(self, view: str, length: str) -> str:
+    def describe(self, view: str, length: str) -> str:
         """What happened and what to do, with the name of the view and that distance in words."""
-        if self.creeps:
+        if self.drifts:
             return (
                 f"{self.target} creeps among the targets over the session: its distances to the others change by up to "
                 f"{length}. Leave it out of points.csv, and fix it before you measure again."
@@ -47,12 +47,15 @@ class MovedTarget:
         )
 
 
-def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
+def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
     """Targets that moved once, the clearest first; each is asked without those before it."""
-    places, sigma = places_of(sightings), distance_sigma(sightings)
+    places, sigma = target_positions(sightings), distance_sigma(sightings)
     left, found = list(range(len(sightings.targets))), list[MovedTarget]()
     while len(left) >= _TARGETS:
-        steps = {k: _step(places[:, left], k, start, sigma) for k, start in _likeliest(places[:, left], sigma)}
+        steps = {
+            k: _target_step(places[:, left], k, start, sigma)
+            for k, start in _most_stepped_targets(places[:, left], sigma)
+        }
         k = max(steps, key=lambda k: steps[k][0], default=-1)
         if k < 0 or steps[k][0] < LIMIT_TARGET:
             break
@@ -60,25 +63,27 @@ def moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
     return tuple(found)
 
 
-def _likeliest(places: Array, sigma: float) -> list[tuple[int, int]]:
+def _most_stepped_targets(places: Array, sigma: float) -> list[tuple[int, int]]:
     """The targets (V, K, 3) of which means before and after some view differ most, and that view."""
-    some = np.linspace(0, places.shape[1] - 1, min(places.shape[1], MANY)).astype(int)
-    scatter = max(sigma, MAD_TO_SIGMA * float(np.median([_usual(_apart_from_median(places, k)) for k in some])))
+    some = np.linspace(0, places.shape[1] - 1, min(places.shape[1], COMPARED_TARGETS)).astype(int)
+    scatter = max(
+        sigma, MAD_TO_SIGMA * float(np.median([_typical_distance(_distances_from_median(places, k)) for k in some]))
+    )
     found = []
     for k in range(places.shape[1]):
-        times = _steps_of_means(_apart_from_median(places, k) / scatter)
+        times = _steps_of_means(_distances_from_median(places, k) / scatter)
         if times.max(initial=0.0) > 0:
             found.append((float(times.max()), k, int(np.argmax(times))))
     return [(k, start) for _, k, start in sorted(found, reverse=True)[:_LIKELIEST]]
 
 
-def _apart_from_median(places: Array, k: int) -> Array:
+def _distances_from_median(places: Array, k: int) -> Array:
     """(V, P) distances from target k to its partners, less the median of each."""
     own = np.linalg.norm(places[:, _partners(places, k)] - places[:, k : k + 1], axis=2)
-    return np.asarray(own - median_of_known(own))
+    return np.asarray(own - nan_median(own))
 
 
-def _usual(off: Array) -> float:
+def _typical_distance(off: Array) -> float:
     seen = np.isfinite(off)
     return float(np.median(np.abs(off[seen]))) if seen.any() else 0.0
 
@@ -89,7 +94,7 @@ def _partners(places: Array, k: int) -> Indices:
     together = seen[:, k].astype(float) @ seen
     together[k] = 0
     others = np.flatnonzero(together > together.max() / 2)
-    return np.asarray(others[np.linspace(0, len(others) - 1, min(len(others), MANY - 1)).astype(int)])
+    return np.asarray(others[np.linspace(0, len(others) - 1, min(len(others), COMPARED_TARGETS - 1)).astype(int)])
 
 
 def _steps_of_means(off: Array) -> Array:
@@ -105,26 +110,31 @@ def _steps_of_means(off: Array) -> Array:
     return np.where(few, 0.0, np.sqrt(squares.sum(axis=1) / max(off.shape[1], 1)))
 
 
-def _step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
+def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
     """How many times what is usual the distances from target k step before a view, and the move that this would be."""
     held = _partners(places, k)
-    among = distances(places[:, held])[:, *np.triu_indices(len(held), 1)]
-    mine, rest = _known(np.linalg.norm(places[:, held] - places[:, k : k + 1], axis=2), start), _known(among, start)
+    among = target_distances(places[:, held])[:, *np.triu_indices(len(held), 1)]
+    mine, rest = (
+        _seen_on_both_sides(np.linalg.norm(places[:, held] - places[:, k : k + 1], axis=2), start),
+        _seen_on_both_sides(among, start),
+    )
     if not rest.shape[1]:
         return 0.0, MovedTarget("", start, 0.0)
     # By the sensor's sigma, or by what is left on both sides: a lens changes distances too, but with every view.
     left = [d - _levels(d, start) for d in (mine, rest)]
     scatter = max(sigma, MAD_TO_SIGMA * float(np.nanmedian(np.abs(np.concatenate(left, axis=1)))))
-    (steps, times), (_, usual) = (_stepped(d, start, scatter) for d in (mine, rest))
-    line = mine - _lines(mine)
-    creeps = bool(np.nansum(np.abs(line)) < _CREEPS * np.nansum(np.abs(left[0])))
+    (steps, times), (_, usual) = (_median_steps(d, start, scatter) for d in (mine, rest))
+    line = mine - _fitted_lines(mine)
+    creeps = bool(np.nansum(np.abs(line)) < _DRIFT_SHARE * np.nansum(np.abs(left[0])))
     distance = float(
-        np.max(np.nanmax(_lines(mine), axis=0) - np.nanmin(_lines(mine), axis=0)) if creeps else steps.max()
+        np.max(np.nanmax(_fitted_lines(mine), axis=0) - np.nanmin(_fitted_lines(mine), axis=0))
+        if creeps
+        else steps.max()
     )
     return float(np.median(times) / max(np.median(usual), 1.0)), MovedTarget("", start, distance, creeps)
 
 
-def _known(distances: Array, start: int) -> Array:
+def _seen_on_both_sides(distances: Array, start: int) -> Array:
     """(V, p) those of the distances that are seen on both sides."""
     seen = np.isfinite(distances)
     return distances[:, (seen[:start].sum(axis=0) >= _SIDE) & (seen[start:].sum(axis=0) >= _SIDE)]
@@ -133,10 +143,10 @@ def _known(distances: Array, start: int) -> Array:
 def _levels(distances: Array, start: int) -> Array:
     """(V, p) medians before and from a view on."""
     sides = np.arange(len(distances))[:, None] < start
-    return np.where(sides, *(median_of_known(half) for half in (distances[:start], distances[start:])))
+    return np.where(sides, *(nan_median(half) for half in (distances[:start], distances[start:])))
 
 
-def _lines(distances: Array) -> Array:
+def _fitted_lines(distances: Array) -> Array:
     """(V, p) straight lines through distances over the session, by least squares."""
     seen = np.isfinite(distances)
     order = np.where(seen, np.arange(len(distances))[:, None], np.nan)
@@ -146,7 +156,7 @@ def _lines(distances: Array) -> Array:
     return np.asarray(np.where(seen, middle + slope * at, np.nan))
 
 
-def _stepped(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:
+def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:
     """(p,) steps of the medians, in length_unit and in standard errors."""
     levels = _levels(distances, start)
     before, after = (np.isfinite(half).sum(axis=0) for half in (distances[:start], distances[start:]))

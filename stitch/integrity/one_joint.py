@@ -5,17 +5,17 @@ from scipy.optimize import minimize_scalar
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.snooping import Misplaced
+from stitch.integrity.snooping import MisplacedView
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
 
 # One joint explains a displacement if it leaves less than this share of it.
-_ONE_JOINT = 0.1
+_MAX_REMAINING_SHARE = 0.1
 
 
-def one_joint(
-    session: Session, capture: Capture, T_mount: Array, m: Misplaced
+def find_wrong_joint(
+    session: Session, capture: Capture, T_mount: Array, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
     """The joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
     robot, joints = session.robot, session.views[m.view].joints
@@ -39,7 +39,7 @@ def one_joint(
             fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(a - 0.02, a + 0.02))
             best = min(best, (float(fit.fun), j, float(fit.x)))
     left, j, turn = best
-    if left > _ONE_JOINT * start:
+    if left > _MAX_REMAINING_SHARE * start:
         return None
     fits = joints[j] + turn
     others = [session.views[r].joints for r in (m.view - 1, m.view + 1) if 0 <= r < len(session.views)]

@@ -12,18 +12,25 @@ from pykdtree.kdtree import KDTree
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.linkage import Linkage
-from stitch.integrity.placing import Placement, Surface, judge, place, starts_about, surface_of
+from stitch.integrity.placing import (
+    Placement,
+    ReferenceSurface,
+    evaluate_placement,
+    place_scan,
+    starts_about,
+    surface_of,
+)
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.match import sample_points
 
 # Points of each view that stand for it in its group.
-_PROBES = 600
+_GROUP_PROBES = 600
 # What shows less than this share of the surface cannot be seen to belong there.
 FEW_SHARED = 0.1
 
 
-def placed_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
+def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
     """Where the views of groups outside the core belong, each group moved as a whole; the core grows with them.
 
     Args:
@@ -34,22 +41,22 @@ def placed_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple
     core, placed = list(linked.core), dict[int, Placement]()
     for group in (part for part in linked.components[1:] if len(part) > 1):
         surface = surface_of(capture.scans, poses, core, tolerance)
-        scan = _as_one(capture.scans, poses, group)
-        found = place(scan, surface, starts_about(np.eye(4), scan, size), size)
-        closed = [p for p in found if _closes(scan, p.T, surface, needed)]
+        scan = _merge_scans(capture.scans, poses, group)
+        found = place_scan(scan, surface, starts_about(np.eye(4), scan, size), size)
+        closed = [p for p in found if _group_closes(scan, p.T, surface, needed)]
         if not closed:
             continue
         # A part may look alike from several sides: of the places in which the group closes, the nearest.
-        T = min(closed, key=lambda p: _moved(scan, p.T)).T
-        placed |= {v: judge(capture.scans[v], T @ poses[v], surface) for v in group}
+        T = min(closed, key=lambda p: _rms_displacement(scan, p.T)).T
+        placed |= {v: evaluate_placement(capture.scans[v], T @ poses[v], surface) for v in group}
         core += group
         poses = np.array([T @ pose if v in group else pose for v, pose in enumerate(poses)])
     return placed
 
 
-def _as_one(scans: Sequence[Scan], poses: Array, group: Sequence[int]) -> Scan:
+def _merge_scans(scans: Sequence[Scan], poses: Array, group: Sequence[int]) -> Scan:
     """Some points of all views of a group as one scan in the reference frame."""
-    picked = {v: sample(scans[v], _PROBES) for v in group}
+    picked = {v: sample_points(scans[v], _GROUP_PROBES) for v in group}
     points = np.concatenate([frames.transform(poses[v], scans[v].points[picked[v]]) for v in group])
     return replace(
         scans[group[0]],
@@ -62,7 +69,7 @@ def _as_one(scans: Sequence[Scan], poses: Array, group: Sequence[int]) -> Scan:
     )
 
 
-def _closes(scan: Scan, T: Array, surface: Surface, needed: float) -> bool:
+def _group_closes(scan: Scan, T: Array, surface: ReferenceSurface, needed: float) -> bool:
     """True if enough of what faces the surface lies on it.
 
     Halves of a session may show the two sides of a thin wall: there what is near and faces the other way says nothing.
@@ -72,6 +79,6 @@ def _closes(scan: Scan, T: Array, surface: Surface, needed: float) -> bool:
     return bool(meets.mean() > FEW_SHARED and on.sum() > needed * meets.sum())
 
 
-def _moved(scan: Scan, T: Array) -> float:
+def _rms_displacement(scan: Scan, T: Array) -> float:
     """How far a motion (4, 4) carries the points of a scan, rms."""
     return float(np.sqrt(np.mean(np.sum((frames.transform(T, scan.points) - scan.points) ** 2, axis=1))))

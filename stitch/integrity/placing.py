@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.match import sample_points
 
 # Points of the other views that make up their surface, and of the scan that is placed.
 _SURFACE_POINTS = 30_000
-_PROBES, _FINAL_PROBES = 160, 600
+_COARSE_PROBES, _FINAL_PROBES = 160, 600
 _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Gates of the search as shares of the size: from a third of the part to a two-hundredth.
 _FIRST_GATE, _LAST_GATE, _STEPS = 0.35, 0.005, 14
@@ -32,7 +32,7 @@ _FEWEST = 30
 
 
 @dataclass(frozen=True)
-class Surface:
+class ReferenceSurface:
     """Points of several views in the reference frame, with normals."""
 
     points: Array  # (N, 3)
@@ -66,21 +66,21 @@ class Placement:
     closure: float  # share of those that lie on it
 
     @property
-    def on(self) -> float:
+    def surface_share(self) -> float:
         """Share of all its points that lie on the surface."""
         return self.near * self.closure
 
 
-def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolerance: float) -> Surface:
+def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolerance: float) -> ReferenceSurface:
     """The surface that some views show under poses (V, 4, 4) T_reference_scanner."""
     views = list(views)
-    picked = {v: sample(scans[v], max(_SURFACE_POINTS // max(len(views), 1), 200)) for v in views}
+    picked = {v: sample_points(scans[v], max(_SURFACE_POINTS // max(len(views), 1), 200)) for v in views}
     points = np.concatenate([frames.transform(poses[v], scans[v].points[picked[v]]) for v in views])
     normals = np.concatenate([frames.rotate(poses[v], scans[v].normals[picked[v]]) for v in views])
     spacing = float(
         np.median([scans[v].spacing * np.sqrt(len(scans[v].points) / max(len(picked[v]), 1)) for v in views])
     )
-    return Surface(points, normals, KDTree(np.ascontiguousarray(points), leafsize=16), spacing, tolerance)
+    return ReferenceSurface(points, normals, KDTree(np.ascontiguousarray(points), leafsize=16), spacing, tolerance)
 
 
 def shows_no_surface(scan: Scan) -> bool:
@@ -94,18 +94,20 @@ def lies_in_a_line(scan: Scan) -> bool:
     return bool(extent[1] < _LINE * extent[0])
 
 
-def judge(scan: Scan, T: Array, surface: Surface) -> Placement:
+def evaluate_placement(scan: Scan, T: Array, surface: ReferenceSurface) -> Placement:
     """How well a scan lies on a surface under a pose (4, 4)."""
-    return judge_all(scan, T[None], surface)[0]
+    return evaluate_placements(scan, T[None], surface)[0]
 
 
-def judge_all(scan: Scan, poses: Array, surface: Surface, probes: int = _FINAL_PROBES) -> list[Placement]:
+def evaluate_placements(
+    scan: Scan, poses: Array, surface: ReferenceSurface, probes: int = _FINAL_PROBES
+) -> list[Placement]:
     """The same for several poses (S, 4, 4)."""
-    index = sample(scan, probes)
+    index = sample_points(scan, probes)
     if not len(index):
         return [Placement(T, 0.0, 0.0) for T in poses]
     residual, _, meets = surface.meets(poses, scan.points[index], scan.normals[index], surface.near)
-    inside = _inside(scan, poses, surface, index, surface.near)
+    inside = _points_near_surface(scan, poses, surface, index, surface.near)
     on = meets & (np.abs(residual) < surface.tolerance)
     return [
         Placement(T, float(i.mean()), float(o.sum() / max(i.sum(), 1)))
@@ -113,14 +115,14 @@ def judge_all(scan: Scan, poses: Array, surface: Surface, probes: int = _FINAL_P
     ]
 
 
-def _inside(scan: Scan, poses: Array, surface: Surface, index: Indices, near: float) -> Mask:
+def _points_near_surface(scan: Scan, poses: Array, surface: ReferenceSurface, index: Indices, near: float) -> Mask:
     """(S, n) points with the surface near, whichever way it faces."""
     placed = frames.transform(poses, scan.points[index])
     distance, _ = surface.tree.query(np.ascontiguousarray(placed.reshape(-1, 3)), distance_upper_bound=near)
     return np.asarray(np.isfinite(distance).reshape(placed.shape[:2]))
 
 
-def place(scan: Scan, surface: Surface, starts: Array, size: float) -> list[Placement]:
+def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float) -> list[Placement]:
     """Close in from every start (S, 4, 4); the best few placements, best first.
 
     Args:
@@ -128,17 +130,17 @@ def place(scan: Scan, surface: Surface, starts: Array, size: float) -> list[Plac
     """
     gates = size * np.geomspace(_FIRST_GATE, _LAST_GATE, _STEPS)
     gates = np.maximum(gates, 1.5 * surface.spacing)
-    poses = _closed_in(scan, surface, starts, gates, _PROBES)
-    found = judge_all(scan, poses, surface, 300)
-    best = sorted(range(len(found)), key=lambda i: -found[i].on)[:_KEPT]
+    poses = _icp_scan(scan, surface, starts, gates, _COARSE_PROBES)
+    found = evaluate_placements(scan, poses, surface, 300)
+    best = sorted(range(len(found)), key=lambda i: -found[i].surface_share)[:_KEPT]
     fine = np.full(_FINAL_STEPS, gates[-1])
-    poses = _closed_in(scan, surface, poses[best], fine, _FINAL_PROBES)
-    return sorted(judge_all(scan, poses, surface), key=lambda p: -p.on)
+    poses = _icp_scan(scan, surface, poses[best], fine, _FINAL_PROBES)
+    return sorted(evaluate_placements(scan, poses, surface), key=lambda p: -p.surface_share)
 
 
-def _closed_in(scan: Scan, surface: Surface, starts: Array, gates: Array, probes: int) -> Array:
+def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array, probes: int) -> Array:
     """(S, 4, 4) after one Gauss–Newton step per gate, all starts side by side."""
-    index = sample(scan, probes)
+    index = sample_points(scan, probes)
     points, normals = scan.points[index], scan.normals[index]
     poses = np.array(starts)
     centre = points.mean(axis=0)
@@ -173,7 +175,7 @@ def starts_about(T: Array, scan: Scan, size: float) -> Array:
 _AXES = np.vstack([np.eye(3), -np.eye(3)])
 
 
-def starts_anywhere(surface: Surface, scan: Scan, turns: int = 48) -> Array:
+def starts_anywhere(surface: ReferenceSurface, scan: Scan, turns: int = 48) -> Array:
     """(S, 4, 4) the scan's centre on the surface's centre, turned every way."""
     R = Rotation.random(turns, rng=np.random.default_rng(0)).as_matrix()
     own, there = scan.points.mean(axis=0), surface.points.mean(axis=0)

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from stitch.integrity.view_names import listed
+from stitch.integrity.view_names import list_views
 
 
 @dataclass(frozen=True)
-class Problem:
+class SessionProblem:
     """What is wrong, where, and how to put it right; `views` is empty where it concerns the whole session."""
 
     # exchanged | shifted | reversed | inverse | mount | euler | degrees | quaternion | unit | scale | mirrored |
@@ -24,5 +24,5 @@ class Problem:
 
     def line(self, order: Sequence[str]) -> str:
         """As a message: kind, views, to fix; with the names of all views as they follow each other."""
-        where = f" ({listed(self.views, order)})" if self.views else ""
+        where = f" ({list_views(self.views, order)})" if self.views else ""
         return f"{self.kind}{where}: {self.fix}"

@@ -8,10 +8,10 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.integrity.hypotheses import UNITS
-from stitch.integrity.placing import Surface, judge, place, starts_about
+from stitch.integrity.placing import ReferenceSurface, evaluate_placement, place_scan, starts_about
 from stitch.measurement.capture import Capture
-from stitch.measurement.scan import Scan, prepare_view
-from stitch.observations.surfaces.match import sample
+from stitch.measurement.scan import Scan, prepare_scan
+from stitch.observations.surfaces.match import sample_points
 from stitch.statistics.robust import tukey
 
 # Reflections of the scanner frame, with what was done.
@@ -39,7 +39,7 @@ class ScanFault:
     fix: str
 
 
-def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed: float) -> ScanFault | None:
+def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
     """What makes a scan close on the surface of the others, at its pose or near it; None if nothing does.
 
     Args:
@@ -49,8 +49,11 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
     """
 
     def closes(points: Array, eye: Array, reach: float) -> float:
-        other = prepare_view(scan.name, points, eye=eye)
-        found = [judge(other, T_pose, surface), *place(other, surface, starts_about(T_pose, other, size), size)[:1]]
+        other = prepare_scan(scan.name, points, eye=eye)
+        found = [
+            evaluate_placement(other, T_pose, surface),
+            *place_scan(other, surface, starts_about(T_pose, other, size), size)[:1],
+        ]
         middle = other.points.mean(axis=0)[None]
         moved = [np.linalg.norm(frames.transform(f.T, middle) - frames.transform(T_pose, middle)) for f in found]
         return max(f.closure if f.near > 0.3 and m < reach else 0.0 for f, m in zip(found, moved, strict=True))
@@ -68,17 +71,17 @@ def scan_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed:
     return scale_fault(scan, T_pose, surface, size, needed)
 
 
-def scale_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed: float) -> ScanFault | None:
+def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
     """A factor on the cloud under which it closes at its own pose; None if there is none."""
-    begin = place(scan, surface, np.concatenate([T_pose[None], starts_about(T_pose, scan, size)]), size)[0]
+    begin = place_scan(scan, surface, np.concatenate([T_pose[None], starts_about(T_pose, scan, size)]), size)[0]
     scale = _similarity(scan, begin.T, surface, size)
     if not (_LEAST_SCALE < scale < 1 / _LEAST_SCALE) or abs(scale - 1) < _NEAR_ONE:
         return None
-    other = prepare_view(scan.name, scan.points * scale, eye=scan.eye * scale)
-    found = judge(other, T_pose, surface)
+    other = prepare_scan(scan.name, scan.points * scale, eye=scan.eye * scale)
+    found = evaluate_placement(other, T_pose, surface)
     if found.closure < needed:
         # The factor from the shape is good to a thousandth; the range that it leaves is one of millimetres.
-        found = place(other, surface, T_pose[None], 0.2 * size)[0]
+        found = place_scan(other, surface, T_pose[None], 0.2 * size)[0]
         middle = other.points.mean(axis=0)[None]
         moved = np.linalg.norm(frames.transform(found.T, middle) - frames.transform(T_pose, middle))
         if found.closure < needed or moved > _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(middle):
@@ -86,9 +89,9 @@ def scale_fault(scan: Scan, T_pose: Array, surface: Surface, size: float, needed
     return ScanFault("scale", f"this cloud is {1 / scale:.4g} times as large as the part: multiply it by {scale:.5g}")
 
 
-def _similarity(scan: Scan, T: Array, surface: Surface, size: float) -> float:
+def _similarity(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> float:
     """Factor on the scan's points that fits a surface best, with its pose: point-to-plane, seven unknowns."""
-    index = sample(scan, 600)
+    index = sample_points(scan, 600)
     points, normals = scan.points[index], scan.normals[index]
     centre, scale = points.mean(axis=0), 1.0
     lever = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
@@ -109,24 +112,24 @@ def _similarity(scan: Scan, T: Array, surface: Surface, size: float) -> float:
     return scale
 
 
-def copies(capture: Capture) -> list[tuple[int, int]]:
+def find_copies(capture: Capture) -> list[tuple[int, int]]:
     """Pairs of views (v < w) that show the same measured points."""
     pairs = []
     for v, w in combinations(range(len(capture.scans)), 2):
         a, b = capture.scans[v].points, capture.scans[w].points
-        if abs(len(a) - len(b)) <= 0.02 * max(len(a), len(b)) and _same(capture.scans[v], capture.scans[w]):
+        if abs(len(a) - len(b)) <= 0.02 * max(len(a), len(b)) and _same_points(capture.scans[v], capture.scans[w]):
             pairs.append((v, w))
     return pairs
 
 
-def _same(a: Scan, b: Scan) -> bool:
+def _same_points(a: Scan, b: Scan) -> bool:
     """True if nearly every point of `a` is found in `b`, far closer than two measurements ever agree."""
     index = np.linspace(0, len(a.points) - 1, min(len(a.points), 60)).astype(int)
     distance, _ = b.tree.query(np.ascontiguousarray(a.points[index]), k=1)
     return bool(np.mean(distance < 1e-4 * b.spacing) > 0.9)
 
 
-def same_poses(capture: Capture) -> list[tuple[int, int]]:
+def find_same_poses(capture: Capture) -> list[tuple[int, int]]:
     """Pairs of views (v < w) with the very same pose."""
     T = capture.T_reference_mount
     return [(v, w) for v, w in combinations(range(len(T)), 2) if np.allclose(T[v], T[w], rtol=0, atol=1e-9)]

@@ -13,23 +13,23 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.across_steps import across_steps
-from stitch.integrity.blunders import Found, find_blunders
+from stitch.integrity.across_steps import place_across_steps
+from stitch.integrity.blunders import BlunderSearch, find_blunders
 from stitch.integrity.expected_poses import expected_poses
-from stitch.integrity.homes import Homes, find_homes
+from stitch.integrity.homes import PlacedViews, place_views
 from stitch.integrity.least_displacement import least_displacement
 from stitch.integrity.linkage import Linkage
-from stitch.integrity.placing import judge, place, surface_of
+from stitch.integrity.placing import evaluate_placement, place_scan, surface_of
 from stitch.integrity.pose_tests import PoseTests, pose_tests
-from stitch.integrity.step import Step
+from stitch.integrity.step import PoseStep
 from stitch.integrity.usual_effects import UsualEffects
 from stitch.integrity.view_model import ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
-from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
 
 
 @dataclass(frozen=True)
-class Misplaced:
+class MisplacedView:
     """A view that does not belong where its pose puts it."""
 
     view: int
@@ -46,13 +46,13 @@ class Snooping:
     """What linkage and tests say about the views of one capture."""
 
     linkage: Linkage  # at the poses that overlaps alone give, from the model's
-    misplaced: tuple[Misplaced, ...]
-    suspected: tuple[Misplaced, ...]  # stand out, but usual effects of the arm would do that too
-    steps: tuple[Step, ...]  # from some view on the part or the scanner sits elsewhere
+    misplaced: tuple[MisplacedView, ...]
+    suspected: tuple[MisplacedView, ...]  # stand out, but usual effects of the arm would do that too
+    steps: tuple[PoseStep, ...]  # from some view on the part or the scanner sits elsewhere
     disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
     model: ViewModel
-    found: Found
-    freed: FreePoses  # with the views where they belong
+    blunder_search: BlunderSearch
+    unconstrained: UnconstrainedPoses  # with the views where they belong
     expected: Array  # (V, 4, 4) T_reference_scanner by the robot, steps with it
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
@@ -60,10 +60,10 @@ class Snooping:
     @property
     def left_out(self) -> tuple[int, ...]:
         """Views that are not to be fused: they do not belong, or not between the same steps as most are."""
-        return tuple(sorted(self.not_belonging | (set(range(self.linkage.views)) - set(self.between))))
+        return tuple(sorted(self.not_belonging | (set(range(self.linkage.views)) - set(self.largest_segment))))
 
     @property
-    def between(self) -> range:
+    def largest_segment(self) -> range:
         """The views between the same two steps, or ends, as most are."""
         ends = [0, *(step.start for step in self.steps), self.linkage.views]
         return max((range(a, b) for a, b in pairwise(ends)), key=len)
@@ -73,7 +73,7 @@ class Snooping:
         """Views that are misplaced or not linked."""
         return {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
 
-    def settled(self, sure: Callable[[Misplaced], bool]) -> "Snooping":
+    def with_misplaced(self, sure: Callable[[MisplacedView], bool]) -> "Snooping":
         """The same with those suspected views misplaced of which one is sure."""
         misplaced = (*self.misplaced, *(m for m in self.suspected if sure(m)))
         return replace(
@@ -85,19 +85,19 @@ class Snooping:
     @property
     def rotation(self) -> float:
         """Scatter of the flange poses without the blunders, rad."""
-        return float(np.sqrt(self.found.fit.variances[0]))
+        return float(np.sqrt(self.blunder_search.fit.variances[0]))
 
     @property
     def translation(self) -> float:
         """The same of translations, length_unit."""
-        return float(np.sqrt(self.found.fit.variances[1]))
+        return float(np.sqrt(self.blunder_search.fit.variances[1]))
 
 
-def snoop(
+def snoop_views(
     capture: Capture,
     T_mount: Array,
     gate: float,
-    freed: FreePoses | None = None,
+    unconstrained: UnconstrainedPoses | None = None,
     usual: UsualEffects | None = None,
 ) -> Snooping:
     """Examine the views of a capture under a hand-eye.
@@ -105,26 +105,32 @@ def snoop(
     Args:
         T_mount: (4, 4) corrected hand-eye.
         gate: distance between partners at which the correction ended, length_unit.
-        freed: the views freed from there, if that is at hand.
+        unconstrained: the views freed from there, if that is at hand.
         usual: what may happen to views beside white scatter; asked only where one stands out, or all from one on.
 
     Raises:
         NoResultError: no two views overlap.
     """
     model_poses = capture.poses(T_mount)
-    freed = free_poses(capture, model_poses, gate) if freed is None else freed.seen_from(model_poses)
-    homes = find_homes(capture, *across_steps(capture, T_mount, freed, usual)).seen_from(model_poses)
-    model = view_model(capture, T_mount, homes.freed)
-    tests = pose_tests(model, homes.freed, (homes.homeless, list(homes.placed)), usual)
-    expected = expected_poses(model, model_poses, homes.freed, tests) if tests.steps else model_poses
-    standing_out = [_sized(capture, model, homes, tests, m) for m in _standing_out(capture, expected, homes, tests)]
+    unconstrained = (
+        unconstrained_poses(capture, model_poses, gate)
+        if unconstrained is None
+        else unconstrained.relative_to(model_poses)
+    )
+    homes = place_views(capture, *place_across_steps(capture, T_mount, unconstrained, usual)).seen_from(model_poses)
+    model = view_model(capture, T_mount, homes.unconstrained)
+    tests = pose_tests(model, homes.unconstrained, (homes.unplaced, list(homes.placed)), usual)
+    expected = expected_poses(model, model_poses, homes.unconstrained, tests) if tests.steps else model_poses
+    standing_out = [
+        _with_lower_bound(capture, model, homes, tests, m) for m in _displaced_views(capture, expected, homes, tests)
+    ]
     # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
-    torn = {v for v in homes.torn if v not in homes.homeless}
+    torn = {v for v in homes.torn if v not in homes.unplaced}
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
-        sure &= _beside_usual(model.with_usual(usual.twists(homes.freed)), tests) | torn
+        sure &= _beyond_usual_effects(model.with_usual(usual.twists(homes.unconstrained)), tests) | torn
     groups = homes.groups
-    foreign = [Misplaced(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.homeless if (v,) in groups]
+    foreign = [MisplacedView(v, "foreign", np.nan, np.nan, 0.0, None) for v in homes.unplaced if (v,) in groups]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
     return Snooping(
         linkage=homes.linkage,
@@ -133,46 +139,54 @@ def snoop(
         steps=tests.steps,
         disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
         model=model,
-        found=tests.found,
-        freed=homes.freed,
+        blunder_search=tests.blunder_search,
+        unconstrained=homes.unconstrained,
         expected=expected,
         tolerance=homes.tolerance,
         needed=homes.needed,
     )
 
 
-def _beside_usual(model: ViewModel, tests: PoseTests) -> set[int]:
+def _beyond_usual_effects(model: ViewModel, tests: PoseTests) -> set[int]:
     """Views that stand out beside what usually happens to all of them too."""
-    again = find_blunders(model, tests.alone, tests.steps)
+    again = find_blunders(model, tests.excluded, tests.steps)
     return {b.view for b in again.blunders} | tests.sure
 
 
-def _standing_out(capture: Capture, expected: Array, homes: Homes, tests: PoseTests) -> list[Misplaced]:
+def _displaced_views(capture: Capture, expected: Array, placed: PlacedViews, tests: PoseTests) -> list[MisplacedView]:
     """Views that stand off and torn ones, with where the surface of the others puts them."""
-    off = sorted((*tests.off, *tests.found.blunders), key=lambda b: b.view)
-    refined = [_refined(capture, homes.freed, b.view, homes.tolerance) for b in off]
-    out = [_misplaced(capture, expected[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
-    known = {b.view for b in off} | set(homes.homeless)
-    return out + [_misplaced(capture, expected[v], homes.freed.poses[v], v, 0.0) for v in homes.torn if v not in known]
+    off = sorted((*tests.displaced, *tests.blunder_search.blunders), key=lambda b: b.view)
+    refined = [_refine_pose(capture, placed.unconstrained, b.view, placed.tolerance) for b in off]
+    out = [_displaced_view(capture, expected[b.view], T, b.view, b.p_value) for b, T in zip(off, refined, strict=True)]
+    known = {b.view for b in off} | set(placed.unplaced)
+    return out + [
+        _displaced_view(capture, expected[v], placed.unconstrained.poses[v], v, 0.0)
+        for v in placed.torn
+        if v not in known
+    ]
 
 
-def _sized(capture: Capture, model: ViewModel, homes: Homes, tests: PoseTests, m: Misplaced) -> Misplaced:
-    others = [v for v in (*tests.alone, *(b.view for b in tests.found.blunders)) if v != m.view]
-    middle = frames.transform(homes.freed.poses[m.view], capture.scans[m.view].points.mean(axis=0)[None])[0]
-    return replace(m, at_least=least_displacement(model, tests.found, others, tests.steps, m.view, middle))
+def _with_lower_bound(
+    capture: Capture, model: ViewModel, placed: PlacedViews, tests: PoseTests, m: MisplacedView
+) -> MisplacedView:
+    others = [v for v in (*tests.excluded, *(b.view for b in tests.blunder_search.blunders)) if v != m.view]
+    middle = frames.transform(placed.unconstrained.poses[m.view], capture.scans[m.view].points.mean(axis=0)[None])[0]
+    return replace(m, at_least=least_displacement(model, tests.blunder_search, others, tests.steps, m.view, middle))
 
 
-def _refined(capture: Capture, freed: FreePoses, view: int, tolerance: float) -> Array:
+def _refine_pose(capture: Capture, unconstrained: UnconstrainedPoses, view: int, tolerance: float) -> Array:
     """(4, 4) where the surface of the other views puts one: robust weights of all pairs hold it back."""
     others = [v for v in range(len(capture.scans)) if v != view]
-    surface = surface_of(capture.scans, freed.poses, others, tolerance)
-    best = place(capture.scans[view], surface, freed.poses[view][None], part_size([capture]))[0]
+    surface = surface_of(capture.scans, unconstrained.poses, others, tolerance)
+    best = place_scan(capture.scans[view], surface, unconstrained.poses[view][None], part_size([capture]))[0]
     return (
-        best.T if best.closure > judge(capture.scans[view], freed.poses[view], surface).closure else freed.poses[view]
+        best.T
+        if best.closure > evaluate_placement(capture.scans[view], unconstrained.poses[view], surface).closure
+        else unconstrained.poses[view]
     )
 
 
-def _misplaced(capture: Capture, T_model: Array, T: Array, view: int, p_value: float) -> Misplaced:
+def _displaced_view(capture: Capture, T_model: Array, T: Array, view: int, p_value: float) -> MisplacedView:
     middle = capture.scans[view].points.mean(axis=0)[None]
     distance = np.linalg.norm(frames.transform(T, middle) - frames.transform(T_model, middle))
-    return Misplaced(view, "displaced", float(frames.angle_between(T_model, T)), float(distance), p_value, T)
+    return MisplacedView(view, "displaced", float(frames.angle_between(T_model, T)), float(distance), p_value, T)

@@ -12,27 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
-from stitch.integrity.step import BOTH, Step, What, likelier_step, step_columns
+from stitch.integrity.step import MOVED_BODIES, MovedBody, PoseStep, likelier_step, step_columns
 from stitch.integrity.view_model import ViewModel, projector
-from stitch.integrity.view_test import beside, test
+from stitch.integrity.view_test import hstack_columns, test_alternative
 
 # That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
 # without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
-CHANCE = 1e-4
+STEP_CHANCE = 1e-4
 # Views from which on all by which poses may err takes minutes to hold against a step.
-MANY_VIEWS = 100
+MAX_VIEWS_WITH_EFFECTS = 100
 
 # Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
-_SIDE, _MOST = 2, 3
+_MIN_VIEWS_AT_END, _MAX_STEPS = 2, 3
 # Fewer views than this show no step beside their scatter.
-_FEWEST = 6
+_MIN_VIEWS_FOR_STEP = 6
 # Less of its columns than this outside the mean is rounding.
-_NEW = 1e-6
+_NEW_COLUMN_SHARE = 1e-6
 
 
 def find_steps(
     model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
-) -> tuple[Step, ...]:
+) -> tuple[PoseStep, ...]:
     """Change points in the order of time, beside single views that are off.
 
     Args:
@@ -41,10 +41,10 @@ def find_steps(
         singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
         chance: that a session without a step shows one.
     """
-    found, columns = _searched(model, first, chance)
+    found, columns = _search_steps(model, first, chance)
     if singles[1]:
-        beside_them, every = _searched(model, singles[0], chance)
-        if not found or _criterion(model, every) < _criterion(model, columns):
+        beside_them, every = _search_steps(model, singles[0], chance)
+        if not found or _akaike_criterion(model, every) < _akaike_criterion(model, columns):
             found = beside_them
     return tuple(sorted(found, key=lambda s: s.start))
 
@@ -56,81 +56,98 @@ class _Pick:
     columns: Array  # (n, 6)
     p_value: float
     tests: int  # of which it is the likeliest
-    starts: dict[What, int] | None = None  # where the step of each begins; None: a single view
+    starts: dict[MovedBody, int] | None = None  # where the step of each begins; None: a single view
 
 
-def _searched(model: ViewModel, first: Array | None, chance: float) -> tuple[list[Step], Array | None]:
+def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
     """Steps on top of columns that are in the mean already, and all columns with them and with single views.
 
     As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
     back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
     """
     picked, significant = list[_Pick](), 0
-    while model.count >= _FEWEST and len(picked) < significant + _MOST and len(_starts(picked)) < _MOST:
-        pick = _next(model, _beside(first, picked), _starts(picked))
+    while (
+        model.count >= _MIN_VIEWS_FOR_STEP
+        and len(picked) < significant + _MAX_STEPS
+        and len(_step_starts(picked)) < _MAX_STEPS
+    ):
+        pick = _next_pick(model, _with_picked_columns(first, picked), _step_starts(picked))
         if pick is None:
             break
         picked.append(pick)
-        p = min(pick.p_value, _together(model, first, picked)) if len(picked) > significant + 1 else pick.p_value
+        p = min(pick.p_value, _joint_p_value(model, first, picked)) if len(picked) > significant + 1 else pick.p_value
         significant = len(picked) if p < chance else significant
     picked = picked[:significant]
     steps = []
     for pick in picked:
         if pick.starts is not None:
-            others = _beside(first, [other for other in picked if other is not pick])
-            steps.append(likelier_step(model, others, pick.starts, _tests(model)))
+            others = _with_picked_columns(first, [other for other in picked if other is not pick])
+            steps.append(likelier_step(model, others, pick.starts, _count_step_tests(model)))
     # What was picked early may stand out no more beside the rest.
-    return [step for step in steps if step.p_value < chance], _beside(first, picked)
+    return [step for step in steps if step.p_value < chance], _with_picked_columns(first, picked)
 
 
-def _together(model: ViewModel, first: Array | None, picked: Sequence[_Pick]) -> float:
+def _joint_p_value(model: ViewModel, first: Array | None, picked: Sequence[_Pick]) -> float:
     """Chance of the last two: each may hide in the scatter that the other makes, and then neither stands out alone."""
     *rest, one, other = picked
-    columns = _beside(first, rest)
-    both = test(projector(model, model.fit(columns), columns), np.column_stack([one.columns, other.columns]))
+    columns = _with_picked_columns(first, rest)
+    both = test_alternative(
+        projector(model, model.fit(columns), columns), np.column_stack([one.columns, other.columns])
+    )
     return both.p_value * one.tests * other.tests
 
 
-def _starts(picked: Sequence[_Pick]) -> list[dict[What, int]]:
+def _step_starts(picked: Sequence[_Pick]) -> list[dict[MovedBody, int]]:
     return [pick.starts for pick in picked if pick.starts is not None]
 
 
-def _beside(first: Array | None, picked: Sequence[_Pick]) -> Array | None:
+def _with_picked_columns(first: Array | None, picked: Sequence[_Pick]) -> Array | None:
     for pick in picked:
-        first = beside(first, pick.columns)
+        first = hstack_columns(first, pick.columns)
     return first
 
 
-def _next(model: ViewModel, columns: Array | None, taken: Sequence[dict[What, int]]) -> _Pick | None:
+def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
     """The likeliest step, or the single view that is off, beside some columns; None where these leave no view."""
     under = projector(model, model.fit(columns), columns)
-    starts = [k for k in range(_SIDE, model.count - _SIDE + 1) if k not in [k for own in taken for k in own.values()]]
-    tests = {(moved, k): test(under, step_columns(model, k, moved)) for moved in BOTH for k in starts}
+    starts = [
+        k
+        for k in range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
+        if k not in [k for own in taken for k in own.values()]
+    ]
+    tests = {
+        (moved, k): test_alternative(under, step_columns(model, k, moved)) for moved in MOVED_BODIES for k in starts
+    }
     mean = model.mixed(columns).A[0]
-    alone = {v: test(under, own) for v, own in enumerate(model.views) if not _held(own, mean)}
+    alone = {v: test_alternative(under, own) for v, own in enumerate(model.views) if not _held_by_mean(own, mean)}
     if not alone:
         return None
     view = min(alone, key=lambda v: (alone[v].p_value, -alone[v].statistic))
     likelier = min(tests, key=lambda at: (tests[at].p_value, -tests[at].statistic))
     if (alone[view].p_value, -alone[view].statistic) < (tests[likelier].p_value, -tests[likelier].statistic):
         return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
-    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in BOTH}
+    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in MOVED_BODIES}
     moved, start = likelier
-    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * _tests(model), _tests(model), best)
+    return _Pick(
+        step_columns(model, start, moved),
+        tests[likelier].p_value * _count_step_tests(model),
+        _count_step_tests(model),
+        best,
+    )
 
 
-def _held(columns: Array, mean: Array) -> bool:
+def _held_by_mean(columns: Array, mean: Array) -> bool:
     """True if columns (n, 6) say nothing that a mean of orthonormal columns (n, K) does not hold."""
     left = columns - mean @ (mean.T @ columns)
-    return bool(np.linalg.norm(left) < _NEW * np.linalg.norm(columns))
+    return bool(np.linalg.norm(left) < _NEW_COLUMN_SHARE * np.linalg.norm(columns))
 
 
-def _tests(model: ViewModel) -> int:
+def _count_step_tests(model: ViewModel) -> int:
     """How many steps are tested."""
-    return len(BOTH) * (model.count - 2 * _SIDE + 1) * _MOST
+    return len(MOVED_BODIES) * (model.count - 2 * _MIN_VIEWS_AT_END + 1) * _MAX_STEPS
 
 
-def _criterion(model: ViewModel, columns: Array | None) -> float:
+def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
     """Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
     count = len(model.z)
     taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])

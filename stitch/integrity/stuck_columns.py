@@ -5,16 +5,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from stitch import frames
-from stitch.integrity.fitted_positions import fitted_positions
+from stitch.integrity.fitted_positions import fit_positions
 from stitch.integrity.hypotheses import Hypothesis
-from stitch.integrity.motion_fit import Explained
+from stitch.integrity.motion_fit import MotionFit
 from stitch.integrity.relative_scans import RelativeScans
 
 # Of the largest span of a column: less is one value.
 _ONE_VALUE = 1e-6
 
 
-def stuck_columns(stated: Explained, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
+def restore_stuck_columns(stated: MotionFit, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
     """The poses with the values of such a column that the motions ask for, if most rows have others.
 
     Args:
@@ -27,7 +27,7 @@ def stuck_columns(stated: Explained, motions: RelativeScans, length: float) -> I
     for axis in np.flatnonzero(span <= _ONE_VALUE * span.max()):
         Q = np.zeros((views, 3, views))
         Q[np.arange(views), axis, np.arange(views)] = 1.0
-        moved = fitted_positions(T[:, :3, :3], (position, Q), h.mount, motions, range(views), R_mount)
+        moved = fit_positions(T[:, :3, :3], (position, Q), h.mount, motions, range(views), R_mount)
         column = moved[:, axis]
         if np.median(np.abs(column - np.median(column))) > length:
             fix = (

@@ -15,13 +15,13 @@ from stitch.units import angle_text, length_text
 
 _VIEWS = 3
 # That poses which repeat as those of arms do are said to disagree.
-_CHANCE = 1e-4
+_THREE_VIEWS_CHANCE = 1e-4
 
 
-def three_views(session: Session, found: Snooping) -> str | None:
+def check_three_views(session: Session, found: Snooping) -> str | None:
     """What to say of three views whose poses disagree by more than arms repeat; None where they do not."""
     rotation, translation = usual_twist(session.length_unit)[[0, 3]]
-    if len(session.views) != _VIEWS or _agree(found, np.array([rotation**2, translation**2, 1.0])):
+    if len(session.views) != _VIEWS or _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
         return None
     unit = session.length_unit
     by = f"{length_text(found.translation, unit, 2)} and {angle_text(found.rotation, 2)}"
@@ -32,10 +32,10 @@ def three_views(session: Session, found: Snooping) -> str | None:
     )
 
 
-def _agree(found: Snooping, variances: Array) -> bool:
+def _global_model_test(found: Snooping, variances: Array) -> bool:
     """The test of the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
     mixed = found.model.mixed()
     C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
     CA, Cz = np.linalg.solve(C, A), np.linalg.solve(C, z)
     statistic = z @ Cz - Cz @ A @ np.linalg.solve(A.T @ CA, A.T @ Cz)
-    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _CHANCE
+    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _THREE_VIEWS_CHANCE

@@ -10,7 +10,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_directions
 from stitch.statistics.least_squares import column_space, summed_squares
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, fit_variances
@@ -19,7 +19,7 @@ from stitch.statistics.variance_components import VarianceFit, fit_variances
 SEEN = 1e-6
 # A direction of one view's displacement is held if surfaces see this share of it. Where a scan slides along the others
 # it is 0.001 and less, and what little is seen is their noise; elsewhere 0.9.
-_HELD = 0.1
+_HELD_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ViewModel:
     def with_errors(self, errors: PoseErrors) -> "ViewModel":
         """The model of poses that may err beside white scatter by twists about the centre, in rad and length."""
         unit = np.array([self.lever] * 3 + [1.0] * 3)
-        return replace(self, errors=errors.reduced((self.views * unit).transpose(1, 0, 2).reshape(len(self.z), -1)))
+        return replace(self, errors=errors.project((self.views * unit).transpose(1, 0, 2).reshape(len(self.z), -1)))
 
     @property
     def count(self) -> int:
@@ -65,10 +65,10 @@ class ViewModel:
         return MixedModel(self.z[None], A, every, usual, further=self.errors.prior)
 
     @cached_property
-    def alone(self) -> Array:
+    def held_responses(self) -> Array:
         """(V, n, 6) as `views`, less the directions in which nothing holds a single view."""
         _, values, vectors = np.linalg.svd(self.views, full_matrices=False)
-        held = vectors * (values**2 > _HELD)[:, :, None]
+        held = vectors * (values**2 > _HELD_SHARE)[:, :, None]
         return np.asarray(self.views @ held.transpose(0, 2, 1) @ vectors)
 
     @cached_property
@@ -85,20 +85,20 @@ class ViewModel:
         """−2 log of the full likelihood of z with further columns in the mean, comparable between means."""
         fit = self.fit(further)
         C = self.mixed(further).covariance(fit.variances)[0]
-        return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).pushed)
+        return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).projected)
 
-    def columns(self, freed: Sequence[int]) -> Array | None:
+    def columns(self, free_views: Sequence[int]) -> Array | None:
         """(n, 6k) that let some views stand anywhere."""
-        return np.concatenate([self.views[v] for v in freed], axis=1) if len(freed) else None
+        return np.concatenate([self.views[v] for v in free_views], axis=1) if len(free_views) else None
 
 
-def view_model(capture: Capture, T_mount: Array, freed: FreePoses) -> ViewModel:
+def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses) -> ViewModel:
     """The evidence of overlaps and targets about the poses of a capture.
 
     Args:
         T_mount: (4, 4) hand-eye of the model poses from which `freed.twists` are counted.
     """
-    g = freed.overlaps.gram
+    g = unconstrained.overlaps.gram
     values, vectors, scale = visible_directions(g)
     left = (vectors.T / scale[None, :]).reshape(len(values), g.views, 6).transpose(1, 0, 2)
     to_centre = frames.make(np.eye(3), -g.centre)
@@ -107,7 +107,7 @@ def view_model(capture: Capture, T_mount: Array, freed: FreePoses) -> ViewModel:
     lever = max(g.lever, 1e-300)
     unit = np.diag([1 / lever] * 3 + [1.0] * 3)
     return ViewModel(
-        z=np.einsum("vni,vi->n", left, freed.twists),
+        z=np.einsum("vni,vi->n", left, unconstrained.twists),
         hand_eye=np.einsum("vni,vij->nj", left, J),
         views=left @ unit,
         carried=np.linalg.inv(unit) @ carried,
@@ -124,7 +124,7 @@ class Projector:
     """P of one null hypothesis: a fitted covariance and a free mean."""
 
     P: Array  # (n, n)
-    pushed: Array  # (n,) P z
+    projected: Array  # (n,) P z
     degrees: int  # n less the columns of the mean
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 _LISTED, _RANGE = 6, 3
 
 
-def listed(names: Sequence[str], order: Sequence[str]) -> str:
+def list_views(names: Sequence[str], order: Sequence[str]) -> str:
     """Some views in words: "v000–v102, v105 … and 97 more".
 
     Args:

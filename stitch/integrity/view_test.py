@@ -16,7 +16,7 @@ from stitch.statistics.tails import f_tail
 
 
 @dataclass(frozen=True)
-class Test:
+class AlternativeTest:
     """One alternative, tested."""
 
     statistic: float  # T
@@ -26,26 +26,26 @@ class Test:
     normal: Array  # (6, 6) N: non-centrality of a displacement δ is δᵀNδ
 
 
-def beside(columns: Array | None, more: Array) -> Array:
+def hstack_columns(columns: Array | None, more: Array) -> Array:
     """(n, ·) columns with more of them, where there are any."""
     return more if columns is None else np.column_stack([columns, more])
 
 
-def test(under: Projector, columns: Array) -> Test:
+def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
     """The alternative with `columns` (n, 6) under a null hypothesis."""
-    N, u = columns.T @ under.P @ columns, columns.T @ under.pushed
-    inverse, degrees = _inverse(N)
+    N, u = columns.T @ under.P @ columns, columns.T @ under.projected
+    inverse, degrees = _pseudo_inverse(N)
     statistic = float(u @ inverse @ u)
     nu = under.degrees - degrees
     if degrees == 0 or nu < 1:
-        return Test(0.0, degrees, 1.0, np.zeros(len(N)), N)
+        return AlternativeTest(0.0, degrees, 1.0, np.zeros(len(N)), N)
     # The scatter is estimated with the view in it: T/ν is a beta variable, told as the F of the left-out estimate.
     rest = max(under.degrees - statistic, 1e-9 * under.degrees)
     p = f_tail(statistic / degrees / (rest / nu), degrees, nu)
-    return Test(statistic, degrees, p, inverse @ u, N)
+    return AlternativeTest(statistic, degrees, p, inverse @ u, N)
 
 
-def _inverse(N: Array) -> tuple[Array, int]:
+def _pseudo_inverse(N: Array) -> tuple[Array, int]:
     """Pseudo-inverse and rank of a symmetric matrix whose units may differ."""
     scale = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))

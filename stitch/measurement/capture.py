@@ -9,7 +9,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import GRAZING_COSINE, Scan, prepare_view
+from stitch.measurement.scan import GRAZING_COSINE, Scan, prepare_scan
 from stitch.measurement.session import Scanner, Session, View
 from stitch.measurement.sightings import Sightings, sightings_of
 from stitch.system.threads import parallel
@@ -34,16 +34,16 @@ class Capture:
     noise_factor: float = 1.0
 
     @property
-    def shown(self) -> list[Array]:
+    def visible_points(self) -> list[Array]:
         """Per view the points (N, 3) that it shows, scanner frame: of its scan, or its labelled ones; maybe none."""
         if self.scans or self.sightings is None:
             return [scan.points for scan in self.scans]
-        return self.sightings.sets()
+        return self.sightings.points_by_view()
 
     @property
     def point_sets(self) -> list[Array]:
         """The same, (N, 3) each, of the views that show any."""
-        return [points for points in self.shown if len(points)]
+        return [points for points in self.visible_points if len(points)]
 
     @property
     def spacing(self) -> float:
@@ -72,7 +72,7 @@ class Capture:
         )
 
 
-def capture(session: Session) -> Capture:
+def prepare_capture(session: Session) -> Capture:
     """Prepare the scans and labelled points of a session and place them on the chain of frames.
 
     Raises:
@@ -80,24 +80,24 @@ def capture(session: Session) -> Capture:
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    prepared = partial(_prepared, scanner=session.scanner)
+    prepared = partial(_prepare_scan, scanner=session.scanner)
     scans = tuple(parallel(prepared, session.views, "preparing scans")) if session.has_clouds else ()
     if scans and not any((scan.confidence > GRAZING_COSINE).any() for scan in scans):
         raise InputError(
             f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
             "surface; to fix: clouds swept over the part, or, of profiles of one sphere, stitch calibrate sphere"
         )
-    return place(session.name, scans, T_base_flange, session.mount, sightings_of(session))
+    return build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session))
 
 
-def _prepared(view: View, scanner: Scanner) -> Scan:
+def _prepare_scan(view: View, scanner: Scanner) -> Scan:
     assert view.cloud is not None
     if view.cloud.whole is not None:
         return view.cloud.whole.scan
-    return prepare_view(view.name, view.cloud.points, eye=scanner.eye(view.cloud.points))
+    return prepare_scan(view.name, view.cloud.points, eye=scanner.eye(view.cloud.points))
 
 
-def place(
+def build_capture(
     name: str, scans: Sequence[Scan], T_base_flange: Array, mount: str, sightings: Sightings | None = None
 ) -> Capture:
     """A capture from scans, labelled points and flange poses (V, 4, 4)."""

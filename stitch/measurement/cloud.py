@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.bounding_box import box_of
+from stitch.measurement.bounding_box import bounding_box
 from stitch.measurement.scan import Scan
 
 
@@ -36,7 +36,7 @@ class Cloud:
 class WholeCloud:
     """All points of a scan of which a cloud holds some; they stay where they are, mostly in a file."""
 
-    again: Callable[[], Cloud]  # reads them
+    reload: Callable[[], Cloud]  # reads them
     count: int
     box: Array  # (2, 3) its lowest and highest corner, scanner frame
     scan: Scan  # the points that the cloud holds, with the surface of all of them
@@ -47,7 +47,7 @@ class WholeCloud:
         Raises:
             InputError: the file is not what it was.
         """
-        cloud = self.again()
-        if len(cloud.points) != self.count or not np.array_equal(box_of(cloud.points), self.box):
+        cloud = self.reload()
+        if len(cloud.points) != self.count or not np.array_equal(bounding_box(cloud.points), self.box):
             raise InputError(f"the scan of view {self.scan.name} changed on disk during the run; to fix: run again")
         return cloud

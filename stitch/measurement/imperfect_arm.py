@@ -41,7 +41,7 @@ class FlangeSlopes:
         return np.asarray(np.einsum("vki,vi->vk", self.joints, joints) + self.scale * links.scale[:, None] + rows)
 
 
-def right_links(count: int, joints: int) -> Links:
+def exact_links(count: int, joints: int) -> Links:
     """Those of an arm without any error, for `count` views."""
     return Links(np.ones(count), *np.zeros((3, joints)))
 

@@ -17,7 +17,7 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class Nominal:
+class NominalTargets:
     """Where targets.csv puts the targets, part frame."""
 
     targets: tuple[str, ...]  # T

@@ -20,7 +20,7 @@ from stitch.measurement.session import Mount, SensorKind, Session
 from stitch.measurement.views import ScanView, Views, views_of
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
-SMALLEST_COSINE = 0.1
+MIN_COSINE = 0.1
 # Cosine of the angle from the axis beyond which no lens shows anything that measures, 75°.
 _WIDEST = 0.26
 # Points of a view that say where a sensor looks.
@@ -102,7 +102,7 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     like = [ScanView(v, views, np.zeros(0), intensity[v], gravity=down[v], size=size) for v in range(views.count)]
     scan_views = [
-        replace(like[v], cosine=np.maximum(scan.confidence, SMALLEST_COSINE), eye=scan.eye)
+        replace(like[v], cosine=np.maximum(scan.confidence, MIN_COSINE), eye=scan.eye)
         for v, scan in enumerate(capture.scans)
     ]
     target_views: list[ScanView] = []
@@ -134,14 +134,14 @@ def downwards(robot: Robot | None, T_base_flange: Array, eye_to_hand: bool) -> A
     return np.asarray(frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0])
 
 
-def about_part(measurement: Measurement, T_mount: Array) -> Measurement:
+def with_part_origin(measurement: Measurement, T_mount: Array) -> Measurement:
     """The measurement with the origin about which a part grows; a coarse hand-eye is enough.
 
     On the flange that is the flange, which holds it; in the cell it is the middle of what the views show.
     """
     if measurement.eye_to_hand:
         return measurement
-    views = zip(measurement.capture.poses(T_mount), measurement.capture.shown, strict=True)
+    views = zip(measurement.capture.poses(T_mount), measurement.capture.visible_points, strict=True)
     origin = np.mean([frames.transform(T, points).mean(axis=0) for T, points in views if len(points)], axis=0)
     scan_views, target_views = (
         tuple(replace(v, origin=origin) for v in w) for w in (measurement.scan_views, measurement.target_views)

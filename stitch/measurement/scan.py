@@ -49,7 +49,7 @@ def rays_to(points: Array, eye: Array) -> Array:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
 
 
-def prepare_view(name: str, points: Array, picked: Indices | None = None, eye: Array | None = None) -> Scan:
+def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: Array | None = None) -> Scan:
     """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan.
 
     Args:
@@ -64,7 +64,7 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None, eye: A
     around = points[index]
     centroid = around.mean(axis=1)
     radius = distance[:, -1]
-    normals, variation = _planes(around - centroid[:, None])
+    normals, variation = _fit_planes(around - centroid[:, None])
     eye = np.zeros(3) if eye is None else eye
     cosine = np.einsum("ij,ij->i", normals, rays_to(own, eye))
     normals *= -np.sign(cosine)[:, None]
@@ -74,11 +74,11 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None, eye: A
     usable &= variation < _CREASE_VARIATION
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)
-    noise = _noise(points, own[smooth], normals[smooth], tree)
+    noise = _estimate_noise(points, own[smooth], normals[smooth], tree)
     spacing = scanned_spacing = float(np.median(distance[:, 1]))
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
-        spacing = _spacing(own, tree)
+        spacing = _estimate_spacing(own, tree)
     area = np.pi * radius**2 / neighbours * (len(points) / len(own))
     return Scan(
         name=name,
@@ -95,11 +95,11 @@ def prepare_view(name: str, points: Array, picked: Indices | None = None, eye: A
     )
 
 
-def sparse(scan: Scan, at_most: int) -> Scan:
+def subsample(scan: Scan, at_most: int) -> Scan:
     """The scan with at most `at_most` of its points, evenly over the scan order, and a tree over those alone."""
     if len(scan.points) <= at_most:
         return scan
-    picked = evenly(len(scan.points), at_most)
+    picked = even_indices(len(scan.points), at_most)
     points = np.ascontiguousarray(scan.points[picked])
     tree = KDTree(points, leafsize=16)
     return replace(
@@ -110,28 +110,28 @@ def sparse(scan: Scan, at_most: int) -> Scan:
         area=scan.area[picked] * (len(scan.points) / at_most),
         confidence=scan.confidence[picked],
         tree=tree,
-        spacing=_spacing(points, tree),
+        spacing=_estimate_spacing(points, tree),
     )
 
 
-def evenly(count: int, at_most: int) -> Indices:
+def even_indices(count: int, at_most: int) -> Indices:
     """(n,) at most `at_most` of `count` indices, evenly from the first to the last."""
     return np.linspace(0, count - 1, min(count, at_most)).astype(np.int64)
 
 
-def _spacing(points: Array, tree: Any) -> float:
+def _estimate_spacing(points: Array, tree: Any) -> float:
     distance, _ = tree.query(points, k=2)
     return float(np.median(distance[:, 1]))
 
 
-def _planes(centred: Array) -> tuple[Array, Array]:
+def _fit_planes(centred: Array) -> tuple[Array, Array]:
     """Normals (N, 3) and surface variation (N,) of neighbourhoods (N, k, 3) about their centroid."""
     covariance = np.matmul(centred.transpose(0, 2, 1), centred)
     values, vectors = np.linalg.eigh(covariance)
     return np.ascontiguousarray(vectors[:, :, 0]), values[:, 0] / np.maximum(values.sum(axis=1), 1e-300)
 
 
-def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
+def _estimate_noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
     """1-sigma of the points across a local quadric: median over neighbourhoods of some of `own` in `points`.
 
     A plane would count curvature as noise. White noise only: an error that is smooth over the
@@ -140,7 +140,7 @@ def _noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
     count = min(_QUADRIC_NEIGHBOURS, len(points))
     if count <= 8:
         return float("nan")
-    centre = evenly(len(own), _NOISE_SAMPLES)
+    centre = even_indices(len(own), _NOISE_SAMPLES)
     _, index = tree.query(own[centre], k=count)
     local = points[index] - own[centre][:, None]
     n = normals[centre]

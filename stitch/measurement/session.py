@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
-from stitch.measurement.labelled_points import Nominal, Sighting
+from stitch.measurement.labelled_points import NominalTargets, Sighting
 from stitch.measurement.robot import Robot
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
@@ -86,7 +86,7 @@ class Session:
     cad_unit: str | None
     views: tuple[View, ...]
     warnings: tuple[str, ...] = field(default=())
-    nominal: Nominal | None = None  # targets in the part frame
+    nominal: NominalTargets | None = None  # targets in the part frame
     repeatability: StatedRepeatability = field(default_factory=StatedRepeatability)
 
     @property

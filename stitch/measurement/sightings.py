@@ -28,16 +28,16 @@ class Sightings:
     sigma_rotation: Array | None = None  # (V,)
 
     @property
-    def seen(self) -> Indices:
+    def view_counts(self) -> Indices:
         """(K,) number of views that use each target."""
         return np.asarray(np.bincount(self.target[self.used], minlength=len(self.targets)), np.int64)
 
     @property
-    def everything(self) -> "Sightings":
+    def with_outliers(self) -> "Sightings":
         """The same with the outliers back in."""
         return replace(self, used=self.target >= 0)
 
-    def sets(self) -> list[Array]:
+    def points_by_view(self) -> list[Array]:
         """Per view the points in use, (k, 3); none where it shows nothing."""
         return [points[used] for points, used in zip(self.points, self.used, strict=True)]
 

@@ -35,14 +35,14 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
     if payload is None and robot.has_masses:
         return _each_joint(kinematics.gravity_torques(robot, joints))
     if payload is None and not robot.payload_mass:
-        return _by_link(robot, joints)
+        return _unit_link_torques(robot, joints)
     payload = np.full(len(joints), robot.payload_mass) if payload is None else payload
     carried = payload[:, None] * kinematics.payload_torques(robot, joints)
     if robot.has_masses:
         return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
     # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
-    links = _by_link(robot, joints)
-    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _everywhere(robot)), axis=0) > STILL)
+    links = _unit_link_torques(robot, joints)
+    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _sample_joints(robot)), axis=0) > STILL)
     names = (*links.names, *(str(i + 1) for i in bent))
     return Torques(names, (*links.joint, *(int(i) for i in bent)), np.hstack([links.values, carried[:, bent]]))
 
@@ -81,22 +81,22 @@ def _each_joint(values: Array) -> Torques:
     return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
 
 
-def _everywhere(robot: Robot) -> Array:
+def _sample_joints(robot: Robot) -> Array:
     """(N, n) joint angles from everywhere: a coefficient must mean the same in every session of an arm."""
     return np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, robot.n_joints))
 
 
-def _by_link(robot: Robot, joints: Array) -> Torques:
+def _unit_link_torques(robot: Robot, joints: Array) -> Torques:
     """Of 1 kg at each link's frame, as far as they differ: without masses the geometry gives their shapes alone."""
     n = robot.n_joints
-    shapes = kinematics.unit_torques(robot, _everywhere(robot))
-    keep = [(i, k) for i in range(n) for k in _different(shapes[:, i], range(i, n))]
+    shapes = kinematics.unit_torques(robot, _sample_joints(robot))
+    keep = [(i, k) for i in range(n) for k in _independent_links(shapes[:, i], range(i, n))]
     unit = kinematics.unit_torques(robot, joints)
     values = np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep))
     return Torques(tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep), values)
 
 
-def _different(torques: Array, links: Sequence[int]) -> list[int]:
+def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
     """The links whose unit torque (V, n) about one joint changes and is no combination of those before it.
 
     Frames of a wrist share their origin: a second torque from the same place would only make both unknown.

@@ -2,20 +2,20 @@
 
 from dataclasses import replace
 
-from stitch.effects.in_session import known
+from stitch.effects.in_session import find_effect
 from stitch.errors import InputError
 from stitch.model.model_toml import ModelFile
 
-ARM = ("robot", "links")  # where the effects of an arm stand in the chain
+ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain
 
 
-def kept_arm(file: ModelFile) -> ModelFile:
+def keep_arm_effects(file: ModelFile) -> ModelFile:
     """The model with nothing but the effects of its arm, all of them kept.
 
     Raises:
         InputError: an effect that is not known, or none of the arm.
     """
-    found = arm_in(file)
+    found = arm_model(file)
     if found is None:
         used = ", ".join(file.effects) or "none"
         raise InputError(
@@ -25,7 +25,7 @@ def kept_arm(file: ModelFile) -> ModelFile:
     return found
 
 
-def arm_in(file: ModelFile) -> ModelFile | None:
+def arm_model(file: ModelFile) -> ModelFile | None:
     """The same; None without an effect of the arm.
 
     Raises:
@@ -34,6 +34,6 @@ def arm_in(file: ModelFile) -> ModelFile | None:
     effects = {
         name: {key: replace(p, kept=True) for key, p in own.items()}
         for name, own in file.effects.items()
-        if known(name).place in ARM
+        if find_effect(name).place in ARM_PLACES
     }
     return replace(file, effects=effects, targets={}) if effects else None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.effects.contract import Effect, Parameter
-from stitch.effects.in_session import known, parameters_in, require
+from stitch.effects.in_session import find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Target
@@ -14,7 +14,7 @@ from stitch.model.term import Term
 from stitch.units import METRES
 
 
-def bound(file: ModelFile, measurement: Measurement) -> Model:
+def bind_to_session(file: ModelFile, measurement: Measurement) -> Model:
     """The model of a file in a session; a parameter that the file does not name is held at zero.
 
     Raises:
@@ -23,8 +23,8 @@ def bound(file: ModelFile, measurement: Measurement) -> Model:
     """
     terms = []
     for name, stated in file.effects.items():
-        effect = known(name)
-        require(measurement, effect)
+        effect = find_effect(name)
+        require_available(measurement, effect)
         own = parameters_in(measurement, effect)
         _require_same(measurement, effect, stated, {p.name: p.unit for p in own})
         filled = [
@@ -54,7 +54,7 @@ def _require_same(
             )
 
 
-def in_unit(file: ModelFile, length_unit: str) -> ModelFile:
+def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
     """The model with lengths in another unit."""
     if file.length_unit == length_unit:
         return file

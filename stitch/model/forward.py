@@ -9,7 +9,7 @@ from pykdtree.kdtree import KDTree
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
-from stitch.measurement.imperfect_arm import Links, forward_with_errors, right_links
+from stitch.measurement.imperfect_arm import Links, exact_links, forward_with_errors
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import forward
 from stitch.measurement.scan import Scan
@@ -28,15 +28,15 @@ class ChainErrors:
     part: Array  # (V, 6) twist of the part in the reference frame
 
 
-def chain_errors(measurement: Measurement, terms: Sequence[Term], beside: ChainErrors | None = None) -> ChainErrors:
+def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
     """Collect what some effects do to the chain of frames, beside what others have done already."""
     views = measurement.views
-    if beside is None:
-        right = right_links(*views.joints.shape)
-        beside = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
-    joints, mount, part = beside.joints, beside.mount, beside.part
+    if base is None:
+        right = exact_links(*views.joints.shape)
+        base = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
+    joints, mount, part = base.joints, base.mount, base.part
     # A user's own effect may change the links that it is given in place.
-    links = Links(*(own.copy() for own in vars(beside.links).values()))
+    links = Links(*(own.copy() for own in vars(base.links).values()))
     for term in terms:
         function, arguments = term.effect.function, term.arguments
         # The function adds to what it is given; what it reads of the pose are the reported angles.
@@ -68,24 +68,26 @@ def moves_arm(term: Term) -> bool:
     return term.effect.place in ("robot", "links")
 
 
-def shift(measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice) -> Array:
+def scan_correction(
+    measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice
+) -> Array:
     """(N, 3) what must be added to the scanned points of view v, scanner frame, to undo sensor and part effects.
 
     Args:
         pose: (4, 4) T_reference_scanner of the view.
     """
-    points, view = seen_points(measurement, v, index)
-    return undone(terms, points, view, pose)
+    points, view = scan_points(measurement, v, index)
+    return point_correction(terms, points, view, pose)
 
 
-def seen_points(measurement: Measurement, v: int, index: Indices | slice) -> tuple[Array, ScanView]:
+def scan_points(measurement: Measurement, v: int, index: Indices | slice) -> tuple[Array, ScanView]:
     """Some points (N, 3) of view v, scanner frame, and what effects may know of them."""
     view = measurement.scan_views[v]
     intensity = None if view.intensity is None else view.intensity[index]
     return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
-def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:
+def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:
     """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects.
 
     Args:
@@ -104,7 +106,7 @@ def undone(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, st
     return np.asarray(true - points)
 
 
-def shift_targets(measurement: Measurement, terms: Sequence[Term], poses: Array) -> Array:
+def target_correction(measurement: Measurement, terms: Sequence[Term], poses: Array) -> Array:
     """(V, S, 3) the same as `shift` for the labelled points of all views; zero in empty slots."""
     sightings = measurement.capture.sightings
     assert sightings is not None
@@ -115,7 +117,7 @@ def shift_targets(measurement: Measurement, terms: Sequence[Term], poses: Array)
     filled = np.where((sightings.target >= 0)[..., None], sightings.points, first[:, None])
     blank = ~(sightings.target >= 0).any(axis=1)
     filled[blank] = filled[~blank].mean(axis=0)
-    moved = [undone(terms, filled[v], view, poses[v]) for v, view in enumerate(measurement.target_views)]
+    moved = [point_correction(terms, filled[v], view, poses[v]) for v, view in enumerate(measurement.target_views)]
     return np.where((sightings.target >= 0)[..., None], np.array(moved), 0.0)
 
 
@@ -124,25 +126,25 @@ def moves_points(terms: Sequence[Term]) -> bool:
     return any(term.effect.place in ("sensor", "shape") for term in terms)
 
 
-def placed(measurement: Measurement, model: Model) -> tuple[Array, list[Array]]:
+def true_geometry(measurement: Measurement, model: Model) -> tuple[Array, list[Array]]:
     """Poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
     capture, points = _without_motion(measurement, model.terms), [scan.points for scan in measurement.capture.scans]
     poses, every = capture.poses(model.T_mount), slice(None)
     if moves_points(model.terms):
-        points = [p + shift(measurement, model.terms, v, poses[v], every) for v, p in enumerate(points)]
+        points = [p + scan_correction(measurement, model.terms, v, poses[v], every) for v, p in enumerate(points)]
     return poses, points
 
 
-def corrected(measurement: Measurement, model: Model) -> Capture:
+def corrected_capture(measurement: Measurement, model: Model) -> Capture:
     """The capture as it would be without the effects of the model."""
     terms = model.terms
     capture = _without_motion(measurement, terms)
     if moves_points(terms):
-        poses, points = placed(measurement, model)
-        scans = [_moved(scan, p) for scan, p in zip(capture.scans, points, strict=True)]
+        poses, points = true_geometry(measurement, model)
+        scans = [_with_points(scan, p) for scan, p in zip(capture.scans, points, strict=True)]
         capture = replace(capture, scans=tuple(scans))
         if capture.sightings is not None:
-            shown = capture.sightings.points + shift_targets(measurement, terms, poses)
+            shown = capture.sightings.points + target_correction(measurement, terms, poses)
             capture = replace(capture, sightings=replace(capture.sightings, points=shown))
     return capture
 
@@ -153,6 +155,6 @@ def _without_motion(measurement: Measurement, terms: Sequence[Term]) -> Capture:
     return replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
 
 
-def _moved(scan: Scan, points: Array) -> Scan:
+def _with_points(scan: Scan, points: Array) -> Scan:
     """Points moved by micrometres: normals, edges and spacing stay, the tree must follow."""
     return replace(scan, points=points, tree=KDTree(points, leafsize=16))

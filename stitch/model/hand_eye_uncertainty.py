@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.units import METRES, known_text
+from stitch.units import METRES, value_uncertainty_text
 
 # Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
 COVERAGE_FACTOR = 2.0
@@ -45,7 +45,7 @@ def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covari
     return np.asarray(np.transpose(J) @ covariance @ np.array(J))
 
 
-def expanded(T_mount: Array, covariance: Array) -> Array:
+def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
     """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
     return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
 
@@ -55,9 +55,9 @@ def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: s
     frame = "base" if mount == "eye_to_hand" else "flange"
     to_mm = METRES[length_unit] * 1e3
     rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
-    U = expanded(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+    U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
     position, turn = (
-        ", ".join(f"{axis} {known_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        ", ".join(f"{axis} {value_uncertainty_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
         for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
     )
     return [
@@ -67,7 +67,7 @@ def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: s
     ]
 
 
-def stands_for(verdict: str | None) -> str:
+def uncertainty_scope(verdict: str | None) -> str:
     """Of which model U is: a sigma counts no effect that is missing.
 
     Args:

@@ -19,7 +19,7 @@ from stitch.model.term import Term
 STEP, _STEP_GRIDDED = 0.1, 0.005
 
 
-def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
+def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
     """Per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
 
     About the model with the term in place of its own, or added at its values. Differences are taken of what an effect
@@ -31,23 +31,25 @@ def twists(measurement: Measurement, model: Model, terms: Sequence[Term], centre
         others = chain_errors(measurement, model.without(term.name).terms)
         errors = chain_errors(measurement, [term], others)
         if chain is None or not chain.is_about(errors):
-            chain = _Chain(measurement, about, errors, centre)
-        moved = [_slope(measurement, others, term, i, chain) for i in range(len(term.parameters))]
+            chain = _ChainJacobian(measurement, about, errors, centre)
+        moved = [_pose_derivative(measurement, others, term, i, chain) for i in range(len(term.parameters))]
         yield np.array(moved).reshape(len(moved), measurement.views.count, 6)
 
 
-def _slope(measurement: Measurement, others: ChainErrors, term: Term, i: int, chain: "_Chain") -> Array:
+def _pose_derivative(
+    measurement: Measurement, others: ChainErrors, term: Term, i: int, chain: "_ChainJacobian"
+) -> Array:
     """(V, 6) of one parameter beside what all other terms do."""
     parameter = term.parameters[i]
     if parameter.discrete:
         return np.zeros((measurement.views.count, 6))
     size = (_STEP_GRIDDED if parameter.grid else STEP) * parameter.typical
-    up, down = (chain_errors(measurement, [t], others) for t in stepped(term, i, size))
+    up, down = (chain_errors(measurement, [t], others) for t in step_parameter(term, i, size))
     return chain.twists(up, down, moves_arm(term)) / (2 * size)
 
 
 @dataclass(frozen=True)
-class _Chain:
+class _ChainJacobian:
     """How the views answer to small errors of the chain of frames, about those of a model."""
 
     measurement: Measurement
@@ -63,8 +65,10 @@ class _Chain:
         """(V, 6) left twists of the views between two errors near these."""
         if of_arm and self.measurement.robot is not None:
             links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
-            return _applied(self.of_flange, self.flange.twists(up.joints - down.joints, Links(**links)))
-        return _applied(self.of_mount, up.mount - down.mount) + _applied(self.of_part, up.part - down.part)
+            return _apply_matrices(self.of_flange, self.flange.twists(up.joints - down.joints, Links(**links)))
+        return _apply_matrices(self.of_mount, up.mount - down.mount) + _apply_matrices(
+            self.of_part, up.part - down.part
+        )
 
     @cached_property
     def flange(self) -> FlangeSlopes:
@@ -101,12 +105,12 @@ class _Chain:
         return frames.make(np.eye(3), -self.centre)
 
 
-def _applied(matrix: Array, vectors: Array) -> Array:
+def _apply_matrices(matrix: Array, vectors: Array) -> Array:
     """(V, 6) of (V, 6, 6) and (V, 6)."""
     return np.asarray((matrix @ vectors[..., None])[..., 0])
 
 
-def stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:
+def step_parameter(term: Term, i: int, size: float) -> tuple[Term, Term]:
     """The term with parameter i larger and smaller by a step."""
     step = size * np.eye(len(term.parameters))[i]
     return term.at(term.values + step), term.at(term.values - step)

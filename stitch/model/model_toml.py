@@ -12,7 +12,7 @@ from stitch.errors import InputError
 from stitch.frames import Array, is_rigid
 from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.model import Target
-from stitch.reading.toml_file import choice, read_toml, text
+from stitch.reading.toml_file import optional_text, read_toml, table_choice
 from stitch.units import METRES
 
 FORMAT = "stitch-model/1"
@@ -90,13 +90,13 @@ def read_model(path: Path | str) -> ModelFile:
             raise InputError(f"{path}: hand_eye.{name} is not a rigid motion; its 3x3 part must be a rotation")
     covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
     return ModelFile(
-        length_unit=choice(path, document, "length_unit", tuple(METRES)),
+        length_unit=table_choice(path, document, "length_unit", tuple(METRES)),
         mount=str(document.get("mount")),
         T_mount=corrected,
         T_mount_coarse=coarse,
         covariance=covariance,
         effects=_effects(path, document.get("effects", {})),
-        effects_file=text(path, document, "", "effects_file"),
+        effects_file=optional_text(path, document, "", "effects_file"),
         targets=_targets(path, document.get("targets", {})),
     )
 

@@ -63,29 +63,29 @@ def term_of(measurement: Measurement, effect: Effect) -> Term:
     return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in found))
 
 
-def stacked(terms: Sequence[Term]) -> tuple[Parameter, ...]:
+def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:
     """All parameters of all terms in one row."""
     return tuple(p for term in terms for p in term.parameters)
 
 
 def values_of(terms: Sequence[Term]) -> Array:
     """(P,) values of all parameters of all terms, each in its unit."""
-    return np.array([p.value for p in stacked(terms)], float)
+    return np.array([p.value for p in stack_parameters(terms)], float)
 
 
 def sizes_of(terms: Sequence[Term]) -> Array:
     """(P,) plausible sizes of the same."""
-    return np.array([p.typical for p in stacked(terms)], float)
+    return np.array([p.typical for p in stack_parameters(terms)], float)
 
 
 def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
     """(P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
-    out = np.array([p.sigma if p.kept else np.nan for p in stacked(terms)], float)
+    out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
     out[fitted] = sigmas
     return out
 
 
-def split(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
+def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
     """The terms with values (P,), and sigmas (P,), of all their parameters in one row."""
     out, at = [], 0
     for term in terms:

@@ -20,13 +20,13 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.term import Term
 from stitch.observations.error_model import ErrorModel
-from stitch.observations.response import PointSums, Prior, Response
+from stitch.observations.response import CoefficientPrior, PointSums, Response
 from stitch.statistics.folds import JointEnd
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.variance_components import fit_variances
 
 
-class Trial(Protocol):
+class LinearTrial(Protocol):
     """A model with some columns, in the linear approximation."""
 
     def solve(self, left_out: Indices | None = None) -> Array:
@@ -54,7 +54,7 @@ class Observation(Protocol):
         """(3,) about which twists of the views count, reference frame."""
         ...
 
-    def by_twists(self, moved: Array) -> Array:
+    def from_twists(self, moved: Array) -> Array:
         """(n, P) numbers of the channel of left twists (6V, P) of the views."""
         ...
 
@@ -71,12 +71,16 @@ class Observation(Protocol):
         ...
 
     def trial(
-        self, linear: "LinearModel", response: Array, points: PointSums | None = None, prior: Prior | None = None
-    ) -> Trial:
+        self,
+        linear: "LinearModel",
+        response: Array,
+        points: PointSums | None = None,
+        prior: CoefficientPrior | None = None,
+    ) -> LinearTrial:
         """A model with the columns of a response (·, k); `points` belong to its last ones; prior of k coefficients."""
         ...
 
-    def touched(self, views: Indices) -> Mask:
+    def affected_squares(self, views: Indices) -> Mask:
         """(units,) which squares of a trial some views have a part in."""
         ...
 
@@ -84,11 +88,11 @@ class Observation(Protocol):
         """Groups of views to leave out."""
         ...
 
-    def ends(self, joints: Array) -> list[JointEnd]:
+    def joint_ends(self, joints: Array) -> list[JointEnd]:
         """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
         ...
 
-    def at_part(self, numbers: Array) -> Array:
+    def part_displacements(self, numbers: Array) -> Array:
         """(V, 3) what numbers (n,) of the channel displace at the part, reference frame, without a common motion."""
         ...
 
@@ -146,24 +150,26 @@ class LinearModel(ErrorModel):
         mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
         design = np.hstack([self.design, self.observation.expand(columns)])
         own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
-        out = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, whole=None)
+        out = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
         if self.pose_errors is None:
             return replace(out, null=fit_variances(mixed, start=(near or self).null.variances))
-        return out.refitted()
+        return out.refit()
 
-    def trial(self, response: Array, points: PointSums | None = None, prior: Prior | None = None) -> Trial:
+    def trial(
+        self, response: Array, points: PointSums | None = None, prior: CoefficientPrior | None = None
+    ) -> LinearTrial:
         """A model with the columns of a response (·, k)."""
         return self.observation.trial(self, response, points, prior)
 
     @cached_property
-    def present(self) -> Trial:
+    def baseline_trial(self) -> LinearTrial:
         """The model as it is."""
         return self.trial(self.design)
 
-    def displaced(self) -> Array:
+    def view_displacements(self) -> Array:
         """(V, 3) how far every view sits from where the model puts it, at the part, reference frame."""
-        explained = self.reduce((self.design @ self.present.solve())[:, None])[:, 0]
-        return self.observation.at_part(self.mixed.z.ravel() - explained)
+        explained = self.reduce((self.design @ self.baseline_trial.solve())[:, None])[:, 0]
+        return self.observation.part_displacements(self.mixed.z.ravel() - explained)
 
     def __repr__(self) -> str:
         return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"

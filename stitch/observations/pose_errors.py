@@ -22,26 +22,37 @@ from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
-from stitch.observations.arm_errors import ANEW, FAMILY, JOINT_SCATTER, arm_effects, columns_of, families
-from stitch.observations.flange_errors import WANDERING, along_axes, flange_twists, near_in_time
+from stitch.observations.arm_errors import (
+    EFFECT_FAMILY,
+    JOINT_SCATTER,
+    USUAL_JOINT_SCATTER,
+    arm_effects,
+    effect_twists,
+    group_by_family,
+)
+from stitch.observations.flange_errors import DRIFT_MEMORY, drift_kernel, flange_twists, mean_square_per_axis
 from stitch.observations.joint_processes import joint_processes
-from stitch.statistics.kernels import SmoothErrors, alike_in_joints, same_stop, spread_over
-from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
+from stitch.statistics.kernels import SmoothErrors, process_covariance, rbf_joints, same_stop
+from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
-_ARM, SMOOTH = 0.1, 0.03
+_ARM_SCALE, SMOOTH_SCALE = 0.1, 0.03
 # What the scans of a stop share.
-STOPS = ("stop rotation", "stop translation")
+STOP_COMPONENTS = ("stop rotation", "stop translation")
 # Dense matrices of more views take minutes; there the scatter alone must do.
 _MOST_VIEWS = 150
-_CONSTANT = ("joint_offset", "link_geometry")
+_CONSTANT_EFFECTS = ("joint_offset", "link_geometry")
 
 
 def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
-    arm = ("joint_offset", "link_geometry", "joint_compliance", *FAMILY.values())
-    return dict.fromkeys(arm, _ARM**2) | {"smooth": SMOOTH**2} | dict.fromkeys(WANDERING, 1 / len(WANDERING))
+    arm = ("joint_offset", "link_geometry", "joint_compliance", *EFFECT_FAMILY.values())
+    return (
+        dict.fromkeys(arm, _ARM_SCALE**2)
+        | {"smooth": SMOOTH_SCALE**2}
+        | dict.fromkeys(DRIFT_MEMORY, 1 / len(DRIFT_MEMORY))
+    )
 
 
 @dataclass(frozen=True)
@@ -53,26 +64,28 @@ class PoseErrors:
     scales: Array  # (c,) that their σ usually has
     effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
     # What each joint alone may do without a name, by what it follows: in none of the components.
-    of_one_joint: dict[str, SmoothErrors] = field(default_factory=dict)
+    joint_processes: dict[str, SmoothErrors] = field(default_factory=dict)
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
-    by_joints: Array = field(default_factory=lambda: np.zeros(2))
+    flange_per_joint: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
-    def of_arm(self) -> Mask:
+    def arm_components(self) -> Mask:
         """(c,) what joints and links do again: on a good arm all of it is small."""
-        return np.array([name not in (*WANDERING, *STOPS, JOINT_SCATTER) for name in self.names], bool)
+        return np.array([name not in (*DRIFT_MEMORY, *STOP_COMPONENTS, JOINT_SCATTER) for name in self.names], bool)
 
     @property
     def prior(self) -> FurtherPrior:
         """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
-        return FurtherPrior(self.scales, np.where(self._anew, THERE, MAY_BE_ABSENT), self.of_arm)
+        return FurtherPrior(
+            self.scales, np.where(self._independent, ALWAYS_PRESENT, MAY_BE_ABSENT), self.arm_components
+        )
 
     @property
-    def _anew(self) -> Mask:
+    def _independent(self) -> Mask:
         """(c,) what joints do anew in every view."""
         return np.array([name == JOINT_SCATTER for name in self.names], bool)
 
-    def reduced(self, reduction: Array) -> "PoseErrors":
+    def project(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
         return replace(
             self,
@@ -96,38 +109,38 @@ class PoseErrors:
         names, kept = tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n)
         return replace(self, names=names, components=kept, scales=self.scales[keep], effects=left)
 
-    def but_of_the_arm(self) -> "PoseErrors":
+    def without_arm(self) -> "PoseErrors":
         """What wanders in time, what scans of a stop share and what scatters; neither joints nor links err again."""
-        return replace(self._kept(~self.of_arm), effects={})
+        return replace(self._select(~self.arm_components), effects={})
 
-    def but_anew(self) -> "PoseErrors":
+    def independent_only(self) -> "PoseErrors":
         """What scatters alone; nothing errs again."""
-        return replace(self._kept(self._anew), effects={})
+        return replace(self._select(self._independent), effects={})
 
-    def that_repeats(self) -> "PoseErrors":
+    def repeating_only(self) -> "PoseErrors":
         """All but what joints do anew."""
-        return self._kept(~self._anew)
+        return self._select(~self._independent)
 
-    def but_in_time(self) -> "PoseErrors":
+    def without_drift(self) -> "PoseErrors":
         """What joints and links do and what scans of a stop share; nothing wanders."""
-        return self._kept(np.array([name not in WANDERING for name in self.names], bool))
+        return self._select(np.array([name not in DRIFT_MEMORY for name in self.names], bool))
 
-    def _kept(self, keep: Mask) -> "PoseErrors":
+    def _select(self, keep: Mask) -> "PoseErrors":
         names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
         return replace(self, names=names, components=self.components[keep], scales=self.scales[keep])
 
-    def beside(self, name: str, component: Array, scale: float) -> "PoseErrors":
+    def with_component(self, name: str, component: Array, scale: float) -> "PoseErrors":
         """The same with a further component (n, n)."""
         components = np.concatenate([self.components, component[None]])
         return replace(self, names=(*self.names, name), components=components, scales=np.append(self.scales, scale))
 
 
-def white(views: int) -> PoseErrors:
+def white_scatter_only(views: int) -> PoseErrors:
     """Nothing beside white scatter."""
     return PoseErrors((), np.zeros((0, 6 * views, 6 * views)), np.zeros(0))
 
 
-def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
+def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
     """The prior for the sessions of a rig: one arm, one scanner, one mount; none for very many views.
 
     Args:
@@ -135,32 +148,32 @@ def pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequ
         centres: per session the point (3,) about which twists count, reference frame.
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
-        return white(sum(m.views.count for m in measurements))
+        return white_scatter_only(sum(m.views.count for m in measurements))
     found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     of_one_joint, by_joints = dict[str, SmoothErrors](), np.zeros(2)
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
-        for name, effects in families(arm_effects(measurements)).items():
-            own = [np.concatenate([columns_of(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
+        for name, effects in group_by_family(arm_effects(measurements)).items():
+            own = [np.concatenate([effect_twists(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
             members |= {e.name: (name, columns) for e, columns in zip(effects, own, strict=True)}
-            found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM)
-        constant = [EFFECTS[name] for name in _CONSTANT if name in EFFECTS]
-        links = np.concatenate([columns_of(m, model, centre, constant) for m, centre in sessions])
-        alike = alike_in_joints(joints)
-        found["smooth"] = (spread_over(links, alike), SMOOTH)
-        if constant[0].name == _CONSTANT[0]:
+            found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM_SCALE)
+        constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
+        links = np.concatenate([effect_twists(m, model, centre, constant) for m, centre in sessions])
+        alike = rbf_joints(joints)
+        found["smooth"] = (process_covariance(links, alike), SMOOTH_SCALE)
+        if constant[0].name == _CONSTANT_EFFECTS[0]:
             offsets = links[:, : joints.shape[1]]
-            found[JOINT_SCATTER] = (spread_over(offsets, np.eye(len(joints))), ANEW)
-            by_joints = along_axes(offsets, measurements, centres)
+            found[JOINT_SCATTER] = (process_covariance(offsets, np.eye(len(joints))), USUAL_JOINT_SCATTER)
+            by_joints = mean_square_per_axis(offsets, measurements, centres)
             of_one_joint = joint_processes(measurements, joints, offsets, alike)
     flange = flange_twists(measurements, centres)
-    for name, memory in WANDERING.items():
-        found[name] = (spread_over(flange, near_in_time(measurements, memory)), 1.0)
+    for name, memory in DRIFT_MEMORY.items():
+        found[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
-        halves = dict(zip(STOPS, (flange[:, :3], flange[:, 3:]), strict=True))
-        found |= {name: (spread_over(half, same.astype(float)), 1.0) for name, half in halves.items()}
+        halves = dict(zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True))
+        found |= {name: (process_covariance(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
     return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints)

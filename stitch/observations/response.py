@@ -9,17 +9,17 @@ from stitch.frames import Array, Mask
 class PointSums(Protocol):
     """Sums of what the parameters of an effect do to the points themselves."""
 
-    def of(self, keep: slice | Mask) -> "PointSums":
+    def select(self, keep: slice | Mask) -> "PointSums":
         """The sums of some of the parameters."""
         ...
 
 
 @dataclass(frozen=True)
-class Prior:
+class CoefficientPrior:
     """What is believed of k coefficients before anything is seen."""
 
     precision: Array  # (k,) 0 where nothing is believed
-    middle: Array  # (k,)
+    mean: Array  # (k,)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_limit
 
 # Combinations that views see less than this share of a sigma, at plausible size, count in no p-value.
-_TOLD = 1e-2
+_MIN_INFORMATION = 1e-2
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class CandidateTest:
         return np.asarray(highest + np.log(np.sum(np.exp(logs - highest), axis=0))), significant
 
 
-def candidate_test(linear: LinearModel, candidate: Candidate, tests: int) -> CandidateTest:
+def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> CandidateTest:
     """Of a candidate that is one of so many.
 
     Args:
@@ -74,10 +74,10 @@ def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> t
 def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, share: float = 1.0) -> _FormTest:
     """Of columns (n, p) at a scale that has such a share of belief; all scales are one test."""
     white = linear.residual(columns)
-    known = max(linear.satterthwaite.of(linear.in_blocks(white)), 1.0)
+    known = max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white)), 1.0)
     information = white.T @ white
     values, vectors = np.linalg.eigh(information)
-    keep = values > _TOLD
+    keep = values > _MIN_INFORMATION
     solved = (vectors[:, keep] / np.sqrt(values[keep])).T
     limit = keep.sum() * f_limit(ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), known)
     with_prior = np.eye(len(values)) + information

@@ -9,15 +9,15 @@ from stitch import frames
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.measurement.session import Session
 from stitch.model.model import Model
-from stitch.planning.expected_model import FEWEST, Cell, expected_scans
-from stitch.planning.expected_scan import Field
-from stitch.planning.planned_part import PlannedPart, block, surface_of_file, thinned_surface
-from stitch.planning.scatter import Told, found_scatter, stated_scatter
+from stitch.planning.expected_model import FEWEST, CellModel, expected_scans
+from stitch.planning.expected_scan import FieldOfView
+from stitch.planning.planned_part import PlannedPart, block_surface, surface_of_file, thinned_surface
+from stitch.planning.scatter import FittedScatter, scatter_of_run, stated_scatter
 from stitch.reading.clouds import read_cloud
-from stitch.runs.state import State
+from stitch.runs.state import RunState
 from stitch.units import METRES, length_text
 
 # Full angle of the field where nobody states it, and how far it reaches about the standoff.
@@ -30,9 +30,9 @@ _SEEN, _MARGIN = 0.99, 0.1
 class PlannedCell:
     """A cell, and in words what nobody stated of it."""
 
-    cell: Cell
+    cell: CellModel
     assumed: tuple[str, ...]
-    told: Told | None = None  # errors that a run has found
+    fitted_scatter: FittedScatter | None = None  # errors that a run has found
 
 
 def cell_of_session(
@@ -61,10 +61,10 @@ def cell_of_session(
     if field_deg is None:
         assumed.append(f"the scanner's field is {USUAL_FIELD_DEG:.0f}° wide (--field)")
     near, far = scanner.standoff * (1 - _DEPTH), scanner.standoff * (1 + _DEPTH)
-    field = Field(np.array([half, half]), near, far, standoff=scanner.standoff, axis=scanner.optical_axis)
-    surface, words = _part(session, part, size_mm)
-    cell = Cell(Model(scanner.T_mount), surface, field, scatter)
-    poses = _poses(session, scanner.T_mount)
+    field = FieldOfView(np.array([half, half]), near, far, standoff=scanner.standoff, axis=scanner.optical_axis)
+    surface, words = _part_of_session(session, part, size_mm)
+    cell = CellModel(Model(scanner.T_mount), surface, field, scatter)
+    poses = _scanner_poses(session, scanner.T_mount)
     counts = np.array([len(index) for index in expected_scans(cell, poses)])
     if words or np.mean(counts >= FEWEST) < 0.5:
         # Where nobody says where the part is, it is where the views look.
@@ -74,7 +74,7 @@ def cell_of_session(
     return PlannedCell(cell, (*scatter.assumed, *assumed, *words))
 
 
-def cell_of_run(state: State, folder: Path) -> PlannedCell:
+def cell_of_run(state: RunState, folder: Path) -> PlannedCell:
     """The cell as a run found it: its model, its scatter, its fused cloud, the field that its scans fill.
 
     Raises:
@@ -89,7 +89,7 @@ def cell_of_run(state: State, folder: Path) -> PlannedCell:
     return cell_of_state(state, cloud.points, cloud.normals)
 
 
-def cell_of_state(state: State, points: Array, normals: Array) -> PlannedCell:
+def cell_of_state(state: RunState, points: Array, normals: Array) -> PlannedCell:
     """Return the cell as a run found it.
 
     Args:
@@ -100,7 +100,7 @@ def cell_of_state(state: State, points: Array, normals: Array) -> PlannedCell:
     reach = np.linalg.norm(seen, axis=1)
     slopes = np.abs(seen[:, :2] / seen[:, 2:])
     near, far = np.quantile(reach, [1 - _SEEN, _SEEN])
-    field = Field(
+    field = FieldOfView(
         np.quantile(slopes, _SEEN, axis=0) * (1 + _MARGIN),
         float(near * (1 - _MARGIN)),
         float(far * (1 + _MARGIN)),
@@ -108,18 +108,18 @@ def cell_of_state(state: State, points: Array, normals: Array) -> PlannedCell:
         axis=state.session.scanner.optical_axis,
     )
     noise = float(np.nanmedian([scan.noise for scan in scans]))
-    told = found_scatter(linear_model_of(state), noise)
-    return PlannedCell(Cell(state.model, thinned_surface(points, normals), field, told.believed), (), told)
+    told = scatter_of_run(linear_model_of(state), noise)
+    return PlannedCell(CellModel(state.model, thinned_surface(points, normals), field, told.believed), (), told)
 
 
-def _part(session: Session, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
+def _part_of_session(session: Session, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
     """The part's surface, and what is assumed of it."""
     unit = METRES[session.length_unit]
     if part is not None:
         return surface_of_file(part, 1.0), []
     if size_mm is not None:
         size = size_mm * METRES["mm"] / unit
-        return block(size), [f"the part is a block, {length_text(size, session.length_unit)} long (--part)"]
+        return block_surface(size), [f"the part is a block, {length_text(size, session.length_unit)} long (--part)"]
     if session.cad is not None:
         return surface_of_file(session.cad, METRES[session.cad_unit or session.length_unit] / unit), []
     raise InputError(
@@ -127,6 +127,6 @@ def _part(session: Session, part: Path | None, size_mm: float | None) -> tuple[P
     )
 
 
-def _poses(session: Session, T_mount: Array) -> Array:
+def _scanner_poses(session: Session, T_mount: Array) -> Array:
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    return place(session.name, (), T_base_flange, session.mount).poses(T_mount)
+    return build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)

@@ -15,11 +15,11 @@ import numpy as np
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import SEEN, form_weights
 from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL
-from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, some_law
+from stitch.diagnosis.unknown.joint_laws import TIMES, law_covariances, log_posterior_of_any
 from stitch.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel
-from stitch.planning.candidate_tests import CandidateTest, candidate_test, covariance_tests
-from stitch.statistics.mean_factor import log_mean
+from stitch.planning.candidate_tests import CandidateTest, covariance_tests, test_of_candidate
+from stitch.statistics.mean_factor import log_mean_exp
 
 DRAWS = 100
 
@@ -39,7 +39,7 @@ class ExpectedDiagnosis:
     """What a diagnosis of planned views would say, whatever these may see: all candidate effects beside the model."""
 
     def __init__(self, linear: LinearModel, candidates: Sequence[Candidate]) -> None:
-        self.linear, self.candidates = linear, [c for c in candidates if _visible(linear, c)]
+        self.linear, self.candidates = linear, [c for c in candidates if _is_visible(linear, c)]
         self.tests = max(len(self.candidates), 1)
         self._half = np.linalg.cholesky(linear.covariance[0])
         self._of_arm = set({} if linear.pose_errors is None else linear.pose_errors.effects)
@@ -47,13 +47,13 @@ class ExpectedDiagnosis:
         # By candidate the tests of all laws beside it, of each kind of each joint together, at several sizes.
         self._laws: dict[int, list[list[tuple[CandidateTest, ...]]]] = {}
 
-    def seen(self, shift: Array, rng: np.random.Generator) -> Array:
+    def simulate_numbers(self, shift: Array, rng: np.random.Generator) -> Array:
         """(n, D) numbers of the channel: shifts (n, D) under all other errors."""
         return np.asarray(self._half @ rng.standard_normal(shift.shape) + shift)
 
     def chance(self, effect: str, shift: Array, rng: np.random.Generator) -> Chance:
         """What would be said of an effect that shifts the channel by (n, D)."""
-        numbers = self.seen(shift, rng)
+        numbers = self.simulate_numbers(shift, rng)
         own = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
         factor, significant = np.array([f for f, _ in own]), np.array([s for _, s in own])
         best = self._best(numbers, np.where(significant & (factor > 0), factor, -np.inf))
@@ -68,7 +68,7 @@ class ExpectedDiagnosis:
         """A candidate where some effects are none of the errors that remain."""
         key = frozenset(removed & self._of_arm), candidate.name
         if key not in self._tests:
-            self._tests[key] = candidate_test(self.linear.without(removed), candidate, self.tests)
+            self._tests[key] = test_of_candidate(self.linear.without(removed), candidate, self.tests)
         return self._tests[key]
 
     def _best(self, numbers: Array, factor: Array) -> Array:
@@ -97,7 +97,9 @@ class ExpectedDiagnosis:
         kinds = self._laws[k]
         if not kinds:
             return np.ones(numbers.shape[1], bool)
-        rival = some_law(np.array([log_mean(np.array([_at_best(law, numbers) for law in kind])) for kind in kinds]))
+        rival = log_posterior_of_any(
+            np.array([log_mean_exp(np.array([_best_log_factor(law, numbers) for law in kind])) for kind in kinds])
+        )
         return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
@@ -106,12 +108,12 @@ class ExpectedDiagnosis:
         return np.asarray(own > rival + ODDS)
 
 
-def _at_best(law: Sequence[CandidateTest], numbers: Array) -> Array:
+def _best_log_factor(law: Sequence[CandidateTest], numbers: Array) -> Array:
     """(D,) log Bayes factor at the likeliest of its sizes."""
     return np.asarray(np.max([size.evaluate(numbers)[0] for size in law], axis=0))
 
 
-def _visible(linear: LinearModel, candidate: Candidate) -> bool:
+def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
     white = linear.without([candidate.name]).residual(candidate.forms[0].columns) * candidate.forms[0].sizes
     return bool((np.linalg.norm(white, axis=0) > SEEN).any())

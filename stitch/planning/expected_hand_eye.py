@@ -7,12 +7,12 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
-from stitch.observations.error_model import WHITE
+from stitch.observations.error_model import WHITE_COMPONENTS
 from stitch.observations.surfaces.hand_eye_solution import weak_prior
 from stitch.observations.surfaces.scanner_field import ALARM_SHARE
 from stitch.observations.surfaces.shown_errors import USUAL_SHARE
-from stitch.planning.expected_model import ExpectedModel, Seen
-from stitch.statistics.least_squares import generalised
+from stitch.planning.expected_model import ExpectedModel, SimulatedViews
+from stitch.statistics.least_squares import generalised_fit
 from stitch.statistics.variance_prior import NOISE
 
 
@@ -36,20 +36,20 @@ def displacement(covariance: Array, middle: Array) -> float:
     return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
 
 
-def expected_hand_eye(linear: ExpectedModel, found: Seen, middle: Array | None = None) -> ExpectedHandEye:
+def expected_hand_eye(linear: ExpectedModel, simulated: SimulatedViews, middle: Array | None = None) -> ExpectedHandEye:
     """As `fit_hand_eye` would have it: least squares under the scatter alone, the covariance under all errors.
 
     Args:
         middle: (3,) scanner frame, whose displacement U counts; None: the middle of what the views see.
     """
-    capture, T_mount = found.measurement.capture, linear.model.T_mount
+    capture, T_mount = simulated.measurement.capture, linear.model.T_mount
     sizes, components = linear.null.variances, linear.mixed.components[:, 0]
     errors = () if linear.pose_errors is None else linear.pose_errors.names
-    names = (*WHITE, *errors)
+    names = (*WHITE_COMPONENTS, *errors)
     columns = linear.reduce(linear.design)
-    prior = weak_prior([capture], [found.freed], T_mount, linear.sizes[6:])
+    prior = weak_prior([capture], [simulated.unconstrained], T_mount, linear.sizes[6:])
     scatter = np.einsum("c,cij->ij", sizes[: NOISE + 1], components[: NOISE + 1])
-    weighed = generalised(scatter, columns, prior)
+    weighed = generalised_fit(scatter, columns, prior)
     sources = {
         name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in zip(names, sizes, components, strict=True)
     }

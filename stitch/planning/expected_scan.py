@@ -16,7 +16,7 @@ _AHEAD = 0.3
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldOfView:
     """Where a scanner sees: slopes x/z and y/z up to `half` (2,), distances from `near` to `far`, along `axis` (3,)."""
 
     half: Array
@@ -26,7 +26,7 @@ class Field:
     axis: Array
 
 
-def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: Field) -> Indices:
+def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: FieldOfView) -> Indices:
     """Indices of the part's points that the scanner sees.
 
     Args:
@@ -43,10 +43,10 @@ def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: Field) -
     slopes, reach = points[:, :2] / (points @ field.axis)[:, None], np.linalg.norm(points, axis=1)
     cosine = -np.einsum("ij,ij->i", points, normals) / reach
     inside = (np.abs(slopes) <= field.half).all(axis=1) & (reach > field.near) & (reach < field.far)
-    return np.asarray(ahead[inside & (cosine > GRAZING_COSINE) & ~_hidden(slopes, reach)])
+    return np.asarray(ahead[inside & (cosine > GRAZING_COSINE) & ~_is_occluded(slopes, reach)])
 
 
-def _hidden(slopes: Array, reach: Array) -> Mask:
+def _is_occluded(slopes: Array, reach: Array) -> Mask:
     """(N,) bool: another point lies in the same ray, well before it."""
     area = max(float(np.prod(np.ptp(slopes, axis=0))), 1e-12)
     ray = _RAY * np.sqrt(area / len(slopes))

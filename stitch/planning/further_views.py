@@ -7,10 +7,10 @@ import numpy as np
 
 from stitch.diagnosis.design.candidate_views import reachable
 from stitch.frames import Array
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Session, View
-from stitch.planning.expected_model import FEWEST, Cell, expected_scans
+from stitch.planning.expected_model import FEWEST, CellModel, expected_scans
 
 # A view must show this share of what the others show.
 _SHARE = 0.4
@@ -51,7 +51,7 @@ def _pause(session: Session) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else 60.0
 
 
-def candidate_joints(session: Session, cell: Cell, count: int) -> Array:
+def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:
     """(K, n) joint angles near those that are planned in which the scanner would see the part, K ≤ count."""
     T_mount = cell.model.T_mount
     driven, T_base_flange = session.joints, np.array([view.T_base_flange for view in session.views])
@@ -59,9 +59,9 @@ def candidate_joints(session: Session, cell: Cell, count: int) -> Array:
 
     def poses_of(joints: Array) -> Array:
         assert session.robot is not None
-        return place(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
+        return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
 
-    seen_from = place(session.name, (), T_base_flange, session.mount).poses(T_mount)
+    seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
     joints = reachable(driven, poses_of, seen_from, cell.part.centre)
     least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
     seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))

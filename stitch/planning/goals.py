@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.thresholds import TOLD_APART
+from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.frames import Array
 from stitch.planning.expected_hand_eye import displacement
 from stitch.planning.view_bed import EffectColumns
-from stitch.planning.view_search import Channel, separations
+from stitch.planning.view_search import TwistChannel, separations
 
 # Keeps what too few views leave open finite: a radian, and many times any part.
 _OPEN = 1e-8
@@ -21,7 +21,7 @@ _NEVER = -50.0
 class HalvedHandEye:
     """The hand-eye's U at a point, down to a share of what the present views give it."""
 
-    channel: Channel
+    channel: TwistChannel
     middle: Array  # (3,) scanner frame
     now: float  # U of the present views, length_unit; NaN where they give none
     share: float = 0.5
@@ -46,7 +46,7 @@ class HalvedHandEye:
 class SplitPair:
     """Two effects of usual size, each told from the other."""
 
-    channel: Channel
+    channel: TwistChannel
     names: tuple[str, str]
     effects: tuple[EffectColumns, EffectColumns]  # their columns are the channel's last
 
@@ -58,18 +58,18 @@ class SplitPair:
         both = []
         for own, rival, effect in ((a, b, self.effects[0]), (b, a, self.effects[1])):
             apart = separations(normal, own, rival) @ effect.forms.T
-            both.append(np.minimum(apart / TOLD_APART, 1.0) @ effect.weights)
+            both.append(np.minimum(apart / SEPARATION_LAMBDA, 1.0) @ effect.weights)
         return np.asarray(np.minimum(*both))
 
 
 Goal = HalvedHandEye | SplitPair
 
 
-def progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence[int]) -> Array:
+def mean_progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence[int]) -> Array:
     """(K,) mean progress of all goals with each of some more views."""
     return np.asarray(np.mean([goal.progress(goal.channel.with_each(chosen, others)) for goal in goals], axis=0))
 
 
-def progress_now(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
+def present_progress(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
     """The same of the chosen views alone."""
     return float(np.mean([goal.progress(goal.channel.normal(chosen)) for goal in goals]))

@@ -9,7 +9,7 @@ import trimesh
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.scan import evenly
+from stitch.measurement.scan import even_indices
 from stitch.reading.clouds import read_cloud
 from stitch.reading.text_file import reason_of, require_file
 
@@ -48,10 +48,10 @@ def surface_of_file(file: Path, scale: float) -> PlannedPart:
         InputError: missing, unreadable, or a cloud without normals.
     """
     require_file(file, "name a mesh or a cloud of the part")
-    mesh = _mesh(file)
+    mesh = _read_mesh(file)
     if mesh is not None:
         mesh.apply_scale(scale)
-        return of_mesh(mesh)
+        return surface_of_mesh(mesh)
     cloud = read_cloud(file, scale)
     if cloud.normals is None:
         raise InputError(
@@ -62,16 +62,16 @@ def surface_of_file(file: Path, scale: float) -> PlannedPart:
 
 def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> PlannedPart:
     """At most so many points (N, 3) of a cloud with their normals (N, 3), evenly over their order."""
-    picked = evenly(len(points), at_most)
+    picked = even_indices(len(points), at_most)
     return PlannedPart(points[picked], normals[picked])
 
 
-def block(size: float) -> PlannedPart:
+def block_surface(size: float) -> PlannedPart:
     """What stands for a part of which only the largest side is known: a block of 1 : 0.7 : 0.5 about the origin."""
-    return of_mesh(trimesh.creation.box(extents=size * _SIDES))
+    return surface_of_mesh(trimesh.creation.box(extents=size * _SIDES))
 
 
-def _mesh(file: Path) -> trimesh.Trimesh | None:
+def _read_mesh(file: Path) -> trimesh.Trimesh | None:
     """None where the file holds no triangles."""
     if file.suffix.lower() not in (".stl", ".obj", ".off", ".glb", ".gltf", ".ply"):
         return None
@@ -82,7 +82,7 @@ def _mesh(file: Path) -> trimesh.Trimesh | None:
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
 
 
-def of_mesh(mesh: trimesh.Trimesh) -> PlannedPart:
+def surface_of_mesh(mesh: trimesh.Trimesh) -> PlannedPart:
     """Points spread over a mesh at random, the same every time."""
     points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
     return PlannedPart(np.asarray(points), np.asarray(mesh.face_normals[faces]))

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import form_weights
-from stitch.diagnosis.thresholds import TOLD_APART
+from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 
@@ -20,7 +20,7 @@ RIDGE = 0.01
 
 
 @dataclass(frozen=True)
-class Pair:
+class EffectPair:
     """Two effects, and the multiple of its usual size from which each is told from the other."""
 
     a: str
@@ -34,17 +34,17 @@ class Pair:
         return max(self.size_a, self.size_b)
 
 
-def pairs_of(linear: LinearModel, candidates: Sequence[Candidate]) -> list[Pair]:
+def effect_pairs(linear: LinearModel, candidates: Sequence[Candidate]) -> list[EffectPair]:
     """All pairs of some candidates, hardest first."""
     out = []
     for i, a in enumerate(candidates):
         for b in candidates[i + 1 :]:
             base = linear.without([a.name, b.name])
-            out.append(Pair(a.name, b.name, identifiable(base, a, b), identifiable(base, b, a)))
+            out.append(EffectPair(a.name, b.name, identifiable_size(base, a, b), identifiable_size(base, b, a)))
     return sorted(out, key=lambda pair: -pair.size)
 
 
-def identifiable(base: LinearModel, own: Candidate, rival: Candidate) -> float:
+def identifiable_size(base: LinearModel, own: Candidate, rival: Candidate) -> float:
     """Multiple of the usual size from which `own` is told from `rival`: median over the forms it may have.
 
     Args:
@@ -56,7 +56,7 @@ def identifiable(base: LinearModel, own: Candidate, rival: Candidate) -> float:
     for form in own.forms:
         pattern = base.residual(form.columns) * form.sizes
         apart = min(separation(pattern, X) for X in imitations)
-        sizes.append(float(np.sqrt(TOLD_APART / apart)) if apart > 0 else float("inf"))
+        sizes.append(float(np.sqrt(SEPARATION_LAMBDA / apart)) if apart > 0 else float("inf"))
     return _median(np.array(sizes), form_weights(own))
 
 

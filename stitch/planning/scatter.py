@@ -52,14 +52,14 @@ def stated_scatter(session: Session) -> Scatter:
 
 
 @dataclass(frozen=True)
-class Told:
+class FittedScatter:
     """How large the errors of some views are found to be."""
 
     fitted: Scatter  # at the maximum of the likelihood, which diagnosis takes
     believed: Scatter  # posterior mean, which the covariance of a hand-eye takes
 
 
-def told(linear: LinearModel, noise: float, variances: Sequence[tuple[Array, Array]]) -> Told:
+def mean_scatter(linear: LinearModel, noise: float, variances: Sequence[tuple[Array, Array]]) -> FittedScatter:
     """The mean of fitted and believed variances (c,) of some fits of a linear model.
 
     Args:
@@ -68,11 +68,11 @@ def told(linear: LinearModel, noise: float, variances: Sequence[tuple[Array, Arr
     both = []
     for found in np.mean(variances, axis=0):
         rotation, translation = np.sqrt(found[:NOISE])
-        errors = dict(zip(linear.further, map(float, found[NOISE + 1 :]), strict=True))
+        errors = dict(zip(linear.component_names, map(float, found[NOISE + 1 :]), strict=True))
         both.append(Scatter(float(rotation), float(translation), noise, float(found[NOISE]), errors))
-    return Told(*both)
+    return FittedScatter(*both)
 
 
-def found_scatter(linear: LinearModel, noise: float) -> Told:
+def scatter_of_run(linear: LinearModel, noise: float) -> FittedScatter:
     """As the views of a run show it."""
-    return told(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
+    return mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.planning.expected_model import ExpectedModel
-from stitch.planning.scatter import Scatter, Told, told
+from stitch.planning.scatter import FittedScatter, Scatter, mean_scatter
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
@@ -17,7 +17,7 @@ from stitch.statistics.variance_posterior import mean_variances
 _DRAWS = ((150, 3), (400, 1))
 
 
-def told_sizes(linear: ExpectedModel, noise: float) -> Told:
+def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
     """What runs of these views would find, on average, where the scatter is the expected one.
 
     Args:
@@ -25,16 +25,16 @@ def told_sizes(linear: ExpectedModel, noise: float) -> Told:
     """
     draws = next((count for size, count in _DRAWS if linear.mixed.size <= size), 0)
     if not draws or linear.pose_errors is None:
-        return told(linear, noise, [(linear.null.variances, linear.null.variances)])
+        return mean_scatter(linear, noise, [(linear.null.variances, linear.null.variances)])
     half, rng, found = np.linalg.cholesky(linear.covariance[0]), np.random.default_rng(0), []
     for _ in range(draws):
         mixed = replace(linear.mixed, z=(half @ rng.standard_normal(len(half)))[None])
         null = fit_variances(mixed, both_starts=True)
         found.append((null.variances, mean_variances(mixed, null)))
-    return told(linear, noise, found)
+    return mean_scatter(linear, noise, found)
 
 
-def under(linear: ExpectedModel, scatter: Scatter) -> ExpectedModel:
+def with_scatter(linear: ExpectedModel, scatter: Scatter) -> ExpectedModel:
     """The same views under another scatter."""
     names = () if linear.pose_errors is None else linear.pose_errors.names
     return linear.at(scatter.variances(names))

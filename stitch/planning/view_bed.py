@@ -7,22 +7,22 @@ import numpy as np
 
 from stitch import frames
 from stitch.diagnosis.candidates import free_masks
-from stitch.diagnosis.score import weights_of
-from stitch.effects.in_session import known, require
+from stitch.diagnosis.score import weights_of_masks
+from stitch.effects.in_session import find_effect, require_available
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.model.term import sizes_of, term_of
-from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.pose_channel import jacobian
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.pose_channel import hand_eye_jacobian
 from stitch.observations.surfaces.scanner_field import field_scatter
 from stitch.observations.surfaces.view_responses import view_columns, view_responses
-from stitch.planning.expected_model import Cell, Seen, seen
+from stitch.planning.expected_model import CellModel, SimulatedViews, simulate_views
 from stitch.planning.planned_part import thinned_surface
 from stitch.planning.scatter import Scatter
-from stitch.planning.view_search import Channel, noise_of
+from stitch.planning.view_search import TwistChannel, noise_of
 
 # Points on the part and correspondences of a view are few here: there are many pairs, and noise is not what limits.
-_SAMPLES, _POINTS, _FEWEST = 250, 4000, 25
+_SAMPLES, _POINTS, _MIN_VIEW_SAMPLES = 250, 4000, 25
 
 
 @dataclass(frozen=True)
@@ -35,19 +35,19 @@ class EffectColumns:
 
 
 @dataclass(frozen=True)
-class Bed:
+class PossibleViews:
     """N views: those of the session first, then those that could be added."""
 
     session: Session
-    cell: Cell
-    found: Seen
+    cell: CellModel
+    simulated: SimulatedViews
     scatter: Scatter
 
-    def channel(self, beside: Sequence[str] = (), columns: Sequence[Array] = ()) -> Channel:
-        """Hand-eye, a common motion, effects in use, further columns; `beside`: effects that no arm has of itself."""
-        m, freed, model = self.found.measurement, self.found.freed, self.cell.model
+    def channel(self, foreign_effects: Sequence[str] = (), columns: Sequence[Array] = ()) -> TwistChannel:
+        """Hand-eye, a common motion, effects in use, further columns; `foreign_effects`: effects that no arm has of itself."""
+        m, freed, model = self.simulated.measurement, self.simulated.unconstrained, self.cell.model
         g = freed.overlaps.gram
-        errors = pose_errors([m], model, [g.centre]).without(set(beside))
+        errors = prior_pose_errors([m], model, [g.centre]).without(set(foreign_effects))
         sizes = self.scatter.variances(errors.names)
         covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
         field = field_scatter(m, freed)
@@ -55,8 +55,8 @@ class Bed:
         covariance += noise_of(self._information(), sizes[2] * g.variance, max(g.lever, 1e-9))
         used = view_columns(m, model, freed) * sizes_of(model.terms)
         common = np.tile(np.eye(6), (g.views, 1))
-        own = jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
-        return Channel(covariance, np.hstack([own, common, used, *columns]))
+        own = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
+        return TwistChannel(covariance, np.hstack([own, common, used, *columns]))
 
     def effect(self, name: str) -> EffectColumns:
         """How the views answer to an effect of the library.
@@ -64,17 +64,17 @@ class Bed:
         Raises:
             InputError: one that is not known, or that these views cannot have.
         """
-        measurement, effect = self.found.measurement, known(name)
-        require(measurement, effect)
+        measurement, effect = self.simulated.measurement, find_effect(name)
+        require_available(measurement, effect)
         term = term_of(measurement, effect)
-        response = view_responses(measurement, self.cell.model, [term], self.found.freed)[0].columns
+        response = view_responses(measurement, self.cell.model, [term], self.simulated.unconstrained)[0].columns
         masks = free_masks(term)
-        return EffectColumns(response * term.typical, np.array(masks), weights_of(masks))
+        return EffectColumns(response * term.typical, np.array(masks), weights_of_masks(masks))
 
     def _white(self) -> Array:
         """(6N, 6N) of the flange's scatter, view by view."""
-        m = self.found.measurement
-        to_centre = frames.make(np.eye(3), -self.found.freed.overlaps.gram.centre)
+        m = self.simulated.measurement
+        to_centre = frames.make(np.eye(3), -self.simulated.unconstrained.overlaps.gram.centre)
         carried = frames.adjoint(to_centre @ m.capture.T_reference_flange)
         size = np.repeat([self.scatter.rotation**2, self.scatter.translation**2], 3)
         out = np.zeros((len(carried), 6, len(carried), 6))
@@ -84,18 +84,18 @@ class Bed:
 
     def _information(self) -> Array:
         """(N, 6, 6) of every view against all others."""
-        g = self.found.freed.overlaps.gram
+        g = self.simulated.unconstrained.overlaps.gram
         out = np.zeros((g.views, 6, 6))
         for side in (0, 1):
             np.add.at(out, g.pairs[:, side].astype(np.int64), g.matrix)
         return out
 
 
-def bed_of(session: Session, cell: Cell, scatter: Scatter) -> Bed:
+def possible_views(session: Session, cell: CellModel, scatter: Scatter) -> PossibleViews:
     """A session with all views that could be added.
 
     Args:
         scatter: with the errors of the arm that the views are expected to leave open.
     """
     coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
-    return Bed(session, coarse, seen(session, coarse, _SAMPLES, _FEWEST), scatter)
+    return PossibleViews(session, coarse, simulate_views(session, coarse, _SAMPLES, _MIN_VIEW_SAMPLES), scatter)

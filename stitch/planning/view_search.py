@@ -20,7 +20,7 @@ _UNSEEN = 1e-6
 
 
 @dataclass(frozen=True)
-class Channel:
+class TwistChannel:
     """Twists of N views that could be taken: their covariance, and columns of what is asked and what is in the way."""
 
     covariance: Array  # (6N, 6N) of pose errors and noise

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stitch.errors import InputError
-from stitch.reading.csv_number import number
+from stitch.reading.csv_number import finite_number
 
 _PAYLOAD = "payload_kg"
 _TORQUE = re.compile(r"j([1-9]\d*)_torque_nm$")
@@ -32,7 +32,7 @@ def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, 
         )
     for name in [*torques, *(name for name in filled if name == _PAYLOAD)]:
         for line, row in cells:
-            value = number(file, line, name, row[name], "write a number in every row, or take the column out")
+            value = finite_number(file, line, name, row[name], "write a number in every row, or take the column out")
             if name == _PAYLOAD and value < 0:
                 raise InputError(f"{file} line {line}: {name} is {value:g}; to fix: write a mass, 0 for none")
             if abs(value) > (_LARGEST_KG if name == _PAYLOAD else _LARGEST_NM):

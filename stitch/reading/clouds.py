@@ -12,16 +12,28 @@ from stitch.measurement.cloud import Cloud
 from stitch.reading.csv_number import is_number
 from stitch.reading.depth_image import DEPTH_SUFFIXES, read_depth_columns
 from stitch.reading.more_clouds import MESHES, read_array, read_e57, read_las, read_mesh, read_ptx
-from stitch.reading.organised import grid_shape, measured
+from stitch.reading.organised import grid_shape, measured_pixels
 from stitch.reading.pcd import read_pcd
 from stitch.reading.rights import readable
 from stitch.reading.text_file import reason_of, require_file
 from stitch.reading.zdf import read_zdf
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
-_TEXT = (".xyz", ".csv", ".txt", ".asc")
+_TEXT_SUFFIXES = (".xyz", ".csv", ".txt", ".asc")
 # Kinds that are read, by the ending of the file's name.
-CLOUD_SUFFIXES = (".ply", ".pcd", *_TEXT, *MESHES, ".npy", ".ptx", ".e57", ".las", ".laz", ".zdf", *DEPTH_SUFFIXES)
+CLOUD_SUFFIXES = (
+    ".ply",
+    ".pcd",
+    *_TEXT_SUFFIXES,
+    *MESHES,
+    ".npy",
+    ".ptx",
+    ".e57",
+    ".las",
+    ".laz",
+    ".zdf",
+    *DEPTH_SUFFIXES,
+)
 
 
 @readable()
@@ -35,7 +47,7 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
         raise InputError(f"{path}: no such cloud file; correct the column cloud of views.csv")
     require_file(path, "name a file in the column cloud of views.csv")
     readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": read_ply, ".pcd": read_pcd}
-    readers |= dict.fromkeys(_TEXT, _read_text) | dict.fromkeys(MESHES, read_mesh)
+    readers |= dict.fromkeys(_TEXT_SUFFIXES, _read_text) | dict.fromkeys(MESHES, read_mesh)
     readers |= {
         ".npy": read_array,
         ".ptx": read_ptx,
@@ -54,7 +66,7 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     try:
         columns = reader(path)
         if kind in (".ply", ".pcd") and grid_shape(path):
-            columns = measured(columns)
+            columns = measured_pixels(columns)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no cloud
@@ -138,10 +150,10 @@ def _read_text(path: Path) -> dict[str, Array]:
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}
     separator = next((s for s in ",;" if s in lines[0]), None)
-    first = _names(lines[0], separator)
+    first = _column_names(lines[0], separator)
     header = any(not is_number(cell) for cell in first)
     above = told[: told.index(lines[0])]
-    names = first if header or not above else _names(above[-1].lstrip(" #"), separator)
+    names = first if header or not above else _column_names(above[-1].lstrip(" #"), separator)
     if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
         names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
     if len(lines) == header:
@@ -154,6 +166,6 @@ def _is_comment(line: str) -> bool:
     return line.lstrip()[0] == "#"
 
 
-def _names(line: str, separator: str | None) -> list[str]:
+def _column_names(line: str, separator: str | None) -> list[str]:
     cells = [cell.strip() for cell in line.split(separator)]
     return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]

@@ -11,7 +11,7 @@ from stitch.reading.text_file import not_utf8, require_file
 _LONGEST_HEADER = 1 << 20
 
 
-def read_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Names of the columns, and line number and cells of every line that is not empty.
 
     Raises:

@@ -20,7 +20,7 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def number(file: Path, line: int, column: str, cell: str, mend: str = "write a finite number") -> float:
+def finite_number(file: Path, line: int, column: str, cell: str, remedy: str = "write a finite number") -> float:
     """A finite number.
 
     Raises:
@@ -31,5 +31,5 @@ def number(file: Path, line: int, column: str, cell: str, mend: str = "write a f
     except ValueError:
         value = float("nan")
     if not np.abs(value) < _LARGEST:
-        raise InputError(f"{file} line {line}: {column} is {shortened(cell.strip())}; {mend}")
+        raise InputError(f"{file} line {line}: {column} is {shortened(cell.strip())}; {remedy}")
     return value

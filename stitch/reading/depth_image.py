@@ -10,8 +10,8 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.extras import package
-from stitch.reading.intrinsics import Intrinsics, intrinsics_beside
+from stitch.reading.extras import import_extra
+from stitch.reading.intrinsics import Intrinsics, find_intrinsics
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 # A table of points has fewer columns, an image more.
@@ -51,7 +51,7 @@ def read_depth(path: Path) -> Array:
     Raises:
         InputError: no depth image, no intrinsics, or those of another size of image.
     """
-    return lifted(path, _pixels(path), intrinsics_beside(path))
+    return lifted(path, _pixels(path), find_intrinsics(path))
 
 
 def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
@@ -105,7 +105,7 @@ def _pixels(path: Path) -> Array:
 
 
 def _exr(path: Path) -> Array:
-    with package("OpenEXR", path, "formats").File(str(path)) as file:
+    with import_extra("OpenEXR", path, "formats").File(str(path)) as file:
         channels = {name: np.asarray(channel.pixels, float) for name, channel in file.channels().items()}
     name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
     return channels[name] if channels[name].ndim == 2 else np.asarray(channels[name][..., 0])
@@ -116,7 +116,7 @@ def _rays(camera: Intrinsics, width: int, height: int) -> Array:
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     if not len(camera.distortion):
         return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=2)
-    cv2 = package("cv2", camera.source, "vision")
+    cv2 = import_extra("cv2", camera.source, "vision")
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     pixels = np.stack([u, v], axis=2).reshape(-1, 1, 2)
     rays: Array = cv2.undistortPoints(pixels, K, camera.distortion)

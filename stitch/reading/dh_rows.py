@@ -34,13 +34,13 @@ def robot_from_dh(
         raise InputError("robot.joints is no list of rows; write one DH row a joint")
     rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
     for where, row in rows:
-        known_keys(where, row, _DH_KEYS)
+        require_known_keys(where, row, _DH_KEYS)
     a, alpha, d, theta = (
-        np.array([float(numbers(where, row, key, ())) for where, row in rows])
+        np.array([float(table_numbers(where, row, key, ())) for where, row in rows])
         for key in ("a", "alpha_deg", "d", "theta_deg")
     )
     alpha, theta = np.radians(alpha), np.radians(theta)
-    before, after = _about_joint(convention, a, alpha, d)
+    before, after = _joint_transforms(convention, a, alpha, d)
     masses = [point_mass(where, row) for where, row in rows]
     payload_mass, payload_com = payload_of(payload)
     return Robot(
@@ -61,7 +61,7 @@ def robot_from_dh(
     )
 
 
-def _about_joint(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
+def _joint_transforms(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
     """(n, 4, 4) each: what stands before and behind the turn of every joint."""
     if convention == "standard":
         return np.broadcast_to(np.eye(4), (len(a), 4, 4)), elementary("z", 0, d) @ elementary("x", alpha, a)
@@ -74,24 +74,24 @@ def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
     """Mass (kg) and centre of mass (3,) in the flange frame of [robot] payload; both 0 without one."""
     if payload is None:
         return 0.0, np.zeros(3)
-    known_keys("robot.payload", payload, ("mass", "com"))
+    require_known_keys("robot.payload", payload, ("mass", "com"))
     return point_mass("robot.payload", payload)
 
 
 def gravity_of(gravity: Array) -> Array:
     """Gravity (3,) in m/s² in the base frame, checked."""
-    return numbers("robot", {"gravity": gravity}, "gravity", (3,))
+    return table_numbers("robot", {"gravity": gravity}, "gravity", (3,))
 
 
 def point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
     """mass (kg, not negative) and com (3,) of a table; 0 where absent."""
-    mass = float(numbers(where, table, "mass", ()))
+    mass = float(table_numbers(where, table, "mass", ()))
     if mass < 0:
         raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
-    return mass, numbers(where, table, "com", (3,))
+    return mass, table_numbers(where, table, "com", (3,))
 
 
-def known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
+def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
     """Refuse other keys: a misspelt alpha_deg would silently count as 0, and the arm be another one."""
     if not isinstance(table, dict):
         raise InputError(
@@ -104,7 +104,7 @@ def known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
             raise InputError(f"{where}: unknown key {shortened(key)}; {hint}")
 
 
-def numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
     """The finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
     try:
         value = np.array(table.get(key, np.zeros(shape)), float)

@@ -7,7 +7,7 @@ from typing import Any
 from stitch.errors import InputError
 
 
-def package(name: str, where: Path | str, extra: str) -> Any:
+def import_extra(name: str, where: Path | str, extra: str) -> Any:
     """A package by its name of import.
 
     Args:

@@ -9,13 +9,13 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.csv_lines import read_lines
-from stitch.reading.csv_number import number
+from stitch.reading.csv_lines import read_csv_lines
+from stitch.reading.csv_number import finite_number
 from stitch.reading.text_file import require_file, shortened
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _SIGMA = ("sigma", "sigma_deg")
-_UNIT_TOLERANCE = 1e-3
+_PROBE_QUATERNION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
         InputError: names the line and how to fix it.
     """
     require_file(file, f"a frames session needs {','.join(('view', *_POSE))} there")
-    header, rows = read_lines(file)
+    header, rows = read_csv_lines(file)
     missing = [name for name in ("view", *_POSE) if name not in header]
     if missing:
         raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")
@@ -48,15 +48,15 @@ def read_frames(file: Path, known: Sequence[str]) -> MeasuredFrames:
     for i, (line, cells) in enumerate(rows):
         row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
         _check_name(file, line, row["view"], names, allowed)
-        table[i] = [number(file, line, name, row[name]) for name in _POSE]
+        table[i] = [finite_number(file, line, name, row[name]) for name in _POSE]
         norm = float(np.linalg.norm(table[i, 3:]))
-        if abs(norm - 1) > _UNIT_TOLERANCE:
+        if abs(norm - 1) > _PROBE_QUATERNION_TOLERANCE:
             raise InputError(
                 f"{file} line {line}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
                 "write a unit quaternion, w last"
             )
         for name, values in spread.items():
-            values[i] = number(file, line, name, row[name])
+            values[i] = finite_number(file, line, name, row[name])
             if values[i] <= 0:
                 raise InputError(f"{file} line {line}: {name} is {values[i]:g}; write a positive number")
     T = frames.from_quaternion(table[:, :3], table[:, 3:])

@@ -41,7 +41,7 @@ class Intrinsics:
     units_per_metre: float | None  # of the depth, where the file states it
 
 
-def intrinsics_beside(image: Path) -> Intrinsics:
+def find_intrinsics(image: Path) -> Intrinsics:
     """Intrinsics of an image: a file of its own name, or the one of its folder or of the folder above.
 
     Raises:
@@ -49,13 +49,13 @@ def intrinsics_beside(image: Path) -> Intrinsics:
     """
     own = [image.with_suffix(ending) for ending in _ENDINGS if image.with_suffix(ending).is_file()]
     for file in own:
-        found = _read(file)
+        found = _read_intrinsics(file)
         if found is not None:
             return found
     for folder in (image.parent, image.parent.parent):
         files = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in _ENDINGS and _NAMED.search(f.stem)]
         of_depth = [f for f in files if "depth" in f.stem.lower()]
-        read = [found for f in of_depth or files if (found := _read(f)) is not None]
+        read = [found for f in of_depth or files if (found := _read_intrinsics(f)) is not None]
         if len(read) > 1:
             names = ", ".join(found.source.name for found in read[:3])
             raise InputError(
@@ -66,7 +66,7 @@ def intrinsics_beside(image: Path) -> Intrinsics:
     raise InputError(f"{image}: a depth image needs intrinsics, none lie beside it; {_FIX}")
 
 
-def _read(file: Path) -> Intrinsics | None:
+def _read_intrinsics(file: Path) -> Intrinsics | None:
     """None for a file that holds no intrinsics."""
     if file.stat().st_size > _LARGEST_MB * 1e6:
         return None
@@ -81,24 +81,24 @@ def _read(file: Path) -> Intrinsics | None:
             document = documents[0] if documents else None
     except (ValueError, RecursionError, InputError):
         return None
-    for level in _levels(document):
-        found = _of(file, level)
+    for level in _document_levels(document):
+        found = _intrinsics_of_level(file, level)
         if found is not None:
             return found
     return None
 
 
-def _levels(document: Any) -> Iterator[dict[str, Any]]:
+def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
     """Every mapping of a document, those of the depth first."""
     if isinstance(document, dict):
         plain = {str(key).lower(): value for key, value in document.items()}
         yield plain
         for key in sorted(plain, key=lambda key: "depth" not in key):
-            yield from _levels(plain[key])
+            yield from _document_levels(plain[key])
 
 
-def _of(file: Path, level: dict[str, Any]) -> Intrinsics | None:
-    matrix = _matrix(level)
+def _intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
+    matrix = _camera_matrix(level)
     if matrix is None:
         return None
     fx, fy, cx, cy = matrix
@@ -106,14 +106,14 @@ def _of(file: Path, level: dict[str, Any]) -> Intrinsics | None:
         raise InputError(
             f"{file}: fx = {fx:g}, fy = {fy:g} are no focal lengths; to fix: state them in pixels, above 0"
         )
-    width, height = (_whole(level, *names) for names in (("width", "image_width"), ("height", "image_height")))
+    width, height = (_whole_number(level, *names) for names in (("width", "image_width"), ("height", "image_height")))
     size = None if width is None or height is None else (width, height)
     return Intrinsics(
         file, fx, fy, cx, cy, distortion=_distortion(level), size=size, units_per_metre=_units_per_metre(file, level)
     )
 
 
-def _matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
+def _camera_matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
     """fx, fy, cx, cy."""
     inner = level.get("cameramatrix")
     if isinstance(inner, dict):
@@ -123,7 +123,7 @@ def _matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
             fx, fy, cx, cy = (float(level[name]) for name in names)
             return fx, fy, cx, cy
     for name, by_columns in (("camera_matrix", False), ("k", False), ("intrinsic_matrix", True)):
-        K = _numbers(level.get(name))
+        K = _list_numbers(level.get(name))
         if len(K) == 9:
             K = K.reshape(3, 3)
             # Open3D writes by columns: its last row 0 0 1 tells.
@@ -132,7 +132,7 @@ def _matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
     return None
 
 
-def _numbers(value: Any) -> Array:
+def _list_numbers(value: Any) -> Array:
     """Numbers of a list, of a list of lists, or of a mapping with `data`; none of anything else."""
     if isinstance(value, dict):
         value = value.get("data", [])
@@ -149,11 +149,11 @@ def _distortion(level: dict[str, Any]) -> Array:
         found = np.array([float(named.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")])
     else:
         names = ("distortion_coefficients", "coeffs", "d", "distortion")
-        found = next((x for name in names if len(x := _numbers(level.get(name)))), np.zeros(0))
+        found = next((x for name in names if len(x := _list_numbers(level.get(name)))), np.zeros(0))
     return found if found.any() else np.zeros(0)
 
 
-def _whole(level: dict[str, Any], *names: str) -> int | None:
+def _whole_number(level: dict[str, Any], *names: str) -> int | None:
     return next((int(level[name]) for name in names if isinstance(level.get(name), (int, float))), None)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 
-def json_object(file: Path) -> dict[str, Any]:
+def read_json_object(file: Path) -> dict[str, Any]:
     """What a JSON file holds; nothing where it is missing, damaged, or no object."""
     if not file.is_file():
         return {}

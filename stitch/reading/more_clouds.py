@@ -11,8 +11,8 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.depth_image import is_depth_image, read_depth_columns
-from stitch.reading.extras import package
-from stitch.reading.organised import measured
+from stitch.reading.extras import import_extra
+from stitch.reading.organised import measured_pixels
 
 MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
 _PTX_HEADER = 10
@@ -48,7 +48,7 @@ def read_array(path: Path) -> dict[str, Array]:
     table = array.reshape(-1, array.shape[-1])
     names = [*"xyz", *(f"scalar_{i}" for i in range(table.shape[1] - 3))]
     columns = dict(zip(names, table.T, strict=True))
-    return measured(columns) if array.ndim == 3 else columns
+    return measured_pixels(columns) if array.ndim == 3 else columns
 
 
 def read_ptx(path: Path) -> dict[str, Array]:
@@ -62,29 +62,29 @@ def read_ptx(path: Path) -> dict[str, Array]:
     if len(rows) < count:
         raise InputError(f"{path}: {count} points announced, data for {len(rows)}; export it again")
     if any(line.strip() for line in lines[_PTX_HEADER + count :]):
-        raise InputError(_several(path, "several scans"))
+        raise InputError(_several_scans_message(path, "several scans"))
     table = np.loadtxt(rows, ndmin=2)
     return dict(zip([*"xyz", "intensity"], table.T, strict=False))
 
 
 def read_las(path: Path) -> dict[str, Array]:
     """Columns (N,) x, y, z and intensity of LAS and LAZ, by laspy."""
-    las = package("laspy", path, "formats").read(path)
+    las = import_extra("laspy", path, "formats").read(path)
     xyz = np.asarray(las.xyz, float)
     return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
 
 
 def read_e57(path: Path) -> dict[str, Array]:
     """Columns (N,) of the one scan of an E57 in its own frame, by pye57."""
-    file = package("pye57", path, "formats").E57(str(path))
+    file = import_extra("pye57", path, "formats").E57(str(path))
     if file.scan_count != 1:
-        raise InputError(_several(path, f"{file.scan_count} scans"))
+        raise InputError(_several_scans_message(path, f"{file.scan_count} scans"))
     scan = file.read_scan(0, ignore_missing_fields=True, transform=False)
     columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
     if "intensity" in scan:
         columns["intensity"] = np.asarray(scan["intensity"], float)
-    return measured(columns)
+    return measured_pixels(columns)
 
 
-def _several(path: Path, held: str) -> str:
+def _several_scans_message(path: Path, held: str) -> str:
     return f"{path}: holds {held}, a file is one view; to fix: export every scan to a file of its own"

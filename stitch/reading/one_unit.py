@@ -7,15 +7,15 @@ import numpy as np
 
 from stitch.errors import InputError
 
-_SHOWN = 4
+_LISTED_CLOUDS = 4
 
 
-def possible(size_m: float, limits: tuple[float, float]) -> bool:
+def is_plausible_size(size_m: float, limits: tuple[float, float]) -> bool:
     """Whether a size, m, can be; 0 says nothing."""
     return limits[0] <= size_m <= limits[1] or size_m == 0
 
 
-def shown_length(size_m: float) -> str:
+def length_message(size_m: float) -> str:
     """A length for a message."""
     return f"{size_m * 1e3:.3g} mm" if size_m < 1 else f"{size_m:.3g} m"
 
@@ -32,13 +32,13 @@ def require_one_unit(
     Raises:
         InputError: names the views, and how to fix it.
     """
-    odd = {name: size for name, size in sizes.items() if not possible(size, limits)}
+    odd = {name: size for name, size in sizes.items() if not is_plausible_size(size, limits)}
     others = [size for name, size in sizes.items() if name not in odd]
     if not odd or len(odd) > len(others):
         return
     one = len(odd) == 1
-    names = ", ".join([*odd][:_SHOWN]) + " …" * (len(odd) > _SHOWN)
-    size, usual = (shown_length(float(np.median(found))) for found in ([*odd.values()], others))
+    names = ", ".join([*odd][:_LISTED_CLOUDS]) + " …" * (len(odd) > _LISTED_CLOUDS)
+    size, usual = (length_message(float(np.median(found))) for found in ([*odd.values()], others))
     raise InputError(
         f"{toml}: the points of view{'' if one else 's'} {names} {does.format(size)}, those of the others (usually) "
         f'{usual}, with cloud_unit = "{cloud_unit}": {"that cloud alone is" if one else "those clouds are"} in another '

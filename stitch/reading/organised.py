@@ -23,7 +23,7 @@ def grid_shape(path: Path) -> tuple[int, int] | None:
     return (rows, size.get(b"WIDTH", size.get(b"num_cols", 0))) if rows > 1 else None
 
 
-def measured(columns: dict[str, Array]) -> dict[str, Array]:
+def measured_pixels(columns: dict[str, Array]) -> dict[str, Array]:
     """The columns (N,) without pixels of which x, y and z are NaN."""
     if not all(axis in columns for axis in "xyz"):
         return columns

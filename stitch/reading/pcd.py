@@ -24,7 +24,7 @@ def read_pcd(path: Path) -> dict[str, Array]:
     """
     raw = path.read_bytes()
     header, encoding, start = _header(path, raw)
-    layout, count = _layout(path, header)
+    layout, count = _binary_layout(path, header)
     body = raw[start:]
     if encoding == "ascii":
         return _ascii(path, body, header, count)
@@ -35,7 +35,7 @@ def read_pcd(path: Path) -> dict[str, Array]:
                 f"{path}: {count} points announced, data for {len(body) // layout.itemsize}; export it again"
             )
         table = np.frombuffer(body, layout, count)
-        return {name: table[str(i)] for name, i in _wanted(header).items()}
+        return {name: table[str(i)] for name, i in _scalar_fields(header).items()}
     if encoding == "binary_compressed":
         return _compressed(path, body, header, layout, count)
     raise InputError(f"{path}: PCD DATA {encoding!r} is unknown; use ascii, binary or binary_compressed")
@@ -56,7 +56,7 @@ def _header(path: Path, raw: bytes) -> tuple[dict[str, list[str]], str, int]:
             header[words[0]] = words[1:]
 
 
-def _layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[np.void], int]:
+def _binary_layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[np.void], int]:
     try:
         fields = header["FIELDS"]
         counts = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
@@ -76,7 +76,7 @@ def _counts(header: dict[str, list[str]]) -> list[int]:
     return [int(c) for c in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
 
 
-def _wanted(header: dict[str, list[str]]) -> dict[str, int]:
+def _scalar_fields(header: dict[str, list[str]]) -> dict[str, int]:
     """Field name -> position in FIELDS, without padding and vectors."""
     fields = zip(header["FIELDS"], _counts(header), strict=True)
     return {name: i for i, (name, count) in enumerate(fields) if count == 1 and name != "_"}
@@ -91,7 +91,7 @@ def _ascii(path: Path, body: bytes, header: dict[str, list[str]], count: int) ->
     if len(table) < count:
         raise InputError(f"{path}: {count} points announced, data for {len(table)}; export it again")
     first = np.concatenate([[0], np.cumsum(counts)])
-    return {name: table[:, first[i]] for name, i in _wanted(header).items()}
+    return {name: table[:, first[i]] for name, i in _scalar_fields(header).items()}
 
 
 def _compressed(
@@ -106,4 +106,4 @@ def _compressed(
         raise InputError(f"{path}: compressed data do not give its {count} points; export it again")
     sizes = [layout[name].itemsize for name in layout.names or ()]
     first = np.concatenate([[0], np.cumsum(sizes)]) * count
-    return {name: np.frombuffer(data, layout[i], count, int(first[i])) for name, i in _wanted(header).items()}
+    return {name: np.frombuffer(data, layout[i], count, int(first[i])) for name, i in _scalar_fields(header).items()}

@@ -9,7 +9,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.reading.one_unit import possible, require_one_unit, shown_length
+from stitch.reading.one_unit import is_plausible_size, length_message, require_one_unit
 from stitch.units import METRES
 
 # What one scan of a robot's scanner shows, in metres: from a borescope to a hull.
@@ -21,10 +21,10 @@ _SIGHT_M = 100.0
 # Reach of robots, in metres.
 _REACH_M = (0.03, 60.0)
 # A target moves about as far as the flange: not a few hundred times more or less.
-_MOTION = 300.0
+_MOTION_RATIO = 300.0
 # Fields of view over the working distance; a 1000 times less or more is another unit.
-_FIELD = (2e-3, 30.0)
-_OTHER = {"mm": "m", "m": "mm"}
+_FIELD_SIZE = (2e-3, 30.0)
+_OTHER_UNIT = {"mm": "m", "m": "mm"}
 
 
 def check_scale(session: Session, cloud_unit: str) -> None:
@@ -38,7 +38,7 @@ def check_scale(session: Session, cloud_unit: str) -> None:
     own = session.length_unit
     clouds = [(view.name, view.cloud) for view in session.views if view.cloud is not None]
     away = {name: metres * _median_distance(cloud.points) for name, cloud in clouds}
-    over = {name: metres * _size(cloud.points) for name, cloud in clouds}
+    over = {name: metres * _trimmed_extent(cloud.points) for name, cloud in clouds}
     for sizes, limits, does, how in ((away, (0.0, _RANGE_M), "lie", "away"), (over, _SIZE_M, "extend over", "")):
         require_one_unit(toml, sizes, limits, f"{does} {{}}{' ' * bool(how)}{how}", cloud_unit)
         for name, size in sizes.items():
@@ -59,7 +59,7 @@ def _median_distance(points: Array) -> float:
     return float(np.median(np.linalg.norm(points, axis=1)))
 
 
-def _size(points: Array) -> float:
+def _trimmed_extent(points: Array) -> float:
     """The longest side of the box around all but the outermost points."""
     low, high = np.percentile(points, (5, 95), axis=0)
     return float((high - low).max())
@@ -76,10 +76,10 @@ def require_near(what: str, points: Array) -> None:
 
 
 def _refuse(size_m: float, limits: tuple[float, float], what: str, how: str, key: str, unit: str) -> None:
-    if possible(size_m, limits):
+    if is_plausible_size(size_m, limits):
         return
-    shown = shown_length(size_m)
-    hint = f'the scale looks off by 1000: set {key} = "{_OTHER[unit]}"'
+    shown = length_message(size_m)
+    hint = f'the scale looks off by 1000: set {key} = "{_OTHER_UNIT[unit]}"'
     raise InputError(f'{what} {shown}{" " * bool(how)}{how} with {key} = "{unit}"; {hint}')
 
 
@@ -90,9 +90,9 @@ def _compare_motions(session: Session, flange: Array) -> None:
         return
     names = np.concatenate([sighting.targets for sighting in seen])
     points = np.concatenate([sighting.points for sighting in seen]) * METRES[session.length_unit]
-    moved, arm = max(_spread(points[names == name]) for name in np.unique(names)), _spread(flange)
+    moved, arm = max(_extent(points[names == name]) for name in np.unique(names)), _extent(flange)
     # A target that one view sees has not moved at all.
-    if min(moved, arm) > 0 and not 1 / _MOTION < moved / arm < _MOTION:
+    if min(moved, arm) > 0 and not 1 / _MOTION_RATIO < moved / arm < _MOTION_RATIO:
         raise InputError(
             f"{session.path / 'session.toml'}: the targets move over {moved * 1e3:.3g} mm, the flange over "
             f"{arm * 1e3:.3g} mm; the scale looks off by 1000: write poses and targets in length_unit "
@@ -100,7 +100,7 @@ def _compare_motions(session: Session, flange: Array) -> None:
         )
 
 
-def _spread(points: Array) -> float:
+def _extent(points: Array) -> float:
     """The longest side of the box around points."""
     return float(np.ptp(points, axis=0).max())
 
@@ -110,9 +110,9 @@ def _compare_standoff(session: Session, cloud_unit: str) -> None:
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     if not clouds or not session.scanner.standoff:
         return
-    size = float(np.median([_size(points) for points in clouds]))
+    size = float(np.median([_trimmed_extent(points) for points in clouds]))
     distance = float(np.median([_median_distance(points) for points in clouds]))
-    low, high = _FIELD
+    low, high = _FIELD_SIZE
     if size < low * session.scanner.standoff or max(size, distance) > high * session.scanner.standoff:
         raise InputError(
             f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away over "

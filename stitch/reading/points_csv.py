@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.measurement.labelled_points import Nominal, Sighting
-from stitch.reading.csv_lines import read_lines
-from stitch.reading.csv_number import number
+from stitch.measurement.labelled_points import NominalTargets, Sighting
+from stitch.reading.csv_lines import read_csv_lines
+from stitch.reading.csv_number import finite_number
 from stitch.reading.names import require_name
 from stitch.reading.text_file import shortened
 
@@ -27,7 +27,7 @@ def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
     allowed = set(known)
     rows: dict[str, list[tuple[str, list[float]]]] = {}
     seen: dict[tuple[str, str], int] = {}
-    for line, row in _rows(file, ("view", "target", *_XYZ)):
+    for line, row in _table_rows(file, ("view", "target", *_XYZ)):
         view, target = row["view"], row["target"]
         if view not in allowed:
             raise InputError(
@@ -39,7 +39,7 @@ def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
                 "leave one out, or name it otherwise"
             )
         seen[view, target] = line
-        rows.setdefault(view, []).append((target, _numbers(file, line, row)))
+        rows.setdefault(view, []).append((target, _point_numbers(file, line, row)))
     table = {view: np.array([numbers for _, numbers in found]) for view, found in rows.items()}
     return {
         view: Sighting(tuple(name for name, _ in found), table[view][:, :3], table[view][:, 3])
@@ -47,35 +47,35 @@ def read_points(file: Path, known: Sequence[str]) -> dict[str, Sighting]:
     }
 
 
-def read_targets(file: Path, seen: Sequence[str]) -> Nominal:
+def read_targets(file: Path, sighted: Sequence[str]) -> NominalTargets:
     """Read and check targets.csv.
 
     Args:
-        seen: targets of points.csv; one of them at least must be here.
+        sighted: targets of points.csv; one of them at least must be here.
 
     Raises:
         InputError: names the line and how to fix it.
     """
     lines: dict[str, int] = {}
     table = []
-    for line, row in _rows(file, ("target", *_XYZ)):
+    for line, row in _table_rows(file, ("target", *_XYZ)):
         name = row["target"]
         if name in lines:
             raise InputError(f"{file} line {line}: target {name} stands on line {lines[name]} already; leave one out")
         lines[name] = line
-        table.append(_numbers(file, line, row))
-    if not set(lines) & set(seen):
+        table.append(_point_numbers(file, line, row))
+    if not set(lines) & set(sighted):
         raise InputError(
             f"{file}: none of its targets ({', '.join(list(lines)[:4])}) is seen in points.csv "
-            f"({', '.join(list(seen)[:4])}); use the same names, or remove the file"
+            f"({', '.join(list(sighted)[:4])}); use the same names, or remove the file"
         )
     numbers = np.array(table)
-    return Nominal(tuple(lines), numbers[:, :3], numbers[:, 3])
+    return NominalTargets(tuple(lines), numbers[:, :3], numbers[:, 3])
 
 
-def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+def _table_rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     """Line number and cells by column of every row."""
-    header, cells = read_lines(file)
+    header, cells = read_csv_lines(file)
     missing = [name for name in needed if name not in header]
     if missing:
         raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")
@@ -90,7 +90,7 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]
     return out
 
 
-def _numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
+def _point_numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
     """x, y, z and sigma, NaN where its cell is empty or the column absent."""
     out = []
     for column in (*_XYZ, "sigma"):
@@ -98,7 +98,7 @@ def _numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
         if column == "sigma" and not cell:
             out.append(float("nan"))
             continue
-        out.append(number(file, line, column, cell))
+        out.append(finite_number(file, line, column, cell))
     if out[3] <= 0:
         raise InputError(f"{file} line {line}: sigma is {out[3]:g}; write a positive number or leave it empty")
     return out

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.reading.extras import package
+from stitch.reading.extras import import_extra
 
 _HEAD = 4096
 # From here E57 counts seconds (ASTM E2807).
@@ -61,7 +61,7 @@ def times_in_scans(files: list[Path]) -> list[str] | None:
 
 def _e57_seconds(file: Path) -> float:
     """Zero where the header has no time."""
-    opened = package("pye57", file, "formats").E57(str(file))
+    opened = import_extra("pye57", file, "formats").E57(str(file))
     try:
         return float(opened.get_header(0).acquisitionStart_dateTimeValue)
     except Exception:  # of libe57's own kinds: the standard lets the entry out
@@ -70,7 +70,7 @@ def _e57_seconds(file: Path) -> float:
 
 def _e57(file: Path) -> Array | None:
     # A header is good for as long as its file is open.
-    opened = package("pye57", file, "formats").E57(str(file))
+    opened = import_extra("pye57", file, "formats").E57(str(file))
     header = opened.get_header(0)
     return frames.make(header.rotation_matrix, header.translation) if header.has_pose() else None
 

@@ -34,7 +34,7 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
         InputError: a file that cannot be read, or a picture of another size than its scan.
     """
     try:
-        points, grey = _read(path)
+        points, grey = _read_pixels(path)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises at bytes that are no scan
@@ -42,10 +42,10 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
     if points is None:
         return None
     if grey is None:
-        beside = picture_beside(path)
+        beside = find_picture(path)
         if beside is None:
             return None
-        grey = _picture(beside)
+        grey = _read_picture(beside)
         if grey.shape != points.shape[:2]:
             sizes = [f"{shape[1]}×{shape[0]}" for shape in (grey.shape, points.shape)]
             raise InputError(
@@ -57,12 +57,12 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
     return RangeImage(points * scale, grey)
 
 
-def _read(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
+def _read_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
     kind = path.suffix.lower()
     if kind in DEPTH_SUFFIXES or (kind == ".npy" and is_depth_image(path)):
         return read_depth(path), None
     if kind == ".npy":
-        return _of_array(path)
+        return _array_pixels(path)
     if kind == ".zdf":
         points, colours = read_zdf_image(path)
         return points, None if colours is None else _grey(colours)
@@ -73,7 +73,7 @@ def _read(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
     if len(columns["x"]) != shape[0] * shape[1]:
         return None, None
     points = np.stack([np.asarray(columns[axis], float) for axis in "xyz"], axis=1).reshape(*shape, 3)
-    grey = _of_columns(columns)
+    grey = _brightness_of_columns(columns)
     return points, None if grey is None else grey.reshape(shape)
 
 
@@ -94,7 +94,7 @@ def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) ->
     }
 
 
-def _of_array(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
+def _array_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
     """(H, W, 3) without brightness, (H, W, 4) with it, (H, W, 6) with red, green and blue."""
     array = np.load(path, allow_pickle=False)
     if array.ndim != 3 or array.shape[2] < 3:
@@ -103,7 +103,7 @@ def _of_array(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
     return np.asarray(array[..., :3], float), None if not len(rest) else _grey(rest[:3] if len(rest) >= 3 else rest[:1])
 
 
-def _of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | None:
+def _brightness_of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | None:
     for names in _RGB:
         if all(name in columns for name in names):
             return _grey(np.array([columns[name] for name in names], float))
@@ -125,7 +125,7 @@ def _grey(channels: Array) -> NDArray[np.uint8]:
     return np.asarray(np.clip(values * (255.0 / white), 0, 255), np.uint8)
 
 
-def picture_beside(scan: Path) -> Path | None:
+def find_picture(scan: Path) -> Path | None:
     """The colour or grey image of a scan: named like it with another ending, or by colour and the same number."""
     numbers = re.findall(r"\d+", scan.stem)
     folders = [scan.parent, *(f for f in sorted(scan.parent.parent.iterdir()) if f.is_dir() and _COLOUR.search(f.name))]
@@ -140,7 +140,7 @@ def picture_beside(scan: Path) -> Path | None:
     return None
 
 
-def _picture(file: Path) -> NDArray[np.uint8]:
+def _read_picture(file: Path) -> NDArray[np.uint8]:
     from PIL import Image
 
     with Image.open(file) as image:

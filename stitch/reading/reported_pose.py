@@ -8,12 +8,12 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
-from stitch.reading.csv_lines import read_lines
-from stitch.reading.csv_number import number
+from stitch.reading.csv_lines import read_csv_lines
+from stitch.reading.csv_number import finite_number
 
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 # A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
-_UNIT_TOLERANCE = 1e-3
+_FLANGE_QUATERNION_TOLERANCE = 1e-3
 # Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
 # degrees and percents of the reach are another convention.
 _ANGLE_TOLERANCE = np.radians(2.0)
@@ -24,8 +24,8 @@ def has_reported_poses(file: Path) -> bool:
     """True if some row of a views.csv that was read before reports a pose; False where there is no such file."""
     if not file.is_file():
         return False
-    header, rows = read_lines(file)
-    columns = [k for k, name in enumerate(header) if name in POSE]
+    header, rows = read_csv_lines(file)
+    columns = [k for k, name in enumerate(header) if name in POSE_COLUMNS]
     return any(cells[k].strip() for _, cells in rows for k in columns)
 
 
@@ -42,16 +42,16 @@ def flange_pose(
         InputError: neither stands there, or what stands there is no pose, or not that of the joints.
     """
     from_joints = forward(robot, joints) if robot and joints is not None else None
-    given = [row.get(column, "") for column in POSE]
+    given = [row.get(column, "") for column in POSE_COLUMNS]
     if not any(given):
         if from_joints is None:
             raise InputError(
-                f"{file} line {line}: view {name} has no pose; fill {','.join(POSE)} or the joints, or remove the row"
+                f"{file} line {line}: view {name} has no pose; fill {','.join(POSE_COLUMNS)} or the joints, or remove the row"
             )
         return from_joints
-    values = np.array([number(file, line, c, cell) for c, cell in zip(POSE, given, strict=True)])
+    values = np.array([finite_number(file, line, c, cell) for c, cell in zip(POSE_COLUMNS, given, strict=True)])
     norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1) > _UNIT_TOLERANCE:
+    if abs(norm - 1) > _FLANGE_QUATERNION_TOLERANCE:
         raise InputError(
             f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
             "write a unit quaternion, w last"

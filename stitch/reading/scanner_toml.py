@@ -9,15 +9,15 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Scanner, SensorKind
-from stitch.reading.session_toml import LARGEST, positive
+from stitch.reading.session_toml import LARGEST, positive_number
 from stitch.reading.text_file import shortened
-from stitch.reading.toml_file import choice
+from stitch.reading.toml_file import table_choice
 
 # Effects of the scanner count its field as x/z and y/z: they know no scanner that looks along x or y.
 _AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
 
 
-def scanner(file: Path, table: dict[str, Any]) -> Scanner:
+def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
     """[scanner]; lengths in length_unit.
 
     Raises:
@@ -31,13 +31,13 @@ def scanner(file: Path, table: dict[str, Any]) -> Scanner:
         )
     T_mount = None
     if "pose" in table:
-        T_mount = _pose(file, table["pose"])
-    noise, standoff = (positive(file, table, "scanner", key) for key in ("noise", "standoff"))
-    kind = choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
+        T_mount = _read_pose(file, table["pose"])
+    noise, standoff = (positive_number(file, table, "scanner", key) for key in ("noise", "standoff"))
+    kind = table_choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
     return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind))
 
 
-def within(file: Path, table: dict[str, Any]) -> Array | None:
+def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:
     """[scanner] within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit.
 
     Raises:
@@ -59,7 +59,7 @@ def within(file: Path, table: dict[str, Any]) -> Array | None:
     return box.astype(float)
 
 
-def _pose(file: Path, value: Any) -> Array:
+def _read_pose(file: Path, value: Any) -> Array:
     try:
         T = np.array(value, float)
     except (TypeError, ValueError, OverflowError):

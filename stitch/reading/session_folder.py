@@ -9,9 +9,9 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
-from stitch.measurement.labelled_points import Nominal, Sighting
+from stitch.measurement.labelled_points import NominalTargets, Sighting
 from stitch.measurement.session import Mount, Scanner, Session, View
-from stitch.measurement.thinning import ENOUGH, points_within
+from stitch.measurement.thinning import MAX_POINTS, points_within
 from stitch.reading import scanner_toml, session_toml
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.plausible import check_scale
@@ -19,8 +19,8 @@ from stitch.reading.points_csv import read_points, read_targets
 from stitch.reading.rights import readable
 from stitch.reading.session_scans import read_scans
 from stitch.reading.text_file import require_file
-from stitch.reading.toml_file import choice
-from stitch.reading.views_csv import Row, read_views, row_at
+from stitch.reading.toml_file import table_choice
+from stitch.reading.views_csv import ViewRow, read_views, row_at
 from stitch.units import METRES
 
 
@@ -29,7 +29,7 @@ def load_session(
     path: Path | str,
     scans: bool = True,
     start: Array | None = None,
-    at_most: int | None = ENOUGH,
+    at_most: int | None = MAX_POINTS,
     memory: float | None = None,
 ) -> Session:
     """Read and check a session folder.
@@ -45,35 +45,35 @@ def load_session(
     """
     path = Path(path)
     file = path / "session.toml"
-    document = session_toml.document(file)
-    unit = choice(file, document, "length_unit", tuple(METRES))
-    mount = choice(file, document, "mount", get_args(Mount))
-    robot = session_toml.robot(file, document.get("robot"), unit)
+    document = session_toml.read_session_document(file)
+    unit = table_choice(file, document, "length_unit", tuple(METRES))
+    mount = table_choice(file, document, "mount", get_args(Mount))
+    robot = session_toml.read_robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
-    cloud_unit = choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
-    scanner = scanner_toml.scanner(file, document.get("scanner", {}))
-    views = _views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)
-    cad, cad_unit = session_toml.cad(file, document.get("part", {}))
+    cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
+    scanner = scanner_toml.read_scanner(file, document.get("scanner", {}))
+    views = _read_session_views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)
+    cad, cad_unit = session_toml.cad_file(file, document.get("part", {}))
     session = Session(
         path=path,
-        name=session_toml.name_of(file, document),
+        name=session_toml.session_name(file, document),
         length_unit=unit,
         mount=mount,  # type: ignore[arg-type]
         scanner=scanner,
         robot=robot,
-        sphere_radius=session_toml.positive(file, document.get("sphere", {}), "sphere", "radius"),
+        sphere_radius=session_toml.positive_number(file, document.get("sphere", {}), "sphere", "radius"),
         cad=cad,
         cad_unit=cad_unit,
         views=views,
-        nominal=_nominal(path, views),
-        repeatability=session_toml.repeatability(file, document.get("robot")),
+        nominal=_read_nominal(path, views),
+        repeatability=session_toml.read_repeatability(file, document.get("robot")),
     )
     if scans:
         check_scale(session, cloud_unit)
     return session
 
 
-def _sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
+def _read_sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
     """By view, from points.csv or frames.csv."""
     points, frames_file = path / "points.csv", path / "frames.csv"
     for optional in (points, frames_file, path / "targets.csv"):
@@ -95,7 +95,7 @@ def _sightings(path: Path, known: list[str]) -> dict[str, Sighting]:
     }
 
 
-def _nominal(path: Path, views: tuple[View, ...]) -> Nominal | None:
+def _read_nominal(path: Path, views: tuple[View, ...]) -> NominalTargets | None:
     file = path / "targets.csv"
     if not file.is_file():
         return None
@@ -105,10 +105,10 @@ def _nominal(path: Path, views: tuple[View, ...]) -> Nominal | None:
     return read_targets(file, sorted({name for names in seen for name in names}))
 
 
-def _views(
+def _read_session_views(
     path: Path,
     document: dict[str, Any],
-    rows: list[Row],
+    rows: list[ViewRow],
     scanner: Scanner,
     *,
     scans: bool,
@@ -116,10 +116,10 @@ def _views(
     memory: float | None,
 ) -> tuple[View, ...]:
     """The rows with what was seen."""
-    sightings = _sightings(path, [row.name for row in rows]) if scans else {}
+    sightings = _read_sightings(path, [row.name for row in rows]) if scans else {}
     if memory is not None:
-        at_most = min(at_most or ENOUGH, points_within(memory, len(rows)))
-    within = scanner_toml.within(path / "session.toml", document.get("scanner", {}))
+        at_most = min(at_most or MAX_POINTS, points_within(memory, len(rows)))
+    within = scanner_toml.read_crop_box(path / "session.toml", document.get("scanner", {}))
     unit = document["length_unit"]
     clouds: Iterable[Cloud | None] = [None] * len(rows)
     if scans:

@@ -10,10 +10,10 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.session import Scanner
-from stitch.measurement.thinning import thinned_cloud
+from stitch.measurement.thinning import thin_cloud
 from stitch.reading.clouds import read_cloud
 from stitch.reading.plausible import require_near
-from stitch.reading.views_csv import Row
+from stitch.reading.views_csv import ViewRow
 from stitch.system.threads import parallel
 from stitch.units import METRES
 
@@ -23,7 +23,7 @@ _FEWEST = 3
 
 def read_scans(
     path: Path,
-    rows: Sequence[Row],
+    rows: Sequence[ViewRow],
     length_unit: str,
     cloud_unit: str,
     scanner: Scanner,
@@ -41,13 +41,13 @@ def read_scans(
     Raises:
         InputError: a file missing, broken, with too few points or in another unit; names the view and its line.
     """
-    read = partial(_read, scale=METRES[cloud_unit] / METRES[length_unit], within=within)
-    cloud = partial(_cloud, path, read=read, metres=METRES[length_unit], scanner=scanner, at_most=at_most)
+    read = partial(_read_cropped, scale=METRES[cloud_unit] / METRES[length_unit], within=within)
+    cloud = partial(_scan_of_row, path, read=read, metres=METRES[length_unit], scanner=scanner, at_most=at_most)
     return parallel(cloud, rows, "reading scans")
 
 
-def _cloud(
-    path: Path, row: Row, read: Callable[[Path], Cloud], metres: float, scanner: Scanner, at_most: int | None
+def _scan_of_row(
+    path: Path, row: ViewRow, read: Callable[[Path], Cloud], metres: float, scanner: Scanner, at_most: int | None
 ) -> Cloud | None:
     if not row.cloud:
         return None
@@ -81,10 +81,10 @@ def checked_scan(
         )
     # Looked at before some are taken: each of them will be fused.
     require_near(where, cloud.points * metres)
-    return cloud if at_most is None else thinned_cloud(name, cloud, at_most, scanner, read)
+    return cloud if at_most is None else thin_cloud(name, cloud, at_most, scanner, read)
 
 
-def _read(file: Path, scale: float, within: Array | None) -> Cloud:
+def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:
     """A scan in length_unit, what counts of it."""
     cloud = read_cloud(file, scale)
     if within is None:

@@ -8,14 +8,14 @@ from typing import Any
 from stitch.errors import InputError
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import StatedRepeatability
-from stitch.reading.dh_rows import known_keys, numbers, robot_from_dh
+from stitch.reading.dh_rows import require_known_keys, robot_from_dh, table_numbers
 from stitch.reading.names import require_folder_name, require_name
 from stitch.reading.text_file import shortened
-from stitch.reading.toml_file import choice, read_toml, text
+from stitch.reading.toml_file import optional_text, read_toml, table_choice
 from stitch.reading.urdf import robot_from_urdf
 from stitch.units import METRES
 
-FORMAT = "stitch-session/1"
+SESSION_FORMAT = "stitch-session/1"
 
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
@@ -28,7 +28,7 @@ _KEYS = {
 LARGEST = 1e12
 
 
-def document(file: Path) -> dict[str, Any]:
+def read_session_document(file: Path) -> dict[str, Any]:
     """The document with known tables and keys only.
 
     Raises:
@@ -43,8 +43,8 @@ def document(file: Path) -> dict[str, Any]:
     else:
         hint += f"; to fix: name a folder that exists, {shlex.quote(str(file.parent))} does not"
     document = read_toml(file, hint)
-    if document.get("format") != FORMAT:
-        raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{FORMAT}"')
+    if document.get("format") != SESSION_FORMAT:
+        raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{SESSION_FORMAT}"')
     for table, known in _KEYS.items():
         entries = document if not table else document.get(table, {})
         if not isinstance(entries, dict):
@@ -59,17 +59,17 @@ def document(file: Path) -> dict[str, Any]:
     return document
 
 
-def name_of(file: Path, document: dict[str, Any]) -> str:
+def session_name(file: Path, document: dict[str, Any]) -> str:
     """What the session is called: its name, or that of its folder.
 
     Raises:
         InputError: a name that cannot be that of its run's folder.
     """
-    stated = text(file, document, "", "name")
+    stated = optional_text(file, document, "", "name")
     return require_folder_name(str(file), file.resolve().parent.name if stated is None else stated, "name")
 
 
-def positive(file: Path, table: dict[str, Any], name: str, key: str) -> float | None:
+def positive_number(file: Path, table: dict[str, Any], name: str, key: str) -> float | None:
     """A positive number, or None where it is absent.
 
     Raises:
@@ -83,7 +83,7 @@ def positive(file: Path, table: dict[str, Any], name: str, key: str) -> float | 
     return float(value)
 
 
-def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
+def read_robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
     """[robot] by its DH rows or URDF; None without one.
 
     Raises:
@@ -91,10 +91,10 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
     """
     if not table:
         return None
-    name = require_name(f"{file}: robot", text(file, table, "robot", "name") or "robot", "name")
-    gravity = numbers(f"{file}: robot", {"gravity": [0.0, 0.0, -9.81]} | table, "gravity", (3,))
+    name = require_name(f"{file}: robot", optional_text(file, table, "robot", "name") or "robot", "name")
+    gravity = table_numbers(f"{file}: robot", {"gravity": [0.0, 0.0, -9.81]} | table, "gravity", (3,))
     payload = table.get("payload")
-    urdf, base, flange = (text(file, table, "robot", key) for key in ("urdf", "base_link", "flange_link"))
+    urdf, base, flange = (optional_text(file, table, "robot", key) for key in ("urdf", "base_link", "flange_link"))
     if urdf is not None:
         return robot_from_urdf(file.parent / urdf, base, flange, unit, gravity, payload)
     if "joints" not in table and "repeatability" in table:
@@ -109,7 +109,7 @@ def robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
         raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
 
 
-def repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatability:
+def read_repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatability:
     """[robot] repeatability = { position, rotation_mrad }; position in length_unit.
 
     Raises:
@@ -119,19 +119,21 @@ def repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatabili
     if stated is None:
         return StatedRepeatability()
     where = f"{file}: robot.repeatability"
-    known_keys(where, stated, ("position", "rotation_mrad"))
-    position, turn = (positive(file, stated, "robot.repeatability", key) for key in ("position", "rotation_mrad"))
+    require_known_keys(where, stated, ("position", "rotation_mrad"))
+    position, turn = (
+        positive_number(file, stated, "robot.repeatability", key) for key in ("position", "rotation_mrad")
+    )
     return StatedRepeatability(position, None if turn is None else turn / 1e3)
 
 
-def cad(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
+def cad_file(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
     """Path and unit of the CAD file of [part]; None where they are absent.
 
     Raises:
         InputError: no such file, or another unit.
     """
-    name = text(file, table, "part", "cad")
+    name = optional_text(file, table, "part", "cad")
     path = None if name is None else file.parent / name
     if path is not None and not path.is_file():
         raise InputError(f"{file}: part.cad names {path}, which is no file; to fix: correct the path")
-    return path, choice(file, table, "cad_unit", tuple(METRES)) if "cad_unit" in table else None
+    return path, table_choice(file, table, "cad_unit", tuple(METRES)) if "cad_unit" in table else None

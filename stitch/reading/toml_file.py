@@ -29,7 +29,7 @@ def read_toml(file: Path, hint: str) -> dict[str, Any]:
         raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
 
 
-def choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
+def table_choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
     """The word at `key`, one of those allowed.
 
     Raises:
@@ -41,7 +41,7 @@ def choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]
     return str(value)
 
 
-def text(file: Path, table: dict[str, Any], name: str, key: str) -> str | None:
+def optional_text(file: Path, table: dict[str, Any], name: str, key: str) -> str | None:
     """The text at `key` of the table that is called `name`, or None where it is absent.
 
     Raises:

@@ -13,7 +13,7 @@ from stitch.frames import Array
 from stitch.measurement.robot import Robot
 from stitch.reading.dh_rows import gravity_of, payload_of
 from stitch.reading.text_file import require_file
-from stitch.reading.urdf_elements import Element, end, fixed_to, origin, values
+from stitch.reading.urdf_elements import Element, attribute_numbers, fixed_links, link_name, origin
 from stitch.reading.urdf_meshes import link_meshes
 from stitch.units import METRES
 
@@ -41,7 +41,7 @@ def robot_from_urdf(
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
-        scale, chain = 1 / METRES[length_unit], _chain(robot, base_link, flange_link)
+        scale, chain = 1 / METRES[length_unit], _joint_chain(robot, base_link, flange_link)
         before, after, mass, com, T_last_flange = _serial_chain(robot, chain, scale)
         payload_mass, payload_com = payload_of(payload)
     except InputError as error:
@@ -79,7 +79,7 @@ def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Ar
         turn = _turn_to_z(joint)
         before.append(pending @ turn)
         after.append(frames.inverse(turn))
-        body = list(_rigid_body(root, end(joint, "child"), scale))
+        body = list(_rigid_body(root, link_name(joint, "child"), scale))
         mass.append(sum(m for m, _ in body))
         com.append(sum((m * c for m, c in body), np.zeros(3)) / (mass[-1] or 1.0))
         pending = np.eye(4)
@@ -91,16 +91,16 @@ def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Ar
     return np.array(before), np.array(after), np.array(mass), np.array(com), pending
 
 
-def _chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
+def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
     """Joints from base to flange; walked backwards, because a link has one parent."""
     parent_of: dict[str, Element] = {}
     for joint in root.findall("joint"):
-        child = end(joint, "child")
+        child = link_name(joint, "child")
         if child in parent_of:
             raise InputError(f"link {child} hangs on two joints; a URDF is a tree")
         parent_of[child] = joint
     if not base_link or not flange_link:
-        parents = {end(joint, "parent") for joint in parent_of.values()}
+        parents = {link_name(joint, "parent") for joint in parent_of.values()}
         roots, ends = (", ".join(sorted(names)) for names in (parents - set(parent_of), set(parent_of) - parents))
         raise InputError(
             "robot.urdf needs base_link and flange_link in session.toml; the tree starts at "
@@ -112,7 +112,7 @@ def _chain(root: Element, base_link: str | None, flange_link: str | None) -> lis
         if link not in parent_of or parent_of[link] in chain:
             raise InputError(f"no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
         chain.append(parent_of[link])
-        link = end(chain[-1], "parent")
+        link = link_name(chain[-1], "parent")
     return chain[::-1]
 
 
@@ -126,10 +126,10 @@ def _require_turning(joint: Element) -> None:
 
 def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
     """Mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
-    for element, T in fixed_to(root, link, scale):
+    for element, T in fixed_links(root, link, scale):
         name, inertial = element.get("name"), element.find("inertial")
         if inertial is not None and inertial.find("mass") is not None:
-            mass = values(inertial.find("mass"), "value", "0", f"link {name}")
+            mass = attribute_numbers(inertial.find("mass"), "value", "0", f"link {name}")
             if len(mass) != 1 or mass[0] < 0:
                 raise InputError(f"link {name}: mass is not a positive number")
             yield float(mass[0]), (T @ origin(inertial, scale, f"link {name}"))[:3, 3]
@@ -137,7 +137,7 @@ def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float,
 
 def _turn_to_z(joint: Element) -> Array:
     """A rotation whose z axis is the joint's axis; URDF's default axis is x."""
-    direction = values(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
+    direction = attribute_numbers(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
     length = np.linalg.norm(direction)
     if length < 1e-9:
         raise InputError(f"axis of joint {joint.get('name')} has no direction; to fix: write its axis")

@@ -14,7 +14,7 @@ from stitch.reading.dh_rows import LARGEST
 Element = ElementTree.Element
 
 
-def end(joint: Element, kind: str) -> str:
+def link_name(joint: Element, kind: str) -> str:
     """Name of the link at the `parent` or `child` end of a joint.
 
     Raises:
@@ -26,7 +26,7 @@ def end(joint: Element, kind: str) -> str:
     return str(element.get("link"))
 
 
-def fixed_to(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
+def fixed_links(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
     """A link and every link fixed to it, and where each stands in the frame of the first (4, 4)."""
     waiting = [(link, np.eye(4))]
     while waiting:
@@ -35,8 +35,8 @@ def fixed_to(root: Element, link: str, scale: float) -> Iterator[tuple[Element, 
         if element is not None:
             yield element, T
         for joint in root.findall("joint"):
-            if joint.get("type") == "fixed" and end(joint, "parent") == name:
-                waiting.append((end(joint, "child"), T @ origin(joint, scale)))
+            if joint.get("type") == "fixed" and link_name(joint, "parent") == name:
+                waiting.append((link_name(joint, "child"), T @ origin(joint, scale)))
 
 
 def origin(owner: Element, scale: float, where: str = "") -> Array:
@@ -47,11 +47,11 @@ def origin(owner: Element, scale: float, where: str = "") -> Array:
     """
     where = where or f"joint {owner.get('name')}"
     element = owner.find("origin")
-    xyz, rpy = (values(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
+    xyz, rpy = (attribute_numbers(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
     return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
 
 
-def values(element: Element | None, key: str, default: str, where: str) -> Array:
+def attribute_numbers(element: Element | None, key: str, default: str, where: str) -> Array:
     """(n,) the numbers of an attribute, as many as its default has.
 
     Raises:

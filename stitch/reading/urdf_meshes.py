@@ -7,7 +7,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.robot import LinkMesh
-from stitch.reading.urdf_elements import Element, end, fixed_to, origin, values
+from stitch.reading.urdf_elements import Element, attribute_numbers, fixed_links, link_name, origin
 
 
 def link_meshes(
@@ -24,11 +24,11 @@ def link_meshes(
         T_flange_last: (4, 4) frame of the last turning joint's link in that of the flange.
     """
     turning = [joint for joint in chain if joint.get("type") != "fixed"]
-    links = [end(chain[0], "parent"), *(end(joint, "child") for joint in turning)]
+    links = [link_name(chain[0], "parent"), *(link_name(joint, "child") for joint in turning)]
     found = []
     for i, link in enumerate(links):
         T_frame_link = T_flange_last if i == len(turning) else np.eye(4)
-        for element, T in fixed_to(root, link, scale):
+        for element, T in fixed_links(root, link, scale):
             for visual in element.findall("visual"):
                 mesh = _mesh(visual, folder, scale)
                 if mesh is not None:
@@ -44,7 +44,7 @@ def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Arr
     if file is None:
         return None
     try:
-        return origin(visual, scale, "visual"), file, values(mesh, "scale", "1 1 1", "visual") * scale
+        return origin(visual, scale, "visual"), file, attribute_numbers(mesh, "scale", "1 1 1", "visual") * scale
     except InputError:
         return None
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.extras import package
-from stitch.reading.organised import measured
+from stitch.reading.extras import import_extra
+from stitch.reading.organised import measured_pixels
 
 _COLOURS = ("red", "green", "blue")
 
@@ -26,7 +26,7 @@ def read_zdf(path: Path) -> dict[str, Array]:
     columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
     if colours is not None:
         columns |= dict(zip(_COLOURS, colours.reshape(3, -1), strict=True))
-    return measured(columns)
+    return measured_pixels(columns)
 
 
 def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
@@ -35,7 +35,7 @@ def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
     Raises:
         InputError: h5py is not installed, or another layout.
     """
-    with package("h5py", path, "formats").File(path, "r") as file:
+    with import_extra("h5py", path, "formats").File(path, "r") as file:
         told = file.get("data/pointcloud")
         if told is None or len(told.shape) != 3 or told.shape[2] != 3:
             raise InputError(f"{path}: no data/pointcloud of x, y, z in it; to fix: save it as PLY in Zivid Studio")

@@ -23,7 +23,7 @@ class Recorder(Protocol):
         """Called once, with the result."""
 
 
-class Silent:
+class SilentRecorder:
     """A recorder that shows nothing."""
 
     def start(self, session: Session) -> None: ...

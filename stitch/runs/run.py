@@ -10,7 +10,7 @@ from stitch.model.term import Term
 from stitch.observations.surfaces.overlaps import Overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.outliers import Outlier
-from stitch.observations.targets.target_fit import TargetFit
+from stitch.observations.targets.target_fit import TargetModelFit
 
 # By which methods register moves single views, for people.
 METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
@@ -45,7 +45,7 @@ class FusedCloud:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class ExcludedView:
     """A view that is not fused, and why."""
 
     view: str
@@ -111,9 +111,11 @@ class Run:
     convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
-    targets: TargetFit | None = None  # what the labelled points say, where there are any
+    targets: TargetModelFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
-    left_out: tuple[LeftOut, ...] = ()  # views of the session that are not fused; all other fields are without them
+    left_out: tuple[
+        ExcludedView, ...
+    ] = ()  # views of the session that are not fused; all other fields are without them
     links: ViewLinks = field(default_factory=ViewLinks)
 
     @property

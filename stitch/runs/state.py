@@ -8,11 +8,11 @@ from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model import Model
-from stitch.runs.run import LedgerStep, LeftOut, Run, ViewLinks
+from stitch.runs.run import ExcludedView, LedgerStep, Run, ViewLinks
 
 
 @dataclass(frozen=True)
-class State:
+class RunState:
     """What was measured, the model, and its history."""
 
     session: Session
@@ -24,7 +24,9 @@ class State:
     noise_floor: float
     ledger: tuple[LedgerStep, ...]
     effects_file: str | None
-    left_out: tuple[LeftOut, ...] = ()  # views of the session that do not count; session and measurement are without
+    left_out: tuple[
+        ExcludedView, ...
+    ] = ()  # views of the session that do not count; session and measurement are without
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
     register: str = ""  # method of register; empty: the usual one
@@ -39,9 +41,9 @@ class State:
         return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"
 
 
-def state_of(run: Run) -> State:
+def state_of(run: Run) -> RunState:
     """The state of a run in memory."""
-    return State(
+    return RunState(
         session=run.session,
         measurement=run.measurement,
         model=run.model,

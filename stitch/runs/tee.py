@@ -8,7 +8,7 @@ from stitch.runs.recorder import Recorder
 from stitch.runs.run import Run, StageResult
 
 
-class Tee:
+class RecorderGroup:
     """Several recorders at once."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:

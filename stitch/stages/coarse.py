@@ -17,22 +17,22 @@ from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
-from stitch.measurement.scan import sparse
-from stitch.stages.correct import close_in, tightened
+from stitch.measurement.scan import subsample
+from stitch.stages.correct import icp_hand_eye, next_gates
 from stitch.stages.initial_guess.centroids import centroid_hand_eyes, scanner_centre
 from stitch.stages.initial_guess.hand_eye_candidates import (
     SEARCH_SAMPLES,
-    Candidate,
-    consistency,
-    distinct,
-    same_answer,
+    HandEyeCandidate,
+    distinct_hand_eyes,
+    same_hand_eye,
+    view_consistency,
 )
 from stitch.stages.initial_guess.relative_motion import motion_candidates
 from stitch.system.steps import steps
 
 _SEARCH_POINTS = 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
-_UNTIL_THEY_MEET, _AFTERWARDS = 4, 3
+_STEPS_TO_MEET, _STEPS_AFTER = 4, 3
 # First gate of the search and truncation of the score, as shares of the part's size.
 COARSE_GATE, SCORE_SHARE = 0.35, 0.05
 # Where a hand-eye came from that was not searched.
@@ -42,13 +42,13 @@ _RESTART_DEG = 15.0
 
 
 @dataclass(frozen=True)
-class Coarse:
+class CoarseHandEye:
     """The coarse hand-eye; `candidates` best first, one per distinct answer."""
 
     T_mount: Array  # (4, 4)
     gate: float  # length_unit: first distance between partners for the correction
     source: str
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[HandEyeCandidate, ...]
 
     @property
     def runner_up_ratio(self) -> float:
@@ -56,16 +56,16 @@ class Coarse:
         return self.candidates[1].score / self.candidates[0].score if len(self.candidates) > 1 else np.inf
 
 
-def given(captures: Sequence[Capture], T_mount: Array, source: str) -> Coarse:
+def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
     """Take a hand-eye that is known from elsewhere: the gate is wide enough for 5° and 30 mm.
 
     Args:
         source: where from, in words.
     """
-    return Coarse(T_mount, COARSE_GATE * part_size(captures), source, ())
+    return CoarseHandEye(T_mount, COARSE_GATE * part_size(captures), source, ())
 
 
-def coarse(captures: Sequence[Capture]) -> Coarse:
+def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
     """Search the hand-eye.
 
     Raises:
@@ -74,18 +74,18 @@ def coarse(captures: Sequence[Capture]) -> Coarse:
     if sum(len(c.scans) for c in captures) < 3:
         raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
     size = part_size(captures)
-    starts = _starts(captures, size)
-    tried = close_from(captures, starts, size)
+    starts = _starting_hand_eyes(captures, size)
+    tried = icp_from_starts(captures, starts, size)
     if not tried:
         raise NoResultError(
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
-    answers = distinct(captures, tried, size)
-    return Coarse(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
+    answers = distinct_hand_eyes(captures, tried, size)
+    return CoarseHandEye(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
 
 
-def _starts(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
+def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
     """Distinct starting hand-eyes with the name of the idea behind each.
 
     Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
@@ -102,7 +102,7 @@ def _starts(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]
     motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
     kept: list[tuple[str, Array]] = []
     for name, T in motions:
-        if not any(same_answer(captures, size, T, other) for _, other in kept):
+        if not any(same_hand_eye(captures, size, T, other) for _, other in kept):
             kept.append((name, T))
     return starts + kept
 
@@ -113,36 +113,38 @@ def _turn_about(rotation: Array, centre: Array) -> Array:
     return T
 
 
-def close_from(captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float) -> list[Candidate]:
+def icp_from_starts(
+    captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float
+) -> list[HandEyeCandidate]:
     """Close in from every start on few points; starts under which no views overlap are dropped.
 
     Half way, starts that have met go on as one: most end in the same place.
     """
-    light = [replace(c, scans=tuple(sparse(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
+    light = [replace(c, scans=tuple(subsample(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
     met: list[tuple[list[str], Array, list[float]]] = []
     for source, start in steps("trying hand-eyes", starts):
-        half = _close(light, start, [COARSE_GATE * size] * len(captures), _UNTIL_THEY_MEET)
+        half = _icp_steps(light, start, [COARSE_GATE * size] * len(captures), _STEPS_TO_MEET)
         if half is None:
             continue
-        same = [sources for sources, T, _ in met if same_answer(captures, size, half[0], T)]
+        same = [sources for sources, T, _ in met if same_hand_eye(captures, size, half[0], T)]
         if same:
             same[0].append(source)
         else:
             met.append(([source], *half))
-    ends = [(sources, _close(light, T, gates, _AFTERWARDS)) for sources, T, gates in met]
+    ends = [(sources, _icp_steps(light, T, gates, _STEPS_AFTER)) for sources, T, gates in met]
     return [
-        Candidate(sources[0], end[0], consistency(captures, end[0], SCORE_SHARE * size), len(sources))
+        HandEyeCandidate(sources[0], end[0], view_consistency(captures, end[0], SCORE_SHARE * size), len(sources))
         for sources, end in ends
         if end is not None
     ]
 
 
-def _close(
+def _icp_steps(
     captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], steps: int
 ) -> tuple[Array, list[float]] | None:
     """Close in by some steps: hand-eye and the gates to go on with; None if no views overlap."""
     try:
-        T_mount, overlaps, _ = close_in(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
+        T_mount, overlaps, _ = icp_hand_eye(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
     except NoResultError:
         return None
-    return T_mount, tightened(captures, overlaps)
+    return T_mount, next_gates(captures, overlaps)

@@ -15,14 +15,21 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.model.model import Model
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import FreePoses, free_poses
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.observations.surfaces.gram import assemble
 from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, fit_hand_eye
 from stitch.observations.surfaces.hand_eye_solution import step_hand_eye
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, common_samples, next_gate, pooled_rms
-from stitch.observations.surfaces.pose_channel import Repeatability, jacobian
-from stitch.runs.recorder import Recorder, Silent
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import (
+    FINE_SAMPLES,
+    Overlaps,
+    collect_overlaps,
+    common_samples,
+    next_gate,
+    pooled_rms,
+)
+from stitch.observations.surfaces.pose_channel import Repeatability, hand_eye_jacobian
+from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages.correction import Correction
 from stitch.statistics.least_squares import least_squares
 
@@ -36,7 +43,9 @@ _CONVERGED = 2e-3
 def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
     """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
     D, b = np.zeros((6, 6)), np.zeros(6)
-    jacobians = [jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
+    jacobians = [
+        hand_eye_jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)
+    ]
     for J, o in zip(jacobians, overlaps, strict=True):
         # Sessions of different noise count by their own variance.
         H, vector = assemble(o.gram)
@@ -47,7 +56,7 @@ def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mou
     return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
 
 
-def close_in(
+def icp_hand_eye(
     captures: Sequence[Capture],
     T_mount: Array,
     gates: Sequence[float],
@@ -65,13 +74,13 @@ def close_in(
     Returns:
         T_mount (4, 4), the last overlaps per capture and the rms per iteration.
     """
-    recorder = recorder or Silent()
+    recorder = recorder or SilentRecorder()
     picked = [common_samples(capture.scans, samples) for capture in captures]
     gates, history = list(gates), []
     before: Sequence[Overlaps | None] = [None] * len(captures)
     for index in range(maximum):
         every = zip(captures, gates, picked, before, strict=True)
-        before = overlaps = [collect(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
+        before = overlaps = [collect_overlaps(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount)
@@ -80,19 +89,19 @@ def close_in(
         settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
         if moved < _CONVERGED and settled:
             break
-        gates = tightened(captures, overlaps)
+        gates = next_gates(captures, overlaps)
     return T_mount, overlaps, history
 
 
-def tightened(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list[float]:
+def next_gates(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list[float]:
     """The next gates, not tighter than 0.6 of the last: the first fits at a wide gate are still far off."""
     return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
 
 
 # From freed views per capture to the twists (6V, K) of each by the scanner's errors that all views repeat.
-Repeating = Callable[[Sequence[FreePoses]], list[Array]]
+ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], list[Array]]
 # From freed views per capture and a hand-eye to how their poses may err.
-Erring = Callable[[Sequence[FreePoses], Array], PoseErrors]
+PoseErrorPrior = Callable[[Sequence[UnconstrainedPoses], Array], PoseErrors]
 
 
 def correct(
@@ -100,8 +109,8 @@ def correct(
     T_mount: Array,
     gate: float,
     recorder: Recorder | None = None,
-    repeating: Repeating | None = None,
-    erring: Erring | None = None,
+    scanner_errors: ScannerErrors | None = None,
+    pose_error_prior: PoseErrorPrior | None = None,
 ) -> Correction:
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
@@ -109,47 +118,47 @@ def correct(
         captures: one per session; all carry the same scanner on the same mount.
         T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
         gate: first distance between partners, length_unit: the coarse error at the part.
-        repeating: errors of the scanner that all views have in common; they widen the covariance.
-        erring: how poses may err beside white scatter; None: they do not.
+        scanner_errors: errors of the scanner that all views have in common; they widen the covariance.
+        pose_error_prior: how poses may err beside white scatter; None: they do not.
 
     Raises:
         NoResultError: no two views of a capture overlap.
     """
-    T_mount, overlaps, history = close_in(captures, T_mount, [gate] * len(captures), recorder=recorder)
+    T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
-    freed = tuple(free_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))
+    freed = tuple(unconstrained_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))
     T_first, scatters = step_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
-    captures = [weighing(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
-    freed = _freed_again(captures, freed, gates, T_first)
-    common = None if repeating is None else {SCANNER_FIELD: repeating(freed)}
-    errors = None if erring is None else erring(freed, T_first)
-    hand_eye = fit_hand_eye(captures, freed, T_first, repeating=common, errors=errors)
+    captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
+    freed = _update_unconstrained(captures, freed, gates, T_first)
+    common = None if scanner_errors is None else {SCANNER_FIELD: scanner_errors(freed)}
+    errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
+    hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors)
     final = tuple(
-        collect(c, c.poses(hand_eye.T_mount), gate, [sample(s, FINE_SAMPLES) for s in c.scans])
+        collect_overlaps(c, c.poses(hand_eye.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
         for c, gate in zip(captures, gates, strict=True)
     )
     return Correction(
         model=Model(hand_eye.T_mount, (), hand_eye.covariance),
         hand_eye=hand_eye,
         overlaps=final,
-        freed=freed,
+        unconstrained=freed,
         history=(*history, pooled_rms(final)),
         captures=tuple(captures),
     )
 
 
-def _freed_again(
-    captures: Sequence[Capture], freed: Sequence[FreePoses], gates: Sequence[float], T_mount: Array
-) -> tuple[FreePoses, ...]:
+def _update_unconstrained(
+    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], gates: Sequence[float], T_mount: Array
+) -> tuple[UnconstrainedPoses, ...]:
     """The freed views against another hand-eye; where clouds now weigh otherwise beside labelled points, freed anew."""
     return tuple(
-        f.seen_from(c.poses(T_mount)) if c.sightings is None else free_poses(c, c.poses(T_mount), gate)
-        for c, f, gate in zip(captures, freed, gates, strict=True)
+        f.relative_to(c.poses(T_mount)) if c.sightings is None else unconstrained_poses(c, c.poses(T_mount), gate)
+        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
 
 
-def weighing(capture: Capture, scatter: Repeatability) -> Capture:
+def with_noise_factor(capture: Capture, scatter: Repeatability) -> Capture:
     """The capture with clouds that weigh beside its labelled points by the scatter that they have shown.
 
     Correspondences share points and normals, so that they never know more than as many independent distances.

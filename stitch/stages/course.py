@@ -9,17 +9,17 @@ from stitch.measurement.session_notes import session_notes
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import LedgerStep, LeftOut, Run, StageResult, ViewLinks
+from stitch.runs.run import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
 from stitch.stages import from_surfaces, from_targets
-from stitch.stages.coarse import Coarse
-from stitch.stages.finish import Finished
-from stitch.stages.fitted import Course, Fitted
+from stitch.stages.coarse import CoarseHandEye
+from stitch.stages.finish import FinishedSession
+from stitch.stages.fitted import FittedRig, Pipeline
 from stitch.stages.observability import unobservable
 from stitch.stages.register import DEFAULT
 from stitch.stages.sentences import view_notes
 
 
-def course_of(session: Session) -> Course:
+def pipeline_for(session: Session) -> Pipeline:
     """How a run goes with what was observed."""
     return from_surfaces if session.has_clouds else from_targets
 
@@ -33,32 +33,32 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     Raises:
         NoResultError: no two views overlap.
     """
-    return course_of(session).linearise(session, measurement, model, gate)
+    return pipeline_for(session).linearise(session, measurement, model, gate)
 
 
 @dataclass(frozen=True)
-class End:
+class FitSummary:
     """What all sessions of a rig have in common at the end of the fit."""
 
-    begun: Sequence[Coarse]  # of every session
-    fitted: Fitted
+    starts: Sequence[CoarseHandEye]  # of every session
+    fitted: FittedRig
     seconds: float
     effects_file: str | None
     register: str = DEFAULT  # its method
     ledger: tuple[LedgerStep, ...] = ()
-    left_out: tuple[LeftOut, ...] = ()  # views of the session that do not belong
-    kept: tuple[LeftOut, ...] = ()  # such views that were fused all the same
-    suspected: tuple[LeftOut, ...] = ()  # views that stand out, and are fused
+    left_out: tuple[ExcludedView, ...] = ()  # views of the session that do not belong
+    kept: tuple[ExcludedView, ...] = ()  # such views that were fused all the same
+    suspected: tuple[ExcludedView, ...] = ()  # views that stand out, and are fused
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole
     notes: tuple[str, ...] = ()  # of the rig
 
 
-def collected(session: Session, index: int, end: End, before: StageResult, recorder: Recorder) -> Run:
+def assemble_run(session: Session, index: int, end: FitSummary, before: StageResult, recorder: Recorder) -> Run:
     """Register and fuse one session, collect its result with its line in the history, and show it."""
-    course, fitted = course_of(session), end.fitted
+    course, fitted = pipeline_for(session), end.fitted
     finished = course.finish(session, fitted, index, before, recorder, end.seconds, end.register)
-    own, model, begun = fitted.sessions[index], fitted.model_of(index), end.begun[index]
+    own, model, begun = fitted.sessions[index], fitted.model_of(index), end.starts[index]
     # Where several sessions share a hand-eye no joint has one place for all.
     shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
     joints = session.joints if len(shared) == 1 else None
@@ -81,7 +81,7 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
         overlaps=finished.overlaps,
         registered=finished.registered,
         verdict=finished.verdict,
-        ledger=(*end.ledger, _step(model, finished)),
+        ledger=(*end.ledger, _ledger_step(model, finished)),
         effects_file=end.effects_file,
         convergence=finished.convergence,
         notes=(
@@ -100,7 +100,7 @@ def collected(session: Session, index: int, end: End, before: StageResult, recor
     return result
 
 
-def _step(model: Model, finished: Finished) -> LedgerStep:
+def _ledger_step(model: Model, finished: FinishedSession) -> LedgerStep:
     return LedgerStep(
         effects=tuple(model.effects),
         residual_rms=finished.residual_rms,

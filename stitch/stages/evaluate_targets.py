@@ -5,27 +5,27 @@ import numpy as np
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.sightings import Sightings
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
-from stitch.observations.targets.landmark_fit import fitted_landmarks, landmarks_covariance
+from stitch.observations.targets.landmark_fit import fit_landmarks, landmarks_covariance
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import mixed_model_of_rows, rows_of
-from stitch.observations.targets.target_fit import TargetFit, rms_of
+from stitch.observations.targets.rows import mixed_model_of_rows, target_rows
+from stitch.observations.targets.target_fit import TargetModelFit, rms_of
 from stitch.statistics.variance_components import fit_variances
 
 
-def placed_targets(measurement: Measurement, model: Model, inflation: float) -> TargetFit | None:
+def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit | None:
     """Targets in the middle of where the views put them under a model that clouds fitted; None without any.
 
     Their covariance counts the scatter of the poses, the sensor's noise and the hand-eye.
     """
     if measurement.capture.sightings is None:
         return None
-    own = corrected(measurement, model)
-    landmarks, blocks, variances = fitted_landmarks(own, model.T_mount)
-    rows = rows_of(own, model.T_mount, landmarks)
+    own = corrected_capture(measurement, model)
+    landmarks, blocks, variances = fit_landmarks(own, model.T_mount)
+    rows = target_rows(own, model.T_mount, landmarks)
     distances = rows.distances(rows.residual)
-    return TargetFit(
+    return TargetModelFit(
         model=model,
         inflation=inflation,
         landmarks=landmarks,
@@ -37,21 +37,21 @@ def placed_targets(measurement: Measurement, model: Model, inflation: float) -> 
     )
 
 
-def evaluate_targets(measurement: Measurement, model: Model) -> TargetFit:
+def evaluate_targets(measurement: Measurement, model: Model) -> TargetModelFit:
     """Rows and scatter under a model of another run; a target that it does not know sits where the views have it."""
-    own = corrected(measurement, model)
-    free, blocks, _ = fitted_landmarks(own, model.T_mount)
+    own = corrected_capture(measurement, model)
+    free, blocks, _ = fit_landmarks(own, model.T_mount)
     assert own.sightings is not None
-    landmarks = _known(free, own.sightings, model)
-    rows = rows_of(own, model.T_mount, landmarks)
+    landmarks = _with_known_places(free, own.sightings, model)
+    rows = target_rows(own, model.T_mount, landmarks)
     nothing = rows.hand_eye[..., :0]
     covariance = landmarks_covariance(blocks, rows, model.covariance)
     distances = rows.distances(rows.residual)
-    return TargetFit(
+    return TargetModelFit(
         model=model,
         inflation=1.0,
         landmarks=landmarks,
-        landmarks_covariance=_as_known(covariance, own.sightings, model),
+        landmarks_covariance=_with_known_sigmas(covariance, own.sightings, model),
         variances=fit_variances(mixed_model_of_rows(rows, nothing), both_starts=True).variances,
         rows=rows,
         heldout=distances,
@@ -59,7 +59,7 @@ def evaluate_targets(measurement: Measurement, model: Model) -> TargetFit:
     )
 
 
-def _as_known(covariance: Array, sightings: Sightings, model: Model) -> Array:
+def _with_known_sigmas(covariance: Array, sightings: Sightings, model: Model) -> Array:
     """The covariance (U, U) of the landmarks with the model's own sigmas for the targets that it knows."""
     out = covariance.copy()
     for k, name in enumerate(sightings.targets):
@@ -70,7 +70,7 @@ def _as_known(covariance: Array, sightings: Sightings, model: Model) -> Array:
     return out
 
 
-def _known(landmarks: Landmarks, sightings: Sightings, model: Model) -> Landmarks:
+def _with_known_places(landmarks: Landmarks, sightings: Sightings, model: Model) -> Landmarks:
     """The landmarks with those of the model in their place."""
     positions, orientation = landmarks.positions.copy(), landmarks.orientation
     for k, name in enumerate(sightings.targets):

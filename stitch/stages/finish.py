@@ -12,25 +12,25 @@ from stitch.measurement.session import Session
 from stitch.observations.surfaces.gram import RMS_GATE
 from stitch.observations.surfaces.noise_floor import noise_floor
 from stitch.observations.surfaces.overlaps import Overlaps
-from stitch.observations.surfaces.pose_channel import Repeatability, scatter_from
-from stitch.observations.targets.target_fit import TargetFit, rms_of
+from stitch.observations.surfaces.pose_channel import Repeatability, repeatability_from
+from stitch.observations.targets.target_fit import TargetModelFit, rms_of
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
 from stitch.stages.correction import Correction
-from stitch.stages.fuse_whole import Registered, fuse_every_point
+from stitch.stages.fuse_whole import RegisteredSession, fuse_every_point
 from stitch.stages.register import Method, register
 from stitch.stages.register_targets import register_targets
 from stitch.stages.sentences import correct_note, register_note, surface_sentence, target_sentence
 from stitch.statistics.robust import MAD_TO_SIGMA
-from stitch.system.mapped_file import release
+from stitch.system.mapped_file import release_mapped
 from stitch.system.threads import Clock
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
-_ENOUGH = 2_000_000
+_RMS_SAMPLES = 2_000_000
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedSession:
     """One session under its model, with single views registered and fused."""
 
     own: Capture  # without the effects in use
@@ -64,7 +64,7 @@ def finish_surfaces(
     recorder: Recorder,
     seconds: float,
     method: Method,
-) -> Finished:
+) -> FinishedSession:
     """Register and fuse session `index` of a rig under the common model, and show it to the recorder.
 
     Raises:
@@ -75,19 +75,19 @@ def finish_surfaces(
     scatter = correction.hand_eye.repeatability[index]
     poses_model = own.poses(model.T_mount)
     note = correct_note(before.rms, overlaps.gram.rms)
-    corrected = _of_overlaps("correct", overlaps, len(correction.history), seconds, note)
+    corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
     clock.lap()
-    start = correction.freed[index].poses
+    start = correction.unconstrained[index].poses
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, start, method)
     note = register_note(registration, session)
-    registered = _of_overlaps("register", registration.overlaps, len(registration.history), clock.lap(), note)
+    registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
     registered = replace(registered, method=method.name)
-    fused = fuse_every_point(Registered(session, measurement, model, own, registration.poses))
+    fused = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
     recorder.stage(registered, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
-    return Finished(
+    return FinishedSession(
         own=own,
         stages=(before, corrected, registered, last),
         poses_model=poses_model,
@@ -105,13 +105,13 @@ def finish_surfaces(
     )
 
 
-def _of_overlaps(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str = "") -> StageResult:
+def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str = "") -> StageResult:
     return StageResult(name, overlaps.gram.rms, int(overlaps.gram.count.sum()), iterations, seconds, note)
 
 
 def finish_targets(
-    session: Session, found: TargetFit, before: StageResult, recorder: Recorder, seconds: float
-) -> Finished:
+    session: Session, found: TargetModelFit, before: StageResult, recorder: Recorder, seconds: float
+) -> FinishedSession:
     """Register single views by their labelled points, and show it to the recorder; there is no cloud to fuse."""
     clock, rows = Clock(), found.rows
     own = rows.capture
@@ -125,8 +125,8 @@ def finish_targets(
     )
     recorder.stage(corrected, poses_model)
     recorder.stage(registered, poses)
-    scatter = scatter_from(found.variances)
-    return Finished(
+    scatter = repeatability_from(found.variances)
+    return FinishedSession(
         own=own,
         stages=(before, corrected, registered),
         poses_model=poses_model,
@@ -142,9 +142,9 @@ def finish_targets(
     )
 
 
-def _targets_as_cloud(found: TargetFit) -> FusedCloud:
+def _targets_as_cloud(found: TargetModelFit) -> FusedCloud:
     """The targets in place of a fused cloud: position, rms distance of the views from it, number of views."""
-    positions, seen = found.landmarks.positions, np.minimum(found.rows.sightings.seen, 65535)
+    positions, seen = found.landmarks.positions, np.minimum(found.rows.sightings.view_counts, 65535)
     return FusedCloud(positions, np.zeros_like(positions), found.target_rms, seen.astype(np.int32))
 
 
@@ -158,9 +158,9 @@ def per_view_rms(overlaps: Overlaps, views: int) -> Array:
 
 
 def _fused_rms(residual: Array) -> float:
-    some = residual[:: -(-len(residual) // _ENOUGH)]
+    some = residual[:: -(-len(residual) // _RMS_SAMPLES)]
     seen = some[np.isfinite(some)]
-    release(residual)
+    release_mapped(residual)
     if not len(seen):
         return float("nan")
     # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.

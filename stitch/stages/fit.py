@@ -14,15 +14,15 @@ from stitch.frames import Mask
 from stitch.model.model import Model
 from stitch.model.term import Term, sizes_of
 from stitch.statistics.identifiability import independent
-from stitch.statistics.parameter_selection import UNSEEN, Whitened, supported
+from stitch.statistics.parameter_selection import UNSEEN, WhitenedData, select_supported
 
 # Iterations in which it is still open what is fitted.
-_CHOOSING = 2
+_CHOICE_STEPS = 2
 # The prior of a fitted parameter about zero, in plausible sizes: it keeps the unseen finite, moves nothing else.
 WEAK = 10.0
 
 
-class Step(Protocol):
+class FitStep(Protocol):
     """One step of a fit."""
 
     @property
@@ -41,11 +41,11 @@ class Step(Protocol):
         ...
 
 
-StepT = TypeVar("StepT", bound=Step)
-StepT_co = TypeVar("StepT_co", bound=Step, covariant=True)
+StepT = TypeVar("StepT", bound=FitStep)
+StepT_co = TypeVar("StepT_co", bound=FitStep, covariant=True)
 
 
-class Linearised(Protocol[StepT_co]):
+class LinearisedFit(Protocol[StepT_co]):
     """What was observed, linearised about a model."""
 
     def choose(self, before: Any) -> Any:
@@ -57,7 +57,7 @@ class Linearised(Protocol[StepT_co]):
         ...
 
 
-class Problem(Protocol[StepT]):
+class FitProblem(Protocol[StepT]):
     """What was observed, ready to be linearised about any model."""
 
     @property
@@ -67,13 +67,13 @@ class Problem(Protocol[StepT]):
         """Moves below so many sigmas end the fit."""
         ...
 
-    def linearise(self, model: Model, previous: StepT | None) -> Linearised[StepT]:
+    def linearise(self, model: Model, previous: StepT | None) -> LinearisedFit[StepT]:
         """About a model, with what the step before knows beside it."""
         ...
 
 
 def iterate(
-    problem: Problem[StepT], model: Model, watch: Callable[[int, StepT], None] | None = None
+    problem: FitProblem[StepT], model: Model, watch: Callable[[int, StepT], None] | None = None
 ) -> tuple[StepT, list[float]]:
     """The last step from a model that is near, converged or the last allowed, and the rms before every step.
 
@@ -88,7 +88,7 @@ def iterate(
     history: list[float] = []
     while step is None or (len(history) < problem.maximum_iterations and step.moved >= problem.converged):
         linearised = problem.linearise(model, step)
-        if choice is None or len(history) < _CHOOSING:
+        if choice is None or len(history) < _CHOICE_STEPS:
             choice = linearised.choose(choice)
         step = linearised.solve(choice)
         model = step.model
@@ -98,7 +98,7 @@ def iterate(
     return step, history
 
 
-def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], Whitened]) -> Mask:
+def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], WhitenedData]) -> Mask:
     """(P,) parameters that the views support and can tell apart.
 
     Args:
@@ -116,9 +116,9 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
     if not groups:
         return before
     free, seen = before, whitened(before)
-    for _ in range(_CHOOSING):
+    for _ in range(_CHOICE_STEPS):
         # What is found explains scatter, and less scatter shows more.
-        found = supported(seen, sizes, groups, effects)
+        found = select_supported(seen, sizes, groups, effects)
         if (found == free).all():
             break
         free, seen = found, whitened(found)

@@ -8,23 +8,23 @@ import numpy as np
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import covariance_of_fit, kept_root
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
-from stitch.model.term import known_sigmas, split, values_of
+from stitch.model.term import known_sigmas, values_of, with_parameter_values
 from stitch.observations.targets.effect_rows import effect_columns
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows, rows_of
-from stitch.observations.targets.target_fit import TargetFit
+from stitch.observations.targets.rows import TargetRows, target_rows
+from stitch.observations.targets.target_fit import TargetModelFit
 from stitch.runs.recorder import Recorder
 from stitch.stages.fit import iterate
-from stitch.stages.sighted import Sighted, rms_of_rows
-from stitch.stages.target_step import Linearised, Step
-from stitch.statistics.block_least_squares import Blocks
-from stitch.statistics.folds import grouped_folds, places
+from stitch.stages.sighted import LinearisedTargetSession, rms_of_rows
+from stitch.stages.target_step import LinearisedTargets, TargetFitStep
+from stitch.statistics.block_least_squares import BlockLeastSquares
+from stitch.statistics.folds import grouped_folds, view_clusters
 
 
 @dataclass(frozen=True)
-class Begun:
+class TargetStart:
     """One session before the fit: what was measured, and from where its own unknowns begin."""
 
     measurement: Measurement  # with the sightings that count
@@ -33,26 +33,30 @@ class Begun:
 
 
 @dataclass(frozen=True)
-class _Targets:
+class _TargetProblem:
     """The labelled points of all sessions of an arm."""
 
-    sessions: Sequence[Begun]
+    sessions: Sequence[TargetStart]
     maximum_iterations: int = 12
     converged: float = 0.02
 
-    def linearise(self, model: Model, previous: Step | None) -> Linearised:
+    def linearise(self, model: Model, previous: TargetFitStep | None) -> LinearisedTargets:
         if previous is None:
-            return Linearised([_about(own.measurement, own.model, own.landmarks) for own in self.sessions], None)
+            return LinearisedTargets(
+                [_linearise_session(own.measurement, own.model, own.landmarks) for own in self.sessions], None
+            )
         every = zip(self.sessions, previous.models, previous.landmarks, strict=True)
-        return Linearised([_about(own.measurement, at, landmarks) for own, at, landmarks in every], previous.variances)
+        return LinearisedTargets(
+            [_linearise_session(own.measurement, at, landmarks) for own, at, landmarks in every], previous.variances
+        )
 
 
-def _about(measurement: Measurement, model: Model, landmarks: Landmarks) -> Sighted:
-    rows = rows_of(corrected(measurement, model), model.T_mount, landmarks)
-    return Sighted(model, landmarks, rows, effect_columns(rows, measurement, model))
+def _linearise_session(measurement: Measurement, model: Model, landmarks: Landmarks) -> LinearisedTargetSession:
+    rows = target_rows(corrected_capture(measurement, model), model.T_mount, landmarks)
+    return LinearisedTargetSession(model, landmarks, rows, effect_columns(rows, measurement, model))
 
 
-def fit_targets(sessions: Sequence[Begun], recorder: Recorder | None = None) -> list[TargetFit]:
+def fit_targets(sessions: Sequence[TargetStart], recorder: Recorder | None = None) -> list[TargetModelFit]:
     """Hand-eyes, landmarks and common effects together, from a start that is near; one result a session.
 
     Args:
@@ -60,12 +64,12 @@ def fit_targets(sessions: Sequence[Begun], recorder: Recorder | None = None) -> 
         recorder: shows the first of them.
     """
 
-    def watch(index: int, step: Step) -> None:
+    def watch(index: int, step: TargetFitStep) -> None:
         if recorder is not None:
             poses = step.linearised.sessions[0].rows.capture.poses(step.model.T_mount)
             recorder.iteration("fit", index, poses, step.rms, float("nan"))
 
-    last, history = iterate(_Targets(sessions), sessions[0].model, watch)
+    last, history = iterate(_TargetProblem(sessions), sessions[0].model, watch)
     lin, terms = last.linearised, last.model.terms
     a = lin.base.shape[2]
     groups = [at + g for own, at in zip(lin.sessions, lin.begins, strict=True) for g in _places(own.rows)]
@@ -73,18 +77,18 @@ def fit_targets(sessions: Sequence[Begun], recorder: Recorder | None = None) -> 
     covariance = last.covariance * inflation
     # Another run's arm is known to its own sigmas, and errs alike in every view.
     kept = kept_root(terms, sessions[0].model.effects_covariance)
-    moved = last.blocks.moved_by(lin.columns @ kept)
+    moved = last.blocks.shift_by_errors(lin.columns @ kept)
     covariance = covariance + moved @ moved.T
     sigmas = known_sigmas(terms, last.fitted, np.sqrt(np.diag(covariance)[a:]))
-    found = split(terms, values_of(terms), sigmas)
+    found = with_parameter_values(terms, values_of(terms), sigmas)
     of_effects = covariance_of_fit(terms, last.fitted, covariance[a:, a:], kept)
-    out = list[TargetFit]()
+    out = list[TargetModelFit]()
     for k, (begun, own) in enumerate(zip(sessions, lin.sessions, strict=True)):
         mine = covariance[lin.own[k], lin.own[k]]
         model = Model(last.models[k].T_mount, found, mine[:6, :6], effects_covariance=of_effects)
-        final = rows_of(corrected(begun.measurement, model), model.T_mount, last.landmarks[k])
+        final = target_rows(corrected_capture(begun.measurement, model), model.T_mount, last.landmarks[k])
         out.append(
-            TargetFit(
+            TargetModelFit(
                 model=model,
                 inflation=inflation,
                 landmarks=last.landmarks[k],
@@ -98,11 +102,11 @@ def fit_targets(sessions: Sequence[Begun], recorder: Recorder | None = None) -> 
     return out
 
 
-def _places(rows: Rows) -> list[Indices]:
-    return places(rows.capture.T_reference_mount, rows.reach)
+def _places(rows: TargetRows) -> list[Indices]:
+    return view_clusters(rows.capture.T_reference_mount, rows.reach)
 
 
-def _heldout(rows: Rows, blocks: Blocks, begins: int) -> Array:
+def _heldout(rows: TargetRows, blocks: BlockLeastSquares, begins: int) -> Array:
     """(V, S) distances of targets whose views were left out with their neighbours in time or pose.
 
     Args:

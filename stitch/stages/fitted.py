@@ -12,17 +12,17 @@ from stitch.model.model_toml import ModelFile
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
-from stitch.stages.coarse import Coarse
+from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correction import Correction
-from stitch.stages.finish import Finished
+from stitch.stages.finish import FinishedSession
 from stitch.stages.outlier_removal import FittedSession
 
 # From a measurement, its model and the gate to the model that the fit of effects begins with.
-BeginAt = Callable[[Measurement, Model, float], Model]
+InitialModel = Callable[[Measurement, Model, float], Model]
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedRig:
     """The common model of a rig, and its sessions as they count."""
 
     model: Model  # of labelled points, that of the first session
@@ -36,16 +36,18 @@ class Fitted:
         return own.model if self.correction is None and own is not None else self.model
 
 
-class Course(Protocol):
+class Pipeline(Protocol):
     """How a run goes with what was observed; a further kind of observation is one more module with these functions."""
 
-    def start(
+    def initial_hand_eyes(
         self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
-    ) -> list[Coarse]:
+    ) -> list[CoarseHandEye]:
         """The hand-eye of every session to begin with."""
         ...
 
-    def begin(self, measurement: Measurement, begun: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+    def initial_stage(
+        self, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
+    ) -> StageResult:
         """How well the views agree under it."""
         ...
 
@@ -53,10 +55,10 @@ class Course(Protocol):
         self,
         sessions: Sequence[Session],
         measurements: Sequence[Measurement],
-        begun: Sequence[Coarse],
-        begin_at: BeginAt | None,
+        starts: Sequence[CoarseHandEye],
+        initial_model: InitialModel | None,
         recorder: Recorder,
-    ) -> Fitted:
+    ) -> FittedRig:
         """Hand-eye and effects from the coarse hand-eye on."""
         ...
 
@@ -67,11 +69,11 @@ class Course(Protocol):
         model: Model,
         gates: Sequence[float],
         recorder: Recorder,
-    ) -> Fitted:
+    ) -> FittedRig:
         """Hand-eye and the effects of a model fitted anew from where it stands."""
         ...
 
-    def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
+    def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
         """The sessions under a model of another run as it is."""
         ...
 
@@ -82,16 +84,16 @@ class Course(Protocol):
     def finish(
         self,
         session: Session,
-        fitted: Fitted,
+        fitted: FittedRig,
         index: int,
         before: StageResult,
         recorder: Recorder,
         seconds: float,
         register: str,
-    ) -> Finished:
+    ) -> FinishedSession:
         """Single views registered by a method, and fused."""
         ...
 
-    def notes(self, session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[str, ...]:
+    def notes(self, session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
         """What a user should know before trusting the result."""
         ...

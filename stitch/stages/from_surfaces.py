@@ -8,53 +8,57 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.model.bound import bound
-from stitch.model.forward import corrected
+from stitch.model.bound import bind_to_session
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import PoseErrors, pose_errors
-from stitch.observations.surfaces.free_poses import FreePoses, free_poses
-from stitch.observations.surfaces.overlaps import collect, common_samples
-from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.observations.surfaces.overlaps import collect_overlaps, common_samples
+from stitch.observations.surfaces.scanner_field import rig_field_scatters
 from stitch.observations.surfaces.surface_model import surface_model
-from stitch.observations.targets.target_fit import TargetFit
+from stitch.observations.targets.target_fit import TargetModelFit
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import StageResult
-from stitch.stages.coarse import REUSED, STATED, Coarse, coarse, given
+from stitch.stages.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.stages.correct import COARSE_SAMPLES, correct
 from stitch.stages.correction import Correction
-from stitch.stages.evaluate_targets import placed_targets
-from stitch.stages.finish import Finished, finish_surfaces
+from stitch.stages.evaluate_targets import locate_targets
+from stitch.stages.finish import FinishedSession, finish_surfaces
 from stitch.stages.fit_surfaces import fit_surfaces
-from stitch.stages.fitted import BeginAt, Fitted
-from stitch.stages.outlier_removal import FittedSession, without_outliers
+from stitch.stages.fitted import FittedRig, InitialModel
+from stitch.stages.outlier_removal import FittedSession, fit_without_outliers
 from stitch.stages.register import METHODS
-from stitch.stages.reuse import reuse
+from stitch.stages.reuse import apply_given_hand_eye
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
 
 
-def start(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None) -> list[Coarse]:
+def initial_hand_eyes(
+    sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+) -> list[CoarseHandEye]:
     """The hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
 
     Raises:
         NoResultError: no hand-eye makes the views overlap.
     """
-    return [_start(sessions, [m.capture for m in measurements], file)] * len(sessions)
+    return [_initial_hand_eye(sessions, [m.capture for m in measurements], file)] * len(sessions)
 
 
-def _start(sessions: Sequence[Session], captures: Sequence[Capture], file: ModelFile | None) -> Coarse:
+def _initial_hand_eye(
+    sessions: Sequence[Session], captures: Sequence[Capture], file: ModelFile | None
+) -> CoarseHandEye:
     if file:
-        return given(captures, file.T_mount, REUSED)
+        return use_given_hand_eye(captures, file.T_mount, REUSED)
     stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
-    return coarse(captures) if stated is None else given(captures, stated, STATED)
+    return find_coarse_hand_eye(captures) if stated is None else use_given_hand_eye(captures, stated, STATED)
 
 
-def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Recorder) -> StageResult:
+def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder) -> StageResult:
     """How well the views of one session meet under the coarse hand-eye."""
-    own, poses = measurement.capture, measurement.capture.poses(begun.T_mount)
-    g = collect(own, poses, begun.gate, common_samples(own.scans, COARSE_SAMPLES)).gram
-    stage = StageResult("coarse", g.rms, int(g.count.sum()), len(begun.candidates), seconds, coarse_note(begun))
+    own, poses = measurement.capture, measurement.capture.poses(start.T_mount)
+    g = collect_overlaps(own, poses, start.gate, common_samples(own.scans, COARSE_SAMPLES)).gram
+    stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
     recorder.stage(stage, poses)
     return stage
 
@@ -62,28 +66,28 @@ def begin(measurement: Measurement, begun: Coarse, seconds: float, recorder: Rec
 def fit(
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
-    begun: Sequence[Coarse],
-    begin_at: BeginAt | None,
+    starts: Sequence[CoarseHandEye],
+    initial_model: InitialModel | None,
     recorder: Recorder,
-) -> Fitted:
+) -> FittedRig:
     """The hand-eye from the scans; with effects, both."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        repeating = partial(field_scatters, measurements)
+        repeating = partial(rig_field_scatters, measurements)
         captures = [m.capture for m in measurements]
 
-        def erring(freed: Sequence[FreePoses], T_mount: Array) -> PoseErrors:
-            return pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in freed])
+        def erring(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
+            return prior_pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in unconstrained])
 
-        first = correct(captures, begun[0].T_mount, begun[0].gate, recorder, repeating, erring)
-        if begin_at is None:
+        first = correct(captures, starts[0].T_mount, starts[0].gate, recorder, repeating, erring)
+        if initial_model is None:
             return first
         gates = [overlaps.gate for overlaps in first.overlaps]
-        weighed = [_weighed(m, own.noise_factor) for m, own in zip(measurements, first.captures, strict=True)]
+        weighed = [_with_noise_factor(m, own.noise_factor) for m, own in zip(measurements, first.captures, strict=True)]
         # An event or a time constant is one for the whole rig: the first session says where it begins.
-        return fit_surfaces(weighed, begin_at(weighed[0], Model(first.model.T_mount), gates[0]), gates, recorder)
+        return fit_surfaces(weighed, initial_model(weighed[0], Model(first.model.T_mount), gates[0]), gates, recorder)
 
-    return _fitted(*without_outliers(measurements, once, _targets))
+    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
 
 
 def refit(
@@ -92,23 +96,23 @@ def refit(
     model: Model,
     gates: Sequence[float],
     recorder: Recorder,
-) -> Fitted:
+) -> FittedRig:
     """Hand-eye and the effects of a model fitted anew, matched anew."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
         return fit_surfaces(measurements, model, gates, recorder)
 
-    return _fitted(*without_outliers(measurements, once, _targets))
+    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
 
 
-def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> Fitted:
+def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
     """The sessions under a model of another run, neither hand-eye nor effects changed."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        model = bound(file, measurements[0])
-        return reuse([corrected(m, model) for m in measurements], model)
+        model = bind_to_session(file, measurements[0])
+        return apply_given_hand_eye([corrected_capture(m, model) for m in measurements], model)
 
-    return _fitted(*without_outliers(measurements, once, _targets))
+    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
 
 
 def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
@@ -117,19 +121,19 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     Raises:
         NoResultError: no two views overlap.
     """
-    own = corrected(measurement, model)
-    return surface_model(measurement, model, own, free_poses(own, own.poses(model.T_mount), gate))
+    own = corrected_capture(measurement, model)
+    return surface_model(measurement, model, own, unconstrained_poses(own, own.poses(model.T_mount), gate))
 
 
 def finish(
     session: Session,
-    fitted: Fitted,
+    fitted: FittedRig,
     index: int,
     before: StageResult,
     recorder: Recorder,
     seconds: float,
     register: str,
-) -> Finished:
+) -> FinishedSession:
     """Register and fuse session `index` under the common model."""
     assert fitted.correction is not None
     return finish_surfaces(
@@ -144,26 +148,26 @@ def finish(
     )
 
 
-def notes(session: Session, fitted: Fitted, index: int, begun: Coarse) -> tuple[str, ...]:
+def notes(session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
     """What a user should know before trusting the result."""
     assert fitted.correction is not None
     own = fitted.sessions[index]
     more = () if own.targets is None else mixed_notes(own.targets, own.outliers, session)
-    return (*warnings(begun, fitted.correction.hand_eye), *more)
+    return (*warnings(start, fitted.correction.hand_eye), *more)
 
 
-def _targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetFit | None]:
-    return [placed_targets(m, correction.model, correction.hand_eye.inflation) for m in measurements]
+def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
+    return [locate_targets(m, correction.model, correction.hand_eye.inflation) for m in measurements]
 
 
-def _fitted(correction: Correction, sessions: Sequence[FittedSession]) -> Fitted:
+def _fitted_rig(correction: Correction, sessions: Sequence[FittedSession]) -> FittedRig:
     weighed = [
-        replace(s, measurement=_weighed(s.measurement, own.noise_factor))
+        replace(s, measurement=_with_noise_factor(s.measurement, own.noise_factor))
         for s, own in zip(sessions, correction.captures, strict=True)
     ]
-    return Fitted(correction.model, weighed, list(correction.captures), correction)
+    return FittedRig(correction.model, weighed, list(correction.captures), correction)
 
 
-def _weighed(measurement: Measurement, noise_factor: float) -> Measurement:
+def _with_noise_factor(measurement: Measurement, noise_factor: float) -> Measurement:
     """The measurement with clouds that weigh as they were found to (`Capture.noise_factor`)."""
     return replace(measurement, capture=replace(measurement.capture, noise_factor=noise_factor))

@@ -32,12 +32,12 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    return fused(together(_placed(capture.scans, poses)), cell or capture.spacing)
+    return fuse_points(concatenate_points(_place_scans(capture.scans, poses)), cell or capture.spacing)
 
 
-def fused(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
+def fuse_points(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
     """The same of placed points, in the order of cells along `axis`; the grid is the reference frame's own."""
-    cells = _Cells(points_of_views, cell, axis)
+    cells = _GridCells(points_of_views, cell, axis)
     points, normals = cells.mean()
     view_cell, offset, view_weight = cells.view_means(points, normals)
     count = np.bincount(view_cell, minlength=len(points))
@@ -47,30 +47,30 @@ def fused(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedClo
     return FusedCloud(points, normals, residual, count.astype(np.int32))
 
 
-def weights(confidence: Array, usable: Array) -> Array:
+def point_weights(confidence: Array, usable: Array) -> Array:
     """(N,) what points count by their cosine of incidence, and by whether they lie on a smooth surface."""
     return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
 
 
-def together(parts: Sequence[PlacedPoints]) -> PlacedPoints:
+def concatenate_points(parts: Sequence[PlacedPoints]) -> PlacedPoints:
     """The points of several views, one view after the other."""
     names = [f.name for f in fields(PlacedPoints)]
     return PlacedPoints(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def placed(T: Array, view: int, points: Array, normals: Array, weight: Array) -> PlacedPoints:
+def place_points(T: Array, view: int, points: Array, normals: Array, weight: Array) -> PlacedPoints:
     """Points (N, 3) of one view with normals and weights, scanner frame, by its T_reference_scanner (4, 4)."""
     return PlacedPoints(frames.transform(T, points), frames.rotate(T, normals), weight, np.full(len(points), view))
 
 
-def _placed(scans: Sequence[Scan], poses: Array) -> list[PlacedPoints]:
+def _place_scans(scans: Sequence[Scan], poses: Array) -> list[PlacedPoints]:
     return [
-        placed(T, v, s.points, s.normals, weights(s.confidence, s.usable))
+        place_points(T, v, s.points, s.normals, point_weights(s.confidence, s.usable))
         for v, (s, T) in enumerate(zip(scans, poses, strict=True))
     ]
 
 
-class _Cells:
+class _GridCells:
     """Placed points with the grid cell of each."""
 
     def __init__(self, placed: PlacedPoints, size: float, axis: int = 0) -> None:

@@ -12,25 +12,25 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.bounding_box import corners
+from stitch.measurement.bounding_box import box_corners
 from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import SMALLEST_COSINE, Measurement, intensity_scale
+from stitch.measurement.measurement import MIN_COSINE, Measurement, intensity_scale
 from stitch.measurement.session import Session
-from stitch.model.forward import moves_points, undone
+from stitch.model.forward import moves_points, point_correction
 from stitch.model.model import Model
 from stitch.runs.run import FusedCloud
-from stitch.stages.fuse import PlacedPoints, fuse, fused, placed, together, weights
-from stitch.system.mapped_file import mapped
+from stitch.stages.fuse import PlacedPoints, concatenate_points, fuse, fuse_points, place_points, point_weights
+from stitch.system.mapped_file import map_parts
 from stitch.system.threads import parallel
 
 # Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
 _SLAB = 2_500_000
 # Effects of scanner and part move a point by less than this share of the view's size.
-_MOVED = 0.02
+_MAX_MOVE = 0.02
 
 
 @dataclass(frozen=True)
-class Registered:
+class RegisteredSession:
     """A session under its model, with single views registered."""
 
     session: Session
@@ -45,7 +45,7 @@ class Registered:
         return intensity_scale(self.session)
 
 
-def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
+def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> FusedCloud:
     """Fuse all points that were scanned, those in memory and those in files.
 
     Args:
@@ -62,15 +62,15 @@ def fuse_every_point(registered: Registered, slab: int = _SLAB) -> FusedCloud:
 
     def of_slab(bounds: tuple[float, float]) -> FusedCloud | None:
         low, high = (cell * number for number in bounds)
-        every = together([_within(registered, v, axis, low, high) for v in range(len(own.scans))])
-        return fused(every, cell, axis) if len(every.points) else None
+        every = concatenate_points([_points_in_slab(registered, v, axis, low, high) for v in range(len(own.scans))])
+        return fuse_points(every, cell, axis) if len(every.points) else None
 
     clouds = parallel(of_slab, pairwise(ends), "fusing slabs")
     found = (cloud for cloud in clouds if cloud is not None)
-    return next(found) if len(ends) == 2 else FusedCloud(**mapped(vars(cloud) for cloud in found))
+    return next(found) if len(ends) == 2 else FusedCloud(**map_parts(vars(cloud) for cloud in found))
 
 
-def _slabs(registered: Registered, cell: float, slab: int) -> tuple[list[float], int]:
+def _slabs(registered: RegisteredSession, cell: float, slab: int) -> tuple[list[float], int]:
     """Numbers of cells at which slabs end along the part's longest axis, and that axis."""
     own, poses = registered.own, registered.poses
     shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
@@ -87,28 +87,28 @@ def _slabs(registered: Registered, cell: float, slab: int) -> tuple[list[float],
     return [-np.inf, *ends.tolist(), np.inf], axis
 
 
-def _within(registered: Registered, v: int, axis: int, low: float, high: float) -> PlacedPoints:
+def _points_in_slab(registered: RegisteredSession, v: int, axis: int, low: float, high: float) -> PlacedPoints:
     """Points of view v between two planes of the reference frame, with the view's number."""
     T, cloud, scan = registered.poses[v], registered.session.views[v].cloud, registered.own.scans[v]
     whole = None if cloud is None else cloud.whole
     if whole is None:
-        points, normals, weight = scan.points, scan.normals, weights(scan.confidence, scan.usable)
+        points, normals, weight = scan.points, scan.normals, point_weights(scan.confidence, scan.usable)
     else:
-        ends = frames.transform(T, corners(whole.box))[:, axis]
-        margin = _MOVED * float(np.ptp(whole.box, axis=0).max())
+        ends = frames.transform(T, box_corners(whole.box))[:, axis]
+        margin = _MAX_MOVE * float(np.ptp(whole.box, axis=0).max())
         if ends.max() + margin < low or ends.min() - margin > high:
-            return placed(T, v, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+            return place_points(T, v, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         every = whole.read()
         height = frames.transform(T, every.points)[:, axis]
         near = np.flatnonzero((height >= low - margin) & (height < high + margin))
-        points, normals, weight = _surface(registered, v, every.points[near], every.scalars, near)
+        points, normals, weight = _corrected_points(registered, v, every.points[near], every.scalars, near)
     height = frames.transform(T, points)[:, axis]
     keep = (height >= low) & (height < high)
-    return placed(T, v, points[keep], normals[keep], weight[keep])
+    return place_points(T, v, points[keep], normals[keep], weight[keep])
 
 
-def _surface(
-    registered: Registered, v: int, points: Array, scalars: dict[str, Array], index: Indices
+def _corrected_points(
+    registered: RegisteredSession, v: int, points: Array, scalars: dict[str, Array], index: Indices
 ) -> tuple[Array, Array, Array]:
     """Points (N, 3) of view v, scanner frame, without the effects in use; their normals (N, 3) and weights (N,)."""
     scan = registered.measurement.capture.scans[v]
@@ -120,8 +120,8 @@ def _surface(
         scale = registered.intensity_scale
         view = replace(
             registered.measurement.scan_views[v],
-            cosine=np.maximum(confidence, SMALLEST_COSINE),
+            cosine=np.maximum(confidence, MIN_COSINE),
             intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
         )
-        points = points + undone(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
-    return points, normals, weights(confidence, scan.usable[nearest])
+        points = points + point_correction(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
+    return points, normals, point_weights(confidence, scan.usable[nearest])

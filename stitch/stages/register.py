@@ -19,12 +19,12 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, assemble, gram
-from stitch.observations.surfaces.match import Match, sample
-from stitch.observations.surfaces.moved_views import LastStep, moved, settled
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect, next_gate
+from stitch.observations.surfaces.match import Match, sample_points
+from stitch.observations.surfaces.moved_views import LastStep, has_converged, take_step
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect_overlaps, next_gate
 from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.observations.surfaces.target_pairs import joined
-from stitch.runs.recorder import Recorder, Silent
+from stitch.observations.surfaces.target_pairs import append_targets
+from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages.correspondence_weights import plane_weights
 from stitch.stages.dpwvm import OffsetSums, dpwvm_weights, with_offsets
 
@@ -33,7 +33,7 @@ _CONVERGED = 5e-3
 # Iterations in a row in which neither the rms nor the step may fall by this share, at a gate that stands still.
 _PATIENCE, _FALLS = 3, 1e-3
 # Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
-Weighing = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
+CorrespondenceWeights = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Method:
     """What correspondences count, and whether an offset that a view's whole surface shows costs nothing."""
 
     name: str
-    weigh: Weighing
+    weigh: CorrespondenceWeights
     offsets: bool = False
 
 
@@ -101,10 +101,10 @@ def register(
     Raises:
         NoResultError: no two views overlap.
     """
-    recorder = recorder or Silent()
-    picked = [sample(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses, history = np.array(model_poses if start is None else _held(start, model_poses)), list[float]()
-    overlaps = collect(capture, poses, gate, picked)
+    recorder = recorder or SilentRecorder()
+    picked = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
+    poses, history = np.array(model_poses if start is None else _without_mean_motion(start, model_poses)), list[float]()
+    overlaps = collect_overlaps(capture, poses, gate, picked)
     last: LastStep = None
     progress = _Progress()
     for index in range(_MAXIMUM_ITERATIONS):
@@ -114,15 +114,15 @@ def register(
         equations = normal_equations(overlaps, capture, poses, model_poses, scatter=scatter, method=method)
         step = equations.step
         tighter = min(gate, next_gate(overlaps, capture))
-        if settled(g, step, _CONVERGED) and tighter > 0.9 * gate:
+        if has_converged(g, step, _CONVERGED) and tighter > 0.9 * gate:
             return Registration(poses, overlaps, tuple(history), offsets=equations.offsets)
         if progress.made(g, step, gate):
             best = Registration(poses, overlaps, (), offsets=equations.offsets)
         elif progress.stalled >= _PATIENCE:
             break
-        poses, last = moved(poses, g, step, last)
+        poses, last = take_step(poses, g, step, last)
         gate = tighter
-        overlaps = collect(capture, poses, gate, picked, overlaps)
+        overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
     return replace(best, history=tuple(history), note=progress.note(len(history)))
 
 
@@ -154,7 +154,7 @@ class _Progress:
         return f"did not come to rest in {iterations} iterations; the poses of iteration {kept} are kept"
 
 
-def _held(start: Array, model_poses: Array) -> Array:
+def _without_mean_motion(start: Array, model_poses: Array) -> Array:
     """`start` without its mean motion against the robot, which no overlap can show."""
     common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
     return np.asarray(frames.exp(-common) @ start)
@@ -183,7 +183,7 @@ def normal_equations(
     sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
     if sums is not None:
         surfaces = replace(surfaces, square=sums.square)
-    g = joined(surfaces, overlaps.targets, capture.noise_factor)
+    g = append_targets(surfaces, overlaps.targets, capture.noise_factor)
     variance, prior = g.variance * scatter.noise_factor, prior_precision(capture, scatter, g.centre)
     to_centre = frames.make(np.eye(3), -g.centre)
     off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))

@@ -4,10 +4,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.observations.targets.rows import Rows, mixed_model_of_rows
+from stitch.observations.targets.rows import TargetRows, mixed_model_of_rows
 
 
-def register_targets(rows: Rows, variances: Array, poses: Array) -> tuple[Array, Array]:
+def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
     """Poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
 
     The most likely twist of a view is C·leverᵀ·V⁻¹·(−left) (best linear unbiased prediction, Robinson 1991).

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.effects.in_session import known, parameters_in, require
+from stitch.effects.in_session import find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile
 
 # No two measured scans begin with so many points alike.
-_TELLING = 100
+_COMPARED_POINTS = 100
 
 
 def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> None:
@@ -67,7 +67,11 @@ def require_measured_once(sessions: Sequence[Session]) -> None:
     """
     known: dict[bytes, tuple[Session, str]] = {}
     for session in sessions:
-        clouds = {view.name: view.cloud.points[:_TELLING].tobytes() for view in session.views if view.cloud is not None}
+        clouds = {
+            view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()
+            for view in session.views
+            if view.cloud is not None
+        }
         for name, points in clouds.items():
             if points in known:
                 other, view = known[points]
@@ -84,9 +88,9 @@ def require_effects(measurements: Sequence[Measurement], effects: Sequence[str])
     Raises:
         InputError: names the effect, the session and what is missing or different.
     """
-    for effect in map(known, effects):
+    for effect in map(find_effect, effects):
         for measurement in measurements:
-            require(measurement, effect)
+            require_available(measurement, effect)
         first, *others = (
             {f"{p.name} ({p.unit})" for p in parameters_in(measurement, effect)} for measurement in measurements
         )

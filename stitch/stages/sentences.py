@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.hand_eye import HandEye
+from stitch.observations.surfaces.hand_eye import HandEyeFit
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.observations.targets.outliers import Outlier
-from stitch.observations.targets.target_fit import TargetFit
-from stitch.runs.run import LeftOut
-from stitch.stages.coarse import Coarse
+from stitch.observations.targets.target_fit import TargetModelFit
+from stitch.runs.run import ExcludedView
+from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.error_sources import SOURCES
 from stitch.stages.register import Registration
 from stitch.units import angle_text, length_text
@@ -43,7 +43,7 @@ def surface_sentence(
         return f"{model} closes all overlaps to {left} rms, which the sensor's own noise ({noise}) explains."
     return (
         f"{model} leaves {left} rms where the sensor's own noise would leave {noise}: the robot's poses "
-        f"{_scatter(scatter, registered, length_unit)}."
+        f"{_scatter_clause(scatter, registered, length_unit)}."
     )
 
 
@@ -57,21 +57,21 @@ def register_note(found: Registration, session: Session) -> str:
     return "; ".join([*lines, *([found.note] if found.note else [])])
 
 
-def target_sentence(found: TargetFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
+def target_sentence(found: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
     """What the model leaves at the targets, what the noise would leave, and where the difference sits."""
     floor = found.noise_floor
     left, out, noise = (length_text(x, length_unit, 4) for x in (found.rms, found.heldout_rms, floor))
-    if found.shows_nothing:
+    if found.uninformative:
         return "No target is seen in two views: they lie where the model puts them, and nothing shows how well."
     if found.rms < _NEAR_FLOOR * floor:
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (
         f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; the "
-        f"sensor's own noise would leave {noise}. The robot's poses {_scatter(scatter, registered, length_unit)}."
+        f"sensor's own noise would leave {noise}. The robot's poses {_scatter_clause(scatter, registered, length_unit)}."
     )
 
 
-def _scatter(scatter: Repeatability, registered: float, length_unit: str) -> str:
+def _scatter_clause(scatter: Repeatability, registered: float, length_unit: str) -> str:
     return (
         f"scatter by {length_text(scatter.translation, length_unit)} and {angle_text(scatter.rotation, 2)}; moving "
         f"each view by its own correction leaves {length_text(registered, length_unit)}"
@@ -85,7 +85,7 @@ def correct_note(before: float, after: float) -> str:
     return ""
 
 
-def coarse_note(start: Coarse) -> str:
+def coarse_note(start: CoarseHandEye) -> str:
     """Where the hand-eye came from, and how far the second answer was."""
     if not start.candidates:
         return start.source
@@ -97,7 +97,7 @@ def coarse_note(start: Coarse) -> str:
     return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
 
 
-def warnings(start: Coarse, found: HandEye) -> tuple[str, ...]:
+def warnings(start: CoarseHandEye, found: HandEyeFit) -> tuple[str, ...]:
     """What a user should know before trusting the hand-eye."""
     notes = []
     if start.candidates and start.runner_up_ratio < _CLOSE:
@@ -113,7 +113,7 @@ def warnings(start: Coarse, found: HandEye) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _largest_sources(found: HandEye) -> str:
+def _largest_sources(found: HandEyeFit) -> str:
     """Where most of its variance may come from."""
     (turn, of_turn), (shift, of_shift) = (
         max(shares.items(), key=lambda item: item[1]) for shares in (found.rotation_shares, found.position_shares)
@@ -126,7 +126,7 @@ def _largest_sources(found: HandEye) -> str:
 
 
 def view_notes(
-    left_out: Sequence[LeftOut], kept: Sequence[LeftOut], suspected: Sequence[LeftOut] = ()
+    left_out: Sequence[ExcludedView], kept: Sequence[ExcludedView], suspected: Sequence[ExcludedView] = ()
 ) -> tuple[str, ...]:
     """Views that do not belong, first of all."""
     told = [f"View {item.view} does not belong and was left out: {item.why}." for item in left_out]
@@ -140,9 +140,9 @@ def view_notes(
     return tuple(told)
 
 
-def target_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+def target_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
     """Outliers by name, targets seen once, clouds that were not used, and a covariance that had to be widened."""
-    notes = _left_out(found, outliers, session)
+    notes = _unused_points(found, outliers, session)
     if any(view.cloud is not None for view in session.views):
         notes.append("Some views have no cloud: only the labelled points were fitted.")
     if found.inflation > _WIDENED:
@@ -153,9 +153,9 @@ def target_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session
     return tuple(notes)
 
 
-def mixed_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+def mixed_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
     """Outliers by name, targets seen once, and what is not used of labelled points beside clouds."""
-    notes = _left_out(found, outliers, session)
+    notes = _unused_points(found, outliers, session)
     if session.nominal is not None:
         notes.append("Nominal positions (targets.csv) are not used beside clouds; the targets' places were free.")
     if found.landmarks.orientation is not None:
@@ -163,21 +163,21 @@ def mixed_notes(found: TargetFit, outliers: Sequence[Outlier], session: Session)
     return tuple(notes)
 
 
-def _left_out(found: TargetFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
+def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
     notes = []
     if outliers:
         named_outliers = [
-            f"{named(o, session)} ({length_text(o.distance, session.length_unit)}, {o.times:.0f} times the usual)"
+            f"{outlier_name(o, session)} ({length_text(o.distance, session.length_unit)}, {o.times:.0f} times the usual)"
             for o in outliers
         ]
         more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""
         notes.append(f"Not used, because they contradict the rest: {', '.join(named_outliers[:_LISTED])}{more}.")
-    if found.alone and not found.shows_nothing:
-        notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(found.alone)}.")
+    if found.single_view_targets and not found.uninformative:
+        notes.append(f"Seen in fewer than two views, so that they say nothing: {', '.join(found.single_view_targets)}.")
     return notes
 
 
-def named(outlier: Outlier, session: Session) -> str:
+def outlier_name(outlier: Outlier, session: Session) -> str:
     """An outlier by the names of its view and target."""
     view = session.views[outlier.view].name
     return f"view {view}" if outlier.target is None else f"{outlier.target} in view {view}"

@@ -9,17 +9,17 @@ from stitch.frames import Array, exp
 from stitch.model.model import Model
 from stitch.model.term import Term
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows
+from stitch.observations.targets.rows import TargetRows
 from stitch.observations.targets.target_fit import rms_of
 
 
 @dataclass(frozen=True)
-class Sighted:
+class LinearisedTargetSession:
     """The labelled points of one session about its model; P parameters of effects, the same in all sessions."""
 
     model: Model
     landmarks: Landmarks
-    rows: Rows
+    rows: TargetRows
     columns: Array  # (B, m, P)
 
     @property
@@ -34,9 +34,9 @@ class Sighted:
 
     def moved(self, x: Array, terms: tuple[Term, ...]) -> tuple[Model, Landmarks]:
         """Model and landmarks after a step x (a,) of its own unknowns, with the effects as they are then."""
-        return Model(self.model.T_mount @ exp(x[:6]), terms), self.landmarks.moved(x[6:])
+        return Model(self.model.T_mount @ exp(x[:6]), terms), self.landmarks.updated(x[6:])
 
 
-def rms_of_rows(rows: Sequence[Rows]) -> float:
+def rms_of_rows(rows: Sequence[TargetRows]) -> float:
     """3D distance of the targets from where they are, length_unit."""
     return rms_of(np.concatenate([own.distances(own.residual).ravel() for own in rows]))

@@ -10,21 +10,21 @@ from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.effects_covariance import kept_root
 from stitch.model.model import Model
-from stitch.model.term import sizes_of, split, stacked, values_of
-from stitch.observations.pose_errors import PoseErrors, pose_errors
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.model.term import sizes_of, stack_parameters, values_of, with_parameter_values
+from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
 from stitch.observations.surfaces.gram import pair_squares
-from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEye, fit_hand_eye
-from stitch.observations.surfaces.hand_eye_solution import Columns
-from stitch.observations.surfaces.pose_channel import whitened
-from stitch.observations.surfaces.scanner_field import field_scatters
+from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEyeFit, fit_hand_eye
+from stitch.observations.surfaces.hand_eye_solution import FittedEffects
+from stitch.observations.surfaces.pose_channel import whiten_captures
+from stitch.observations.surfaces.scanner_field import rig_field_scatters
 from stitch.stages.error_sources import ANOTHER_ARM, unfitted
 from stitch.stages.fit import WEAK, fitted_parameters
-from stitch.statistics.parameter_selection import Whitened, omitted_rms
+from stitch.statistics.parameter_selection import WhitenedData, omitted_rms
 
 
 @dataclass(frozen=True)
-class Choice:
+class ParameterChoice:
     """Which parameters of effects are fitted, and what errs beside them."""
 
     fitted: Mask  # (P,)
@@ -33,25 +33,25 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Step:
+class SurfaceFitStep:
     """Where a step ended, and from where it came."""
 
     model: Model
     moved: float  # of the parameters, sigmas
     rms: float  # what the model leaves between the surfaces, length_unit
-    hand_eye: HandEye
-    linearised: "Linearised"
-    choice: Choice
+    hand_eye: HandEyeFit
+    linearised: "LinearisedSurfaces"
+    choice: ParameterChoice
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedSurfaces:
     """Freed views of all sessions about a model; P parameters of effects."""
 
     measurements: Sequence[Measurement]
     model: Model
     captures: tuple[Capture, ...]
-    freed: list[FreePoses]
+    unconstrained: list[UnconstrainedPoses]
     columns: list[Array]  # per session (6V, P)
 
     @property
@@ -64,46 +64,51 @@ class Linearised:
         """(P,) plausible ones."""
         return sizes_of(self.model.terms)
 
-    def choose(self, before: Choice | None) -> Choice:
+    def choose(self, before: ParameterChoice | None) -> ParameterChoice:
         """The parameters that the views ask for, those of before first."""
         # What the scanner repeats hardly changes with the last micrometres.
-        field = field_scatters(self.measurements, self.freed)
+        field = rig_field_scatters(self.measurements, self.unconstrained)
         fitted = np.zeros(len(self.values), bool) if before is None else before.fitted
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
         omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted, self._of_effect)
-        return Choice(fitted, np.where(self._held, 0.0, omitted), field)
+        return ParameterChoice(fitted, np.where(self._held, 0.0, omitted), field)
 
-    def solve(self, choice: Choice) -> Step:
+    def solve(self, choice: ParameterChoice) -> SurfaceFitStep:
         """The step, as the iteration of the fit asks for it."""
         return self.step(choice)
 
-    def step(self, choice: Choice, errors: PoseErrors | None = None) -> Step:
+    def step(self, choice: ParameterChoice, errors: PoseErrors | None = None) -> SurfaceFitStep:
         """The step, with a covariance that counts how poses may err; without, one of scatter alone."""
         fitted, before = choice.fitted, self.values
-        columns = Columns(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
-        found = fit_hand_eye(self.captures, self.freed, self.model.T_mount, columns, self._repeating(choice), errors)
+        columns = FittedEffects(tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * self.sizes[fitted])
+        found = fit_hand_eye(
+            self.captures, self.unconstrained, self.model.T_mount, columns, self._scanner_errors(choice), errors
+        )
         values = before.copy()
         # What the views cannot see stays at zero; the time of an event stays where it was found.
         values[~self._held] = 0.0
         values[fitted] = found.values
         moved = float(np.max(np.abs(values - before)[fitted] / found.values_sigma, initial=0.0))
-        return Step(
+        return SurfaceFitStep(
             model=replace(
-                self.model, T_mount=found.T_mount, terms=split(self.model.terms, values), covariance=found.covariance
+                self.model,
+                T_mount=found.T_mount,
+                terms=with_parameter_values(self.model.terms, values),
+                covariance=found.covariance,
             ),
             moved=moved,
-            rms=_model_rms(self.freed),
+            rms=_model_rms(self.unconstrained),
             hand_eye=found,
             linearised=self,
             choice=choice,
         )
 
-    def with_errors(self, choice: Choice) -> Step:
+    def with_errors(self, choice: ParameterChoice) -> SurfaceFitStep:
         """The step again, with all that the arm may do wrong in its covariance."""
-        centres = [f.overlaps.gram.centre for f in self.freed]
-        return self.step(choice, pose_errors(self.measurements, self.model, centres))
+        centres = [f.overlaps.gram.centre for f in self.unconstrained]
+        return self.step(choice, prior_pose_errors(self.measurements, self.model, centres))
 
-    def _repeating(self, choice: Choice) -> dict[str, list[Array]]:
+    def _scanner_errors(self, choice: ParameterChoice) -> dict[str, list[Array]]:
         """Twists that all views have in common: a parameter at zero that is not zero errs alike in every view, as the
         scanner does; so does another run's arm."""
         terms = self.model.terms
@@ -123,17 +128,17 @@ class Linearised:
 
     @property
     def _held(self) -> Mask:
-        return np.array([p.held for p in stacked(self.model.terms)], bool)
+        return np.array([p.held for p in stack_parameters(self.model.terms)], bool)
 
-    def _whitened(self, free: Mask) -> Whitened:
-        channels = [(c, f, extra) for c, f, extra in zip(self.captures, self.freed, self.columns, strict=True)]
-        return whitened(channels, self.model.T_mount, self.values, free)
+    def _whitened(self, free: Mask) -> WhitenedData:
+        channels = [(c, f, extra) for c, f, extra in zip(self.captures, self.unconstrained, self.columns, strict=True)]
+        return whiten_captures(channels, self.model.T_mount, self.values, free)
 
 
-def _model_rms(freed: Sequence[FreePoses]) -> float:
+def _model_rms(unconstrained: Sequence[UnconstrainedPoses]) -> float:
     """What a model leaves between the surfaces, from the correspondences of the freed views."""
     squares, weights = np.zeros(2)
-    for f in freed:
+    for f in unconstrained:
         g = f.overlaps.gram
         squares += pair_squares(g, -f.twists)[~g.labelled].sum()
         weights += g.weight.sum()

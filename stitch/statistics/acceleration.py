@@ -12,7 +12,7 @@ from stitch.frames import Array
 _FARTHEST, _NEAREST = 1.0, -0.5
 
 
-def accelerated(step: Array, last_step: Array, last_taken: Array) -> Array:
+def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
     """(N,) the step to take, from what two iterations in turn ask for.
 
     Args:

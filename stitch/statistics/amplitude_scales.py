@@ -10,11 +10,11 @@ from scipy.special import logsumexp
 from stitch.frames import Array
 
 # What is grossly wrong: one effect of a hundred.
-GROSS, _OF_A_HUNDRED = 30.0, 0.01
+GROSS, _GROSS_SHARE = 30.0, 0.01
 # Of plausible size, or grossly wrong.
-PLAUSIBLE = {1.0: 1 - _OF_A_HUNDRED, GROSS: _OF_A_HUNDRED}
+PLAUSIBLE = {1.0: 1 - _GROSS_SHARE, GROSS: _GROSS_SHARE}
 # Of any size: what plausible sizes are is a guess.
-ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _OF_A_HUNDRED) / 4) | {GROSS: _OF_A_HUNDRED}
+ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _GROSS_SHARE) / 4) | {GROSS: _GROSS_SHARE}
 
 
 def log_mixture(logs: Array, scales: dict[float, float]) -> float:

@@ -11,7 +11,7 @@ from stitch.statistics.jackknife import grouped_inflation
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockLeastSquares:
     """z = X·x + noise in B blocks of m, with a weak prior; the noise's covariance is known.
 
     Rows weigh by their own variances (working independence, Liang & Zeger 1986): as long as effects are missing
@@ -23,7 +23,7 @@ class Blocks:
     X: Array  # (B, m, k)
     covariance: Array  # (B, m, m)
     precision: Array  # (k,) of the prior
-    pull: Array  # (k,) precision times the prior's middle
+    prior_vector: Array  # (k,) precision times the prior's middle
 
     @cached_property
     def scale(self) -> Array:
@@ -45,7 +45,7 @@ class Blocks:
         """(k,) XᵀWz."""
         return _product(self.weighted, self.z[..., None])[:, 0]
 
-    def pulls(self, estimates: Array) -> Array:
+    def residual_vectors(self, estimates: Array) -> Array:
         """(B, k) XᵀW(z − X·x) of every block."""
         return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z - self.X @ estimates))
 
@@ -57,7 +57,7 @@ class Blocks:
             M = M - _product(self.weighted[out], self.X[out])
             b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
         inverse = _inverse(M + np.diag(self.precision), self.scale)
-        return np.asarray(inverse @ (b + self.pull))
+        return np.asarray(inverse @ (b + self.prior_vector))
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
@@ -65,7 +65,7 @@ class Blocks:
         inverse = _inverse(self.information + np.diag(self.precision), self.scale)
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
-    def moved_by(self, errors: Array) -> Array:
+    def shift_by_errors(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
         pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
         return np.asarray(_inverse(self.information + np.diag(self.precision), self.scale) @ pulls)

@@ -58,7 +58,7 @@ def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Ind
         lever: length that makes a radian of orientation comparable with a distance.
     """
     views = np.arange(len(T_reference_mount))
-    twists = _apart(T_reference_mount, lever)
+    twists = _pose_offsets(T_reference_mount, lever)
     # Along the direction in which the poses differ most.
     along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
     orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
@@ -66,7 +66,7 @@ def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Ind
     return [(np.sort(first), np.sort(second)) for first, second in halves]
 
 
-def places(T_reference_mount: Array, lever: float) -> list[Indices]:
+def view_clusters(T_reference_mount: Array, lever: float) -> list[Indices]:
     """Index arrays of views near each other, every view in one: what a model does not know errs alike in one place."""
     count = len(T_reference_mount)
     if count < _PLACES * _VIEWS_PER_PLACE:
@@ -74,24 +74,24 @@ def places(T_reference_mount: Array, lever: float) -> list[Indices]:
     return [f for f in _regions(T_reference_mount, lever, _PLACES) if len(f)]
 
 
-def joint_ends(joints: Array, seen: Indices) -> list[JointEnd]:
+def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
     """Both ends of every joint's range; none of a joint that stands still, or where views are few.
 
     Args:
         joints: (V, n) rad.
-        seen: indices of the views that show something.
+        observed: indices of the views that show something.
     """
     out = []
-    for joint, q in enumerate(joints[seen].T):
+    for joint, q in enumerate(joints[observed].T):
         low, high = np.quantile(q, [_END, 1 - _END])
-        for upper, views in ((False, seen[q <= low]), (True, seen[q >= high])):
+        for upper, views in ((False, observed[q <= low]), (True, observed[q >= high])):
             # Where many views share one angle, an end may be most of them.
-            if _VIEWS_PER_END <= len(views) <= len(seen) // 2:
+            if _VIEWS_PER_END <= len(views) <= len(observed) // 2:
                 out.append(JointEnd(joint, upper, views))
     return out
 
 
-def _apart(T_reference_mount: Array, lever: float) -> Array:
+def _pose_offsets(T_reference_mount: Array, lever: float) -> Array:
     """(V, 6) twists of the poses from the first, as lengths."""
     return np.asarray(
         frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
@@ -99,7 +99,7 @@ def _apart(T_reference_mount: Array, lever: float) -> Array:
 
 
 def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indices]:
-    twists = _apart(T_reference_mount, lever)
+    twists = _pose_offsets(T_reference_mount, lever)
     with warnings.catch_warnings():
         # An empty group is no harm: it is left out by the callers.
         warnings.simplefilter("ignore", UserWarning)

@@ -12,7 +12,7 @@ _SAME = 1e-4
 REACH, SHORT_REACH = 1.0, 0.2
 
 
-def alike_in_joints(joints: Array, others: Array | None = None, reach: float = REACH) -> Array:
+def rbf_joints(joints: Array, others: Array | None = None, reach: float = REACH) -> Array:
     """(V, V) of a smooth function of all joints (V, n) rad: of each alone, of pairs, …, of all, equally likely; or
     (V, O) with other views (O, n). Alike as far as `reach`, rad.
 
@@ -23,59 +23,59 @@ def alike_in_joints(joints: Array, others: Array | None = None, reach: float = R
     out = np.ones((len(joints), len(others)))
     # One joint after the other: of thousands of views all factors at once would take a gigabyte.
     for joint in range(joints.shape[1]):
-        out *= alike_joint_by_joint(joints[:, [joint]], others[:, [joint]], reach)[..., 0]
+        out *= joint_kernel_factors(joints[:, [joint]], others[:, [joint]], reach)[..., 0]
     return out
 
 
-def alike_joint_by_joint(some: Array, others: Array, reach: float = REACH) -> Array:
+def joint_kernel_factors(some: Array, others: Array, reach: float = REACH) -> Array:
     """(S, O, n) factors of that product between joints (S, n) and (O, n), rad; alike as far as `reach`, rad."""
     apart = some[:, None, :] - others[None, :, :]
     return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
 
 
-def alike_closely(some: Array, others: Array) -> Array:
+def short_range_kernel(some: Array, others: Array) -> Array:
     """(S, O) of a function of one joint's angle alone, (S,) and (O,) rad, that may change within a few degrees."""
-    return np.asarray(2 * alike_joint_by_joint(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1)
+    return np.asarray(2 * joint_kernel_factors(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1)
 
 
-def alike_in_waves(some: Array, others: Array, period: float) -> Array:
+def periodic_kernel(some: Array, others: Array, period: float) -> Array:
     """(S, O) of a function of one joint's angle, (S,) and (O,) rad, that repeats after a period, rad; smooth within it
     (MacKay 1998)."""
     phase = np.pi * (some[:, None] - others[None, :]) / period
     return np.asarray(np.exp(-2 * np.sin(phase) ** 2))
 
 
-def alike_in_two(one: Array, other: Array) -> Array:
+def two_joint_kernel(one: Array, other: Array) -> Array:
     """(V, V) of a smooth function of the angles of two joints, (V,) rad each."""
     both = np.column_stack([one, other])
-    return np.asarray((2 * alike_joint_by_joint(both, both) - 1).prod(axis=2))
+    return np.asarray((2 * joint_kernel_factors(both, both) - 1).prod(axis=2))
 
 
-def alike_in_way(joint: Array, came: Array) -> Array:
+def direction_kernel(joint: Array, travel: Array) -> Array:
     """(V, V) of a function of one joint's angle (V,) rad, smooth, and of how far it came, (V,) rad, by any law:
     continuous and no more (Ornstein–Uhlenbeck, over the range of the joint), as play, friction and settling are.
     """
-    return np.asarray(alike_in_joints(joint[:, None]) * alike_within(came, came, reach_of_way(joint)))
+    return np.asarray(rbf_joints(joint[:, None]) * exponential_kernel(travel, travel, direction_reach(joint)))
 
 
-def alike_within(some: Array, others: Array, reach: float) -> Array:
+def exponential_kernel(some: Array, others: Array, reach: float) -> Array:
     """(S, O) of a continuous function of one number, (S,) and (O,), alike as far as `reach`."""
-    return alike_in_time(some, reach, others)
+    return ornstein_uhlenbeck(some, reach, others)
 
 
-def alike_under_load(torques: Array) -> Array:
+def load_kernel(torques: Array) -> Array:
     """(V, V) of a continuous function of the torques (V, m) that bend one joint, each of which changes
     (Ornstein–Uhlenbeck, over the range of each)."""
     share = torques / np.ptp(torques, axis=0)
     return np.asarray(np.exp(-np.abs(share[:, None] - share[None]).mean(axis=2)))
 
 
-def reach_of_way(joint: Array) -> float:
+def direction_reach(joint: Array) -> float:
     """How far a move may differ and still do nearly the same, rad: the range of the joint (V,) rad."""
     return max(float(np.ptp(joint)), 1e-9)
 
 
-def alike_in_time(time: Array, memory: float, others: Array | None = None) -> Array:
+def ornstein_uhlenbeck(time: Array, memory: float, others: Array | None = None) -> Array:
     """(V, V) of a process that forgets (Ornstein–Uhlenbeck), or (V, O) with other times (O,).
 
     Args:
@@ -99,7 +99,7 @@ class SmoothErrors:
     have several, of which one is there."""
 
     columns: Array  # (6V, P) twists of the views per unit of each process
-    alike: Array  # (V, V) covariance of each, or (P, V, V) where they differ
+    kernel: Array  # (V, V) covariance of each, or (P, V, V) where they differ
     joints: tuple[int, ...]  # (P,) that each is of, counted from 0
     others: tuple[int, ...] = ()  # (P,) whose angle it follows beside the joint's own, counted from 0; () if none
     periods: tuple[float, ...] = ()  # (P,) after which it repeats, rad; () if it does not
@@ -108,21 +108,21 @@ class SmoothErrors:
         """The processes of a joint, counted from 0."""
         return [p for p, own in enumerate(self.joints) if own == joint]
 
-    def of(self, process: int) -> Array:
+    def twist_covariance(self, process: int) -> Array:
         """(6V, 6V) covariance of the twists by one process alone."""
-        return spread_over(self.columns[:, [process]], self.alike_of(process))
+        return process_covariance(self.columns[:, [process]], self.kernel_of(process))
 
-    def alike_of(self, process: int) -> Array:
+    def kernel_of(self, process: int) -> Array:
         """(V, V) covariance of a process."""
-        return self.alike if self.alike.ndim == 2 else np.asarray(self.alike[process])
+        return self.kernel if self.kernel.ndim == 2 else np.asarray(self.kernel[process])
 
 
-def spread_over(columns: Array, alike: Array) -> Array:
-    """(6V, 6V) covariance of Σ_p f_p(view)·column_p with independent processes f_p of covariance `alike` (V, V).
+def process_covariance(columns: Array, kernel: Array) -> Array:
+    """(6V, 6V) covariance of Σ_p f_p(view)·column_p with independent processes f_p of covariance `kernel` (V, V).
 
     Args:
         columns: (6V, P) twists of the views per unit of each process.
     """
-    views = len(alike)
+    views = len(kernel)
     own = (columns @ columns.T).reshape(views, 6, views, 6)
-    return np.asarray((own * alike[:, None, :, None]).reshape(6 * views, 6 * views))
+    return np.asarray((own * kernel[:, None, :, None]).reshape(6 * views, 6 * views))

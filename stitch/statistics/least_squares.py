@@ -9,24 +9,24 @@ from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Generalised:
+class GeneralisedFit:
     """Generalised least squares with a prior: what was seen (n,) to a unknowns."""
 
     gain: Array  # (a, n)
     covariance: Array  # (a, a)
 
-    def solve(self, z: Array, pull: Array) -> Array:
+    def solve(self, z: Array, prior_vector: Array) -> Array:
         """(a,) from what was seen (n,), and the prior's precision times its middle (a,)."""
-        return np.asarray(self.gain @ z + self.covariance @ pull)
+        return np.asarray(self.gain @ z + self.covariance @ prior_vector)
 
 
-def generalised(noise: Array, columns: Array, precision: Array) -> Generalised:
+def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
     """Columns (n, a) under noise of covariance (n, n), with a prior of a precision (a, a); units may be mixed."""
     weighted = cho_solve(cho_factor(noise, lower=True), columns)
     M = columns.T @ weighted + precision
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     covariance = np.linalg.inv(M * np.outer(scale, scale)) * np.outer(scale, scale)
-    return Generalised(np.asarray(covariance @ weighted.T), np.asarray(covariance))
+    return GeneralisedFit(np.asarray(covariance @ weighted.T), np.asarray(covariance))
 
 
 def column_space(columns: Array, relative: float = 1e-9) -> Array:

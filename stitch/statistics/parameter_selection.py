@@ -21,11 +21,11 @@ _LOG_BAYES_FACTOR = 2.5
 # only borrow from the hand-eye.
 UNSEEN = 4.0
 # A parameter of an effect of which nobody knows more is there or not.
-_EVEN = 0.5
+_EVEN_ODDS = 0.5
 
 
 @dataclass(frozen=True)
-class Whitened:
+class WhitenedData:
     """An observation in units of its scatter."""
 
     base: Array  # (N, a) columns of what is fitted in any case: hand-eye, landmarks
@@ -33,7 +33,9 @@ class Whitened:
     z: Array  # (N,) what was seen, without the effects
 
 
-def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]], effects: Sequence[int]) -> Mask:
+def select_supported(
+    whitened: WhitenedData, sizes: Array, groups: Sequence[Sequence[int]], effects: Sequence[int]
+) -> Mask:
     """(P,) bool: parameters that are fitted; of every effect at least its best group.
 
     Args:
@@ -52,7 +54,7 @@ def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]],
 
     every = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
-    ways = (_without_idle(gain, _grown(gain, every)), _without_idle(gain, every))
+    ways = (_backward_elimination(gain, _forward_selection(gain, every)), _backward_elimination(gain, every))
     chosen = max(ways, key=gain)
     seen = np.linalg.norm(G, axis=0) >= 1 / UNSEEN
     for effect in dict.fromkeys(effects):
@@ -64,13 +66,13 @@ def supported(whitened: Whitened, sizes: Array, groups: Sequence[Sequence[int]],
     return out
 
 
-def _evidence(told: Array, b: Array) -> float:
+def _evidence(gram: Array, b: Array) -> float:
     """Log likelihood ratio integrated over standard normal amplitudes, from MᵀM and Mᵀy."""
-    information = np.eye(len(b)) + told
+    information = np.eye(len(b)) + gram
     return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
 
-def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask, effects: Indices) -> Array:
+def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Indices) -> Array:
     """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
 
     Each may be there or not: with probability π it has the mean μ and the sigma σ that the views give it, so that its
@@ -85,42 +87,42 @@ def omitted_rms(whitened: Whitened, sizes: Array, fitted: Mask, effects: Indices
         fitted: (P,) bool.
         effects: (P,) index of the effect that each belongs to.
     """
-    told, pull = _each(whitened, sizes, fitted)
-    seen, gain, square = told / (1 + told), *_if_there(told, pull)
+    told, pull = _marginal_information(whitened, sizes, fitted)
+    seen, gain, square = told / (1 + told), *_inclusion_odds(told, pull)
     others = np.equal.outer(effects, effects) & ~np.eye(len(sizes), dtype=bool)
     there = seen * expit(gain)
-    share = (_EVEN + others @ there) / (1 + others @ seen)
+    share = (_EVEN_ODDS + others @ there) / (1 + others @ seen)
     scale = np.sqrt((1 + others @ (there * square)) / (1 + others @ there))
-    gain, square = _if_there(scale**2 * told, scale * pull)
+    gain, square = _inclusion_odds(scale**2 * told, scale * pull)
     rms = sizes * scale * np.sqrt(expit(logit(share) + gain) * square)
     return np.where(fitted, 0.0, rms)
 
 
-def _if_there(told: Array, pull: Array) -> tuple[Array, Array]:
+def _inclusion_odds(precision: Array, vector: Array) -> tuple[Array, Array]:
     """(P,) log odds that a parameter of standard normal prior has over none, and its mean square if it is there."""
-    mean, variance = pull / (1 + told), 1 / (1 + told)
-    return 0.5 * pull * mean - 0.5 * np.log1p(told), mean**2 + variance
+    mean, variance = vector / (1 + precision), 1 / (1 + precision)
+    return 0.5 * vector * mean - 0.5 * np.log1p(precision), mean**2 + variance
 
 
-def _each(whitened: Whitened, sizes: Array, fitted: Mask) -> tuple[Array, Array]:
+def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) -> tuple[Array, Array]:
     """(P,) what the views know of every parameter beside all others that are fitted, per plausible size: information,
     and that times the likeliest value."""
 
-    def beside(others: Mask, own: Mask) -> tuple[Array, Array]:
+    def conditioned_on(others: Mask, own: Mask) -> tuple[Array, Array]:
         base = np.hstack([whitened.base, whitened.further[:, others]])
         G = project_out(base, whitened.further[:, own] * sizes[own])
         y = project_out(base, whitened.z[:, None])[:, 0]
         return np.einsum("np,np->p", G, G), G.T @ y
 
     told, pull = np.zeros(len(sizes)), np.zeros(len(sizes))
-    told[~fitted], pull[~fitted] = beside(fitted, ~fitted)
+    told[~fitted], pull[~fitted] = conditioned_on(fitted, ~fitted)
     for p in np.flatnonzero(fitted):
         only = np.arange(len(sizes)) == p
-        told[only], pull[only] = beside(fitted & ~only, only)
+        told[only], pull[only] = conditioned_on(fitted & ~only, only)
     return told, pull
 
 
-def _grown(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
+def _forward_selection(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
     """From nothing: the group that gains most is added until none gains enough."""
     chosen: list[int] = []
     while left := [k for k in groups if k not in chosen]:
@@ -131,7 +133,7 @@ def _grown(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> lis
     return chosen
 
 
-def _without_idle(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
+def _backward_elimination(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
     """The group that is missed least is left out until all that remain gain enough beside each other."""
     chosen = list(groups)
     while chosen:

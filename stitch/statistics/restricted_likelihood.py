@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from stitch.frames import Array
-from stitch.statistics.inverse import Inverse, inverted
+from stitch.statistics.inverse import InverseCovariance, invert_covariance
 from stitch.statistics.variance_prior import FurtherPrior, log_prior
 
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
@@ -47,7 +47,7 @@ class MixedModel:
 
 
 @dataclass(frozen=True)
-class Problem:
+class RemlProblem:
     """A mixed model with the further columns of its mean, and their prior."""
 
     mixed: MixedModel
@@ -56,28 +56,28 @@ class Problem:
     offset: float  # log det of the prior covariance
 
 
-def problem_of(mixed: MixedModel, G: Array | None, prior: Array | None) -> Problem:
+def reml_problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> RemlProblem:
     """With further columns G (B, m, g) and the standard deviations (g,) of their coefficients, if these have any."""
     a = mixed.A.shape[2]
     if G is None:
-        return Problem(mixed, mixed.A, np.zeros(a), 0.0)
+        return RemlProblem(mixed, mixed.A, np.zeros(a), 0.0)
     X = np.concatenate([mixed.A, G], axis=2)
     if prior is None:
-        return Problem(mixed, X, np.zeros(X.shape[2]), 0.0)
+        return RemlProblem(mixed, X, np.zeros(X.shape[2]), 0.0)
     precision = np.concatenate([np.zeros(a), 1 / prior**2])
-    return Problem(mixed, X, precision, float(2 * np.log(prior).sum()))
+    return RemlProblem(mixed, X, precision, float(2 * np.log(prior).sum()))
 
 
 @dataclass(frozen=True)
 class Likelihood:
     """The restricted likelihood at some variances, and what is best believed of the mean there."""
 
-    problem: Problem
+    problem: RemlProblem
     log_variances: Array  # (c,)
     deviance: float  # −2 log of it, and of the prior of the log variances
     mean: Array  # (a + g,) coefficients
     half: Array  # (a + g, r) square root of their covariance
-    inverse: Inverse  # of the numbers' covariance
+    inverse: InverseCovariance  # of the numbers' covariance
     white: Array  # (B·m, a + g) the mean's columns in units of the scatter
     rest: Array  # (B·m,) what the mean leaves, in those units
 
@@ -106,15 +106,15 @@ class Likelihood:
         return np.asarray(variances * own + log_prior(self.log_variances, mixed.further)[1])
 
 
-def likelihood(log_variances: Array, problem: Problem) -> Likelihood:
+def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     """Evaluate it; infinitely unlikely, flat, where the covariance has no inverse."""
     with np.errstate(over="ignore"):
         mixed, variances = problem.mixed, np.exp(log_variances)
-    inverse, k = inverted(mixed.covariance(variances)), problem.X.shape[2]
+    inverse, k = invert_covariance(mixed.covariance(variances)), problem.X.shape[2]
     if not np.isfinite(inverse.logdet):
         mean, half = np.zeros(k), np.zeros((k, k))
         return Likelihood(problem, log_variances, 1e300, mean, half, inverse, white=half, rest=mean)
-    white = rows_of_blocks(inverse.half @ problem.X)
+    white = flatten_blocks(inverse.half @ problem.X)
     white_z = np.matmul(inverse.half, mixed.z[..., None]).ravel()
     M = white.T @ white + np.diag(problem.precision)
     # Equilibrate: columns count in rad, mm and per hour.
@@ -141,12 +141,12 @@ def _root_of_inverse(M: Array) -> tuple[Array, float]:
     return vectors[:, keep] / np.sqrt(values[keep]), float(np.log(values[keep]).sum())
 
 
-def deviance(log_variances: Array, problem: Problem) -> tuple[float, Array]:
+def deviance(log_variances: Array, problem: RemlProblem) -> tuple[float, Array]:
     """−2 log restricted likelihood and its slope in the log variances."""
     here = likelihood(log_variances, problem)
     return here.deviance, here.slope
 
 
-def rows_of_blocks(X: Array) -> Array:
+def flatten_blocks(X: Array) -> Array:
     """(B·m, a) of (B, m, a); a model that is only judged has no columns."""
     return X.reshape(X.shape[0] * X.shape[1], X.shape[2])

@@ -14,7 +14,7 @@ def mad_sigma(e: Array) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(e)))
 
 
-def median_of_known(values: Array) -> Array:
+def nan_median(values: Array) -> Array:
     """(n,) medians over the first axis of values (m, n) without their NaN; NaN where there is nothing else."""
     known, ordered, column = np.isfinite(values).sum(axis=0), np.sort(values, axis=0), np.arange(values.shape[1])
     low, high = np.maximum(known - 1, 0) // 2, np.minimum(known // 2, len(values) - 1)

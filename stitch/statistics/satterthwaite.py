@@ -26,7 +26,7 @@ class Satterthwaite:
     white: Array  # (c, B, m, m)
     spread: Array  # (c, c) covariance of the log variances
 
-    def of(self, white: Array) -> float:
+    def degrees_of_freedom(self, white: Array) -> float:
         """Degrees of freedom of the scatter along whitened columns (B, m, p), on average over them."""
         directions = column_space(white.reshape(-1, white.shape[2])).reshape(*white.shape[:2], -1)
         if not directions.shape[2]:

@@ -6,7 +6,7 @@ from scipy.special import ndtri
 from stitch.frames import Array
 
 
-def share_of(with_it: Array, without: Array) -> tuple[float, float]:
+def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
     """What one model leaves over what another leaves, mean squares, and the standard error of that.
 
     Args:
@@ -18,7 +18,7 @@ def share_of(with_it: Array, without: Array) -> tuple[float, float]:
     return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
 
 
-def clearly_less(squares: Array, others: Array, chance: float) -> bool:
+def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
     """True if the first are less by more than chance would make them; views where either is not finite do not count.
 
     Args:
@@ -27,5 +27,5 @@ def clearly_less(squares: Array, others: Array, chance: float) -> bool:
         chance: one-sided, of the normal distribution.
     """
     seen = np.isfinite(squares) & np.isfinite(others)
-    share, sigma = share_of(squares[seen], others[seen])
+    share, sigma = mean_square_share(squares[seen], others[seen])
     return bool(share < 1 - ndtri(1 - chance) * sigma)

@@ -8,7 +8,7 @@ from stitch.frames import Array
 from stitch.statistics.restricted_likelihood import MixedModel
 
 
-def side_by_side(columns: Sequence[Array]) -> Array:
+def block_columns(columns: Sequence[Array]) -> Array:
     """(ΣB, m, Σa) columns (B, m, a) of unknowns that every session has for itself."""
     if len(columns) == 1:
         return columns[0]
@@ -18,10 +18,10 @@ def side_by_side(columns: Sequence[Array]) -> Array:
         wide = np.zeros((*c.shape[:2], widths[-1]))
         wide[..., at : at + c.shape[2]] = c
         every.append(wide)
-    return one_below_the_other(every)
+    return stack_blocks(every)
 
 
-def one_below_the_other(blocks: Sequence[Array]) -> Array:
+def stack_blocks(blocks: Sequence[Array]) -> Array:
     """(ΣB, m, …) blocks (B, m, …) of several sessions."""
     if len(blocks) == 1:
         return blocks[0]
@@ -29,7 +29,7 @@ def one_below_the_other(blocks: Sequence[Array]) -> Array:
     return np.concatenate([np.pad(b, [(0, 0), (0, m - b.shape[1]), *[(0, 0)] * (b.ndim - 2)]) for b in blocks])
 
 
-def mixed_of_all(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
+def stack_mixed_models(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
     """Mixed models of sessions that scatter alike, with columns A (ΣB, m, a) of the free mean of all."""
     if len(mixed) == 1:
         return mixed[0]
@@ -44,7 +44,7 @@ def mixed_of_all(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
 
     fixed = [np.zeros((*own.z.shape, own.z.shape[1])) if own.fixed is None else own.fixed for own in mixed]
     return MixedModel(
-        z=one_below_the_other([own.z for own in mixed]),
+        z=stack_blocks([own.z for own in mixed]),
         A=A,
         components=np.concatenate([wide(own.components) for own in mixed], axis=1),
         fixed=np.concatenate([wide(own, absent=1.0) for own in fixed]),

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
-from stitch.statistics.restricted_likelihood import MixedModel, rows_of_blocks
+from stitch.statistics.restricted_likelihood import MixedModel, flatten_blocks
 from stitch.statistics.variance_components import VarianceFit
 from stitch.statistics.variance_prior import NOISE, FurtherPrior, log_density, usual_variances
 
@@ -39,7 +39,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _MeanFreeData:
     """Numbers without their mean: n of them, the components of their covariance and square roots of these."""
 
     z: Array  # (n,)
@@ -59,57 +59,59 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """
     if mixed.size >= _NO_ROUNDS:
         return fit.variances
-    seen, rng = _without_mean(mixed), np.random.default_rng(0)
+    seen, rng = _remove_mean(mixed), np.random.default_rng(0)
     if not len(seen.z):
         return fit.variances
     grids = _grids(mixed, fit.variances)
     densities = _densities(mixed, grids)
-    kin = [i for i in np.flatnonzero(_kin(mixed)) if seen.roots[i].shape[1]]
+    kin = [i for i in np.flatnonzero(_common_factor_mask(mixed)) if seen.roots[i].shape[1]]
     here, total, at, factor = np.array(fit.variances), np.zeros(len(grids)), np.zeros(len(grids), int), _USUAL
     rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
     burnt = -(-_BURNT * rounds // _ROUNDS)
     for turn in range(burnt + rounds):
         for i, grid in enumerate(grids):
             if seen.roots[i].shape[1]:
-                weights = _weights(seen, here, i, grid, densities[i][factor if i in kin else 0])
+                weights = _grid_weights(seen, here, i, grid, densities[i][factor if i in kin else 0])
                 at[i] = rng.choice(len(grid), p=weights)
                 here[i] = grid[at[i]]
                 total[i] += (turn >= burnt) * float(weights @ grid)
         if kin:
-            factor = _factor(rng, [densities[i][:, at[i]] for i in kin])
+            factor = _draw_factor(rng, [densities[i][:, at[i]] for i in kin])
     return np.asarray(total / rounds)
 
 
-def _kin(mixed: MixedModel) -> Mask:
+def _common_factor_mask(mixed: MixedModel) -> Mask:
     """(c,) components that share a factor on their usual sizes."""
     shared = np.zeros(len(mixed.components), bool)
     if mixed.further is not None:
-        shared[NOISE + 1 :] = mixed.further.kin
+        shared[NOISE + 1 :] = mixed.further.common_factor
     return shared
 
 
 def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
     """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
     return [
-        np.array([log_density(i, np.log(grid), _times(mixed.further, f)) for f in (_FACTORS if shared else (1.0,))])
-        for i, (grid, shared) in enumerate(zip(grids, _kin(mixed), strict=True))
+        np.array(
+            [log_density(i, np.log(grid), _scale_prior(mixed.further, f)) for f in (_FACTORS if shared else (1.0,))]
+        )
+        for i, (grid, shared) in enumerate(zip(grids, _common_factor_mask(mixed), strict=True))
     ]
 
 
-def _times(further: FurtherPrior | None, factor: float) -> FurtherPrior | None:
-    return None if further is None else further.times(factor)
+def _scale_prior(further: FurtherPrior | None, factor: float) -> FurtherPrior | None:
+    return None if further is None else further.scaled(factor)
 
 
-def _factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:
+def _draw_factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:
     """Index of a factor drawn where the components stand, from densities (F,) of each there."""
     logs = np.sum(densities, axis=0)
     weights = np.exp(logs - logs.max())
     return int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
 
 
-def _without_mean(mixed: MixedModel) -> _Seen:
+def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
     """All numbers as one block, turned to where the mean's columns are nothing: their likelihood is the restricted."""
-    free = np.linalg.svd(column_space(rows_of_blocks(mixed.A)), full_matrices=True)
+    free = np.linalg.svd(column_space(flatten_blocks(mixed.A)), full_matrices=True)
     turn = free[0][:, free[1].size :].T
     roots = []
     for blocks in mixed.components:
@@ -119,7 +121,7 @@ def _without_mean(mixed: MixedModel) -> _Seen:
         roots.append(vectors[:, keep] * np.sqrt(values[keep]))
     n = len(turn)
     fixed = np.zeros((n, n)) if mixed.fixed is None else turn @ block_diag(*mixed.fixed) @ turn.T
-    return _Seen(turn @ mixed.z.ravel(), np.array([root @ root.T for root in roots]), roots, fixed)
+    return _MeanFreeData(turn @ mixed.z.ravel(), np.array([root @ root.T for root in roots]), roots, fixed)
 
 
 def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
@@ -132,18 +134,18 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
     return [np.maximum(size, 1e-300) * np.exp(np.arange(_BELOW, _ABOVE, step)) for size in usual]
 
 
-def _weights(seen: _Seen, here: Array, i: int, grid: Array, density: Array) -> Array:
+def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, density: Array) -> Array:
     """(g,) probabilities of the values of variance i while the others stand.
 
     V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
     """
-    half = seen.half(here)
-    root = solve_triangular(half, seen.roots[i], lower=True)
+    half = data.half(current)
+    root = solve_triangular(half, data.roots[i], lower=True)
     values, vectors = np.linalg.eigh(root.T @ root)
     values = np.maximum(values, 1e-300)
-    along = vectors.T @ (root.T @ solve_triangular(half, seen.z, lower=True))
+    along = vectors.T @ (root.T @ solve_triangular(half, data.z, lower=True))
     # Rounding must not take away more than there is.
-    times = np.maximum(1 + (grid[:, None] - here[i]) * values, 1e-12)
+    times = np.maximum(1 + (grid[:, None] - current[i]) * values, 1e-12)
     logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)
     weights = np.exp(logs - logs.max())
     return np.asarray(weights / weights.sum())

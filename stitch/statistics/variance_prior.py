@@ -15,7 +15,7 @@ NOISE = 2
 # Of further components λ/s² of a scale s is a priori beta-prime(a/2, 1/2), with the tails of a half-Cauchy (Armagan,
 # Clyde & Dunson 2011, NIPS 24). What may well be absent piles up at zero; with a = 1 it is the half-Cauchy of Gelman
 # 2006, Bayesian Analysis 1:515, for what is there on every arm in some size. The density counts per log σ.
-MAY_BE_ABSENT, THERE = 0.1, 1.0
+MAY_BE_ABSENT, ALWAYS_PRESENT = 0.1, 1.0
 # The factor on the sensor's noise is 1 for white noise and grows with its correlation: a few, seldom hundreds.
 # A weak log-normal prior decides where the views hardly can between sensor noise and scatter of the arm.
 USUAL_NOISE_FACTOR, FACTOR_SPREAD = 2.0, 1.5
@@ -27,13 +27,13 @@ class FurtherPrior:
 
     scales: Array  # (f,) that their σ usually has
     shapes: Array  # (f,) of the density near zero: MAY_BE_ABSENT or THERE
-    kin: Mask  # (f,) those that are large or small together
+    common_factor: Mask  # (f,) those that are large or small together
 
-    def of(self, keep: Mask) -> Self:
+    def select(self, keep: Mask) -> Self:
         """Of some components alone (f,)."""
-        return replace(self, scales=self.scales[keep], shapes=self.shapes[keep], kin=self.kin[keep])
+        return replace(self, scales=self.scales[keep], shapes=self.shapes[keep], common_factor=self.common_factor[keep])
 
-    def times(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> Self:
         """Where all are usually so many times as large."""
         return replace(self, scales=factor * self.scales)
 

@@ -6,21 +6,21 @@ from typing import Any
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.measurement.capture import capture, part_size
-from stitch.measurement.measurement import about_part, measurement_of
-from stitch.model.bound import bound
-from stitch.model.forward import corrected
+from stitch.measurement.capture import part_size, prepare_capture
+from stitch.measurement.measurement import measurement_of, with_part_origin
+from stitch.model.bound import bind_to_session
+from stitch.model.forward import corrected_capture
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import LeftOut, ViewLinks
-from stitch.runs.state import State
+from stitch.runs.run import ExcludedView, ViewLinks
+from stitch.runs.state import RunState
 from stitch.stages.reuse import REUSE_GATE, converged_gate
 from stitch.stored.run_documents import read_documents
 from stitch.stored.trusted_model import trusted_model
 from stitch.system.threads import library_threads_off
-from stitch.writing.target_rows import as_counted
+from stitch.writing.target_rows import restore_counted_targets
 
 
-def load_state(folder: Path, effects_file: Path | None = None, trust: bool = False) -> State:
+def load_state(folder: Path, effects_file: Path | None = None, trust: bool = False) -> RunState:
     """The state of a run folder; its session is read again.
 
     Args:
@@ -37,15 +37,15 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
         raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
     session = load_session(path)
     with library_threads_off():
-        measurement = about_part(measurement_of(session, capture(session)), file.T_mount_coarse)
+        measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
         left_out, links = left_out_of(document)
         gone = [v for v, view in enumerate(session.views) if view.name in {item.view for item in left_out}]
         session, measurement = session.without([item.view for item in left_out]), measurement.without(gone)
-        model = bound(file, measurement)
-        measurement = as_counted(measurement, session, document)
-        own = corrected(measurement, model)
+        model = bind_to_session(file, measurement)
+        measurement = restore_counted_targets(measurement, session, document)
+        own = corrected_capture(measurement, model)
         gate = converged_gate(own, model.T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
-    return State(
+    return RunState(
         session=session,
         measurement=measurement,
         model=model,
@@ -62,11 +62,13 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
     )
 
 
-def left_out_of(document: dict[str, Any]) -> tuple[tuple[LeftOut, ...], ViewLinks]:
+def left_out_of(document: dict[str, Any]) -> tuple[tuple[ExcludedView, ...], ViewLinks]:
     """Views that the run left out, and how the others hold each other."""
     rows = {row["view"]: row for row in document["views"]}
     left_out = [
-        LeftOut(item["view"], item["why"], np.array(rows[item["view"]]["pose"], float), rows[item["view"]]["points"])
+        ExcludedView(
+            item["view"], item["why"], np.array(rows[item["view"]]["pose"], float), rows[item["view"]]["points"]
+        )
         for item in document.get("left_out", ())
         if item["view"] in rows
     ]

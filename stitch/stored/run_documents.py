@@ -14,53 +14,62 @@ from stitch.runs.run import LedgerStep, Note
 
 _TEXT = {"type": "string"}
 _NUMBER = {"type": "number"}
-_MAYBE = {"type": ["number", "null"]}  # JSON has no NaN
+_NUMBER_OR_NULL = {"type": ["number", "null"]}  # JSON has no NaN
 _COUNT = {"type": "integer", "minimum": 0}
 
 
-def _list(items: dict[str, Any], length: int | None = None) -> dict[str, Any]:
+def _list_schema(items: dict[str, Any], length: int | None = None) -> dict[str, Any]:
     exact = {} if length is None else {"minItems": length, "maxItems": length}
     return {"type": "array", "items": items} | exact
 
 
-def _table(required: dict[str, Any], **optional: Any) -> dict[str, Any]:
+def _object_schema(required: dict[str, Any], **optional: Any) -> dict[str, Any]:
     return {"type": "object", "properties": required | optional, "required": list(required)}
 
 
-_MATRIX = _list(_list(_NUMBER, 4), 4)
-_STAGE = {"name": _TEXT, "rms": _MAYBE, "correspondences": _COUNT, "iterations": _COUNT, "seconds": _NUMBER}
-_VIEW = {"view": _TEXT, "pose": _MATRIX, "correction": _list(_NUMBER, 6), "rms": _MAYBE}
-_PARAMETER = _table({"value": _NUMBER})
-RESULT = _table(
+_MATRIX = _list_schema(_list_schema(_NUMBER, 4), 4)
+_STAGE = {"name": _TEXT, "rms": _NUMBER_OR_NULL, "correspondences": _COUNT, "iterations": _COUNT, "seconds": _NUMBER}
+_VIEW = {"view": _TEXT, "pose": _MATRIX, "correction": _list_schema(_NUMBER, 6), "rms": _NUMBER_OR_NULL}
+_PARAMETER = _object_schema({"value": _NUMBER})
+RESULT = _object_schema(
     {
         "session": {"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000},
         "hand_eye": _MATRIX,
         "residual_rms": _NUMBER,
-        "heldout_rms": _MAYBE,
+        "heldout_rms": _NUMBER_OR_NULL,
         "noise_floor": _NUMBER,
         "effects": {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _PARAMETER}},
-        "stages": _list(_table(_STAGE, note=_TEXT, method=_TEXT)),
-        "views": _list(_table(_VIEW)),
-        "unobservable": _list(_TEXT),
-        "repeatability": _table({"rotation": _MAYBE, "translation": _MAYBE}),
+        "stages": _list_schema(_object_schema(_STAGE, note=_TEXT, method=_TEXT)),
+        "views": _list_schema(_object_schema(_VIEW)),
+        "unobservable": _list_schema(_TEXT),
+        "repeatability": _object_schema({"rotation": _NUMBER_OR_NULL, "translation": _NUMBER_OR_NULL}),
         "verdict": _TEXT,
-        "notes": _list(_TEXT),
-        "convergence": {"type": "object", "additionalProperties": _list(_MAYBE)},
+        "notes": _list_schema(_TEXT),
+        "convergence": {"type": "object", "additionalProperties": _list_schema(_NUMBER_OR_NULL)},
     },
     disagreement={"type": ["object", "null"], "properties": {"gate": _NUMBER}},
-    outliers=_list(_table({"view": _TEXT, "target": {"type": ["string", "null"]}})),
-    effects_covariance=_table({"parameters": _list(_TEXT), "matrix": _list(_list(_NUMBER))}),
+    outliers=_list_schema(_object_schema({"view": _TEXT, "target": {"type": ["string", "null"]}})),
+    effects_covariance=_object_schema(
+        {"parameters": _list_schema(_TEXT), "matrix": _list_schema(_list_schema(_NUMBER))}
+    ),
     cloud_noise_factor=_NUMBER,
-    left_out=_list(_table({"view": _TEXT, "why": _TEXT})),
-    linkage=_table({}, components=_list(_list(_TEXT)), weak=_list(_table({"view": _TEXT}))),
+    left_out=_list_schema(_object_schema({"view": _TEXT, "why": _TEXT})),
+    linkage=_object_schema(
+        {}, components=_list_schema(_list_schema(_TEXT)), weak=_list_schema(_object_schema({"view": _TEXT}))
+    ),
 )
-_CANDIDATES = _list(_table({"effect": _TEXT}, hand_eye_if_missed=_MAYBE))
+_CANDIDATES = _list_schema(_object_schema({"effect": _TEXT}, hand_eye_if_missed=_NUMBER_OR_NULL))
 _VERDICT = {"enum": ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]}
-DIAGNOSIS = _table({"verdict": _VERDICT}, candidates=_CANDIDATES)
-_STEP = {"effects": _list(_TEXT), "residual_rms": _NUMBER, "heldout_rms": _MAYBE, "noise_floor": _NUMBER}
+DIAGNOSIS = _object_schema({"verdict": _VERDICT}, candidates=_CANDIDATES)
+_STEP = {
+    "effects": _list_schema(_TEXT),
+    "residual_rms": _NUMBER,
+    "heldout_rms": _NUMBER_OR_NULL,
+    "noise_floor": _NUMBER,
+}
 _VALUES = {"type": "object", "additionalProperties": {"type": "object", "additionalProperties": _NUMBER}}
-_NOTES = _list(_table({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
-LEDGER = _list(_table(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES, notes=_NOTES))
+_NOTES = _list_schema(_object_schema({"at": _TEXT, "by": _TEXT, "text": _TEXT}))
+LEDGER = _list_schema(_object_schema(_STEP | {"hand_eye": _MATRIX}, parameters=_VALUES, notes=_NOTES))
 
 
 def read_documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]]:
@@ -84,7 +93,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
         if inner:
             raise InputError(f"{folder}: holds the runs of several sessions ({', '.join(inner)}); name one of them")
-    return dict(_checked(folder / "result.json", RESULT))
+    return dict(_read_checked(folder / "result.json", RESULT))
 
 
 def read_diagnosis(folder: Path) -> dict[str, Any]:
@@ -94,7 +103,7 @@ def read_diagnosis(folder: Path) -> dict[str, Any]:
         InputError: a damaged diagnosis.json.
     """
     file = folder / "diagnosis.json"
-    return dict(_checked(file, DIAGNOSIS)) if file.is_file() else {}
+    return dict(_read_checked(file, DIAGNOSIS)) if file.is_file() else {}
 
 
 def covariance_of_effects(path: Path) -> EffectsCovariance:
@@ -130,7 +139,7 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
     Raises:
         InputError: as `read_result`.
     """
-    steps = _checked(folder / "ledger.json", LEDGER)
+    steps = _read_checked(folder / "ledger.json", LEDGER)
     assert isinstance(steps, list)
     return steps
 
@@ -155,7 +164,7 @@ def ledger_steps(folder: Path) -> tuple[LedgerStep, ...]:
     )
 
 
-def _checked(file: Path, schema: dict[str, Any]) -> Any:
+def _read_checked(file: Path, schema: dict[str, Any]) -> Any:
     # Loaded by who reads a run: most that only write one do not.
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
@@ -165,7 +174,7 @@ def _checked(file: Path, schema: dict[str, Any]) -> Any:
         hint = f"this is a session; to fix: `stitch run {shlex.quote(str(file.parent))} -o RUN` first, then name RUN"
     told = read_text(file, hint)
     try:
-        document = json.loads(told, parse_constant=_refused)
+        document = json.loads(told, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({shortened(str(error))}); run `stitch run` again") from None
     wrong = best_match(Draft202012Validator(schema).iter_errors(document))
@@ -175,5 +184,5 @@ def _checked(file: Path, schema: dict[str, Any]) -> Any:
     return document
 
 
-def _refused(word: str) -> float:
+def _refuse_constant(word: str) -> float:
     raise ValueError(f"{word} is no number")

@@ -11,23 +11,23 @@ from plyfile import PlyData, PlyParseError
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, read_model
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect_overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.observations.targets.target_fit import TargetFit
+from stitch.observations.targets.target_fit import TargetModelFit
 from stitch.reading.clouds import require_room
 from stitch.reading.text_file import shortened
 from stitch.runs.run import FusedCloud, Run, StageResult
-from stitch.runs.state import State
+from stitch.runs.state import RunState
 from stitch.stages.evaluate_targets import evaluate_targets
 from stitch.stages.reuse import converged_overlaps
 from stitch.stored.run_documents import read_result
 from stitch.system.threads import library_threads_off
 
 
-def stored_run(folder: Path, state: State) -> Run:
+def stored_run(folder: Path, state: RunState) -> Run:
     """The run of a folder as far as its page shows it; nothing is fitted.
 
     Args:
@@ -40,13 +40,13 @@ def stored_run(folder: Path, state: State) -> Run:
     try:
         document = read_result(folder)
         _require_one(folder, document, model, state)
-        return _restored(folder, document, state)
+        return _restore_run(folder, document, state)
     except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
         reason = shortened(" ".join(str(error).split()))
         raise InputError(f"{folder}: its files are damaged ({reason}); run `stitch run` again") from None
 
 
-def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state: State) -> None:
+def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state: RunState) -> None:
     """Refuse a model or a session that is not that of the result any more."""
     stated = {name: {p: f["value"] for p, f in own.items()} for name, own in document["effects"].items()}
     values = {name: {p: f.value for p, f in own.items()} for name, own in model.effects.items()}
@@ -60,16 +60,16 @@ def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state
         raise InputError(f"{state.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
 
 
-def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
+def _restore_run(folder: Path, document: dict[str, Any], state: RunState) -> Run:
     session, model = state.session, state.model
     gone = {item.view for item in state.left_out}
     views = [view for view in document["views"] if view["view"] not in gone]
     with library_threads_off():
-        own = corrected(state.measurement, model)
+        own = corrected_capture(state.measurement, model)
         overlaps = converged_overlaps(own, model.T_mount, state.gate) if own.scans else None
         poses = np.array([view["pose"] for view in views], float)
-        registered = _registered(own, poses, document, state.gate) if own.scans else None
-        targets = _targets(folder, state) if document.get("targets") and own.sightings is not None else None
+        registered = _registered_overlaps(own, poses, document, state.gate) if own.scans else None
+        targets = _target_fit(folder, state) if document.get("targets") and own.sightings is not None else None
     scatter = document["repeatability"]
     return Run(
         session=session,
@@ -77,7 +77,7 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
         model=model,
         T_mount_coarse=state.T_mount_coarse,
         unobservable=tuple(document["unobservable"]),
-        stages=tuple(_stage(row) for row in document["stages"]),
+        stages=tuple(_stage_result(row) for row in document["stages"]),
         poses_model=own.poses(model.T_mount),
         poses=poses,
         corrections=np.array([view["correction"] for view in views], float),
@@ -101,18 +101,18 @@ def _restored(folder: Path, document: dict[str, Any], state: State) -> Run:
     )
 
 
-def _registered(own: Capture, poses: Array, document: dict[str, Any], gate: float) -> Overlaps:
+def _registered_overlaps(own: Capture, poses: Array, document: dict[str, Any], gate: float) -> Overlaps:
     """Correspondences after register, as the run found them last."""
     stated = (document.get("disagreement") or {}).get("gate")
-    return collect(own, poses, stated or gate, [sample(scan, FINE_SAMPLES) for scan in own.scans])
+    return collect_overlaps(own, poses, stated or gate, [sample_points(scan, FINE_SAMPLES) for scan in own.scans])
 
 
-def _stage(row: dict[str, Any]) -> StageResult:
+def _stage_result(row: dict[str, Any]) -> StageResult:
     rms, words = _number(row["rms"]), (row.get("note", ""), row.get("method", ""))
     return StageResult(row["name"], rms, row["correspondences"], row["iterations"], row["seconds"], *words)
 
 
-def _targets(folder: Path, state: State) -> TargetFit:
+def _target_fit(folder: Path, state: RunState) -> TargetModelFit:
     """What the labelled points say under the model; the distances of views left out are those of the fit."""
     found = evaluate_targets(state.measurement, state.model)
     used = found.rows.sightings.used

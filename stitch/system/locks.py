@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stitch.errors import BusyError
-from stitch.system.named_errors import named
+from stitch.system.named_errors import report_errors_as
 
 try:
     import fcntl
@@ -45,7 +45,7 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
 
 def _locked(lock: Path, what: Path) -> int:
     while True:
-        with named(what, lock):
+        with report_errors_as(what, lock):
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
             if fcntl is not None:
@@ -57,13 +57,13 @@ def _locked(lock: Path, what: Path) -> int:
             ) from None
         except OSError:
             return descriptor  # a file system that knows no locks
-        if _is_still(descriptor, lock):
+        if _is_same_file(descriptor, lock):
             return descriptor
         # Its holder has removed the file between our opening and our locking it.
         os.close(descriptor)
 
 
-def _is_still(descriptor: int, lock: Path) -> bool:
+def _is_same_file(descriptor: int, lock: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(descriptor), lock.stat())
     except FileNotFoundError:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stitch.errors import InputError
 
 
-def mapped(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """Parts of the same named columns one after the other, each column mapped from a file of its own.
 
     Raises:
@@ -36,7 +36,7 @@ def mapped(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any
     return {name: np.memmap(files[name], kind, "r", shape=(rows, *rest)) for name, (kind, rest) in layout.items()}
 
 
-def release(array: NDArray[Any]) -> None:
+def release_mapped(array: NDArray[Any]) -> None:
     """Give back the memory of a mapped array that was looked at; it comes again from its file. Others stay."""
     held = getattr(array, "_mmap", None)
     if isinstance(array, np.memmap) and held is not None and hasattr(mmap, "MADV_DONTNEED"):

@@ -6,11 +6,11 @@ from pathlib import Path
 
 
 @contextmanager
-def named(asked: Path, hidden: Path | None = None) -> Iterator[None]:
-    """Let errors at `hidden` name `asked`; without `hidden` every error does."""
+def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]:
+    """Let errors at `hidden` name `stated`; without `hidden` every error does."""
     try:
         yield
     except OSError as error:
         if hidden is None or str(error.filename) == str(hidden):
-            error.filename = str(asked)
+            error.filename = str(stated)
         raise

@@ -32,11 +32,11 @@ def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterat
         yield from items
         return
     for done, item in enumerate(items):
-        _tell(label, done, count)
+        _notify_watchers(label, done, count)
         yield item
-    _tell(label, count, count)
+    _notify_watchers(label, count, count)
 
 
-def _tell(label: str, done: int, total: int) -> None:
+def _notify_watchers(label: str, done: int, total: int) -> None:
     for watcher in _watchers:
         watcher(label, done, total)

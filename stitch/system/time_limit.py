@@ -38,9 +38,9 @@ def running_over() -> bool:
 
 
 @contextmanager
-def within(seconds: float, message: str) -> Iterator[None]:
+def time_limit(seconds: float, message: str) -> Iterator[None]:
     """Raise InputError with `message` in the main thread if the block takes longer."""
-    _start()
+    _start_watch()
     thread = threading.get_ident()
     outer = _running.get(thread)
     _running[thread] = _Call(time.monotonic() + seconds, message)
@@ -53,23 +53,23 @@ def within(seconds: float, message: str) -> Iterator[None]:
             _running[thread] = outer
 
 
-def _start() -> None:
+def _start_watch() -> None:
     global _watch
     if _watch is not None or not hasattr(signal, "SIGALRM"):
         return
-    _watch = threading.Thread(target=_look, name="stitch-time-limit", daemon=True)
+    _watch = threading.Thread(target=_check_calls, name="stitch-time-limit", daemon=True)
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGALRM, _interrupt)
+        signal.signal(signal.SIGALRM, _interrupt_call)
     _watch.start()
 
 
-def _interrupt(*_: Any) -> None:
+def _interrupt_call(*_: Any) -> None:
     for call in list(_running.values()):
         if call.interrupted:
             raise InputError(call.message)
 
 
-def _look() -> None:
+def _check_calls() -> None:
     main = threading.main_thread().ident
     while True:
         time.sleep(_STEP)
@@ -77,7 +77,7 @@ def _look() -> None:
         for call in list(_running.values()):
             if not call.interrupted and now > call.due:
                 call.interrupted = True
-                if main is not None and signal.getsignal(signal.SIGALRM) is _interrupt:
+                if main is not None and signal.getsignal(signal.SIGALRM) is _interrupt_call:
                     signal.pthread_kill(main, signal.SIGALRM)
             elif call.interrupted and now > call.due + _GRACE and _ends_process:
                 print(f"stitch: {call.message}", file=sys.stderr, flush=True)

@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stitch.system.exchange import exchange
+from stitch.system.exchange import exchange_paths
 from stitch.system.locks import only_writer
-from stitch.system.named_errors import named
-from stitch.system.whole_file import to_disk
+from stitch.system.named_errors import report_errors_as
+from stitch.system.whole_file import sync_to_disk
 
 Ours = Callable[[Path], bool]  # True for a path, relative to the folder, that may go
 _COMMIT = ".stitch-commit"
@@ -25,7 +25,7 @@ _GOES = ".goes.json"
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[Path]:
+def claim_folder(path: Path) -> Iterator[Path]:
     """Hold a folder as its only writer, in the state of its last writer; yields where its scratch folders go.
 
     Raises:
@@ -35,13 +35,13 @@ def claimed(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
     with only_writer(beside / f".{path.name}.lock", asked):
-        home = _home(path, beside)
+        home = _scratch_parent(path, beside)
         _recover(home, path)
         yield home
 
 
 @contextmanager
-def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
+def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
     """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
 
     A link stays one: what it points to is rewritten. What in `path` is not `ours` is kept.
@@ -50,13 +50,13 @@ def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
         InputError: another process writes there.
     """
     asked, path = path, path.resolve()
-    with claimed(asked) as home:
-        with named(asked):
+    with claim_folder(asked) as home:
+        with report_errors_as(asked):
             scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
         try:
             yield scratch
             scratch.chmod(0o777 & ~_umask())
-            to_disk(scratch)
+            sync_to_disk(scratch)
             _commit(scratch, path, ours)
         except OSError as error:
             # The scratch folder is gone when somebody reads this.
@@ -66,25 +66,25 @@ def rewritten(path: Path, ours: Ours) -> Iterator[Path]:
             shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _home(path: Path, beside: Path) -> Path:
+def _scratch_parent(path: Path, parent: Path) -> Path:
     """Where a new folder is made: beside the old one, or in it where that must stay."""
     here = Path.cwd()
-    return path if path in (here, *here.parents) or os.path.ismount(path) else beside
+    return path if path in (here, *here.parents) or os.path.ismount(path) else parent
 
 
 def _prefix(path: Path) -> str:
     return f".{path.name}.stitch-"
 
 
-def _old(home: Path, path: Path) -> Path:
+def _old_folder(home: Path, path: Path) -> Path:
     return home / f"{_prefix(path)}old"
 
 
 def _recover(home: Path, path: Path) -> None:
     """Finish or clear away what a process that was ended has left."""
     if (path / _COMMIT).is_dir():
-        _carry_out(path)
-    old = _old(home, path)
+        _finish_commit(path)
+    old = _old_folder(home, path)
     if old.is_dir() and not path.exists():
         old.rename(path)
     for left in home.glob(f"{glob.escape(_prefix(path))}*"):
@@ -93,27 +93,27 @@ def _recover(home: Path, path: Path) -> None:
 
 def _commit(scratch: Path, path: Path, ours: Ours) -> None:
     if scratch.parent == path:
-        goes = [str(f.relative_to(path)) for f in _files(path) if ours(f.relative_to(path))]
+        goes = [str(f.relative_to(path)) for f in _list_files(path) if ours(f.relative_to(path))]
         (scratch / _GOES).write_text(json.dumps(goes), encoding="utf-8")
         scratch.rename(path / _COMMIT)
-        _carry_out(path)
+        _finish_commit(path)
     elif not path.exists():
         scratch.rename(path)
     else:
-        for file in _files(path):
+        for file in _list_files(path):
             inside = file.relative_to(path)
             if not ours(inside) and not (scratch / inside).exists():
-                _keep(file, scratch / inside)
-        if not exchange(scratch, path):
-            path.rename(_old(scratch.parent, path))
+                _preserve_file(file, scratch / inside)
+        if not exchange_paths(scratch, path):
+            path.rename(_old_folder(scratch.parent, path))
             scratch.rename(path)
-            shutil.rmtree(_old(scratch.parent, path), ignore_errors=True)
+            shutil.rmtree(_old_folder(scratch.parent, path), ignore_errors=True)
 
 
-def _carry_out(path: Path) -> None:
+def _finish_commit(path: Path) -> None:
     """What was committed takes its place; done twice it does the same."""
     commit = path / _COMMIT
-    new = {file.relative_to(commit) for file in _files(commit)} - {Path(_GOES)}
+    new = {file.relative_to(commit) for file in _list_files(commit)} - {Path(_GOES)}
     if (commit / _GOES).is_file():
         for name in json.loads((commit / _GOES).read_text(encoding="utf-8")):
             if Path(name) not in new and not (path / name).is_dir():
@@ -125,18 +125,18 @@ def _carry_out(path: Path) -> None:
     shutil.rmtree(commit, ignore_errors=True)
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _list_files(folder: Path) -> Iterator[Path]:
     """Everything in a folder but its folders, links and empty folders included, scratch folders left out."""
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith((f".{folder.name}.stitch-", f".{folder.name}.lock", _COMMIT)):
             continue
         if entry.is_dir() and not entry.is_symlink() and any(entry.iterdir()):
-            yield from _files(entry)
+            yield from _list_files(entry)
         else:
             yield entry
 
 
-def _keep(file: Path, place: Path) -> None:
+def _preserve_file(file: Path, place: Path) -> None:
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir() and not file.is_symlink():
         place.mkdir(exist_ok=True)

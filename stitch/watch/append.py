@@ -7,9 +7,9 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.watch.catch_up import catch_up, forget_since
-from stitch.watch.history import History, as_text, insert_run
-from stitch.watch.mount_twist import NAMES, mount_twist, twist_covariance
-from stitch.watch.read_record import middle_seen
+from stitch.watch.history import History, insert_run, matrix_json
+from stitch.watch.mount_twist import TWIST_NAMES, mount_twist, twist_covariance
+from stitch.watch.read_record import scanned_middle
 from stitch.watch.regressors import chosen_channels
 from stitch.watch.run_record import Estimate, RunRecord
 
@@ -25,41 +25,41 @@ def append_runs(history: History, records: Sequence[RunRecord]) -> int:
         InputError: a run of another cell, or one that repeats the numbers of another session.
     """
     with history.writing():
-        begun = [_store(history, record) for record in sorted(records, key=lambda r: r.time)]
+        begun = [_store_run(history, record) for record in sorted(records, key=lambda r: r.time)]
         new = [time for time in begun if time is not None]
         if new:
             catch_up(history, min(new))
         return len(new)
 
 
-def _store(history: History, record: RunRecord) -> float | None:
+def _store_run(history: History, record: RunRecord) -> float | None:
     """Store a run; the time from which the history has to be followed anew, None where the run is there already."""
     if history.sql("SELECT 1 FROM runs WHERE run_hash = ?", record.run_hash):
         return None
     if history.stated("length_unit") is None:
-        _begin(history, record)
+        _begin_cell(history, record)
     _require_same_cell(history, record)
-    begun = min(record.time, _without_former(history, record))
+    begun = min(record.time, _replace_former_run(history, record))
     numbers = _numbers_hash(record)
     for (other,) in history.sql("SELECT run FROM runs WHERE numbers_hash = ?", numbers):
         raise InputError(
             f"{record.path}: has the very numbers of {other}: one fit, not two; to fix: run its session for itself"
         )
     run = insert_run(history, record, numbers)
-    estimates = [*_hand_eye(history, record), *record.estimates]
-    _know_parameters(history, record, estimates)
+    estimates = [*_hand_eye_estimates(history, record), *record.estimates]
+    _insert_parameters(history, record, estimates)
     known = dict(history.sql("SELECT name, id FROM parameters"))
     rows = [(run, known[e.name], e.value, e.sigma) for e in estimates if np.isfinite(e.sigma) and e.sigma > 0]
     if not rows:
         raise InputError(f"{record.path}: states no sigma of anything; to fix: run its session again")
     history.many("INSERT INTO estimates VALUES (?, ?, ?, ?)", rows)
     history.many("INSERT INTO covariates VALUES (?, ?, ?)", [(run, *item) for item in record.covariates.items()])
-    if _channels_changed(history, record):
+    if _update_channels(history, record):
         return -np.inf
     return begun
 
 
-def _without_former(history: History, record: RunRecord) -> float:
+def _replace_former_run(history: History, record: RunRecord) -> float:
     """A session that was run again counts once, as it was run last; the time of the former run, inf without."""
     begun = np.inf
     for run, time, run_hash in history.sql(
@@ -74,9 +74,9 @@ def _without_former(history: History, record: RunRecord) -> float:
     return begun
 
 
-def _begin(history: History, record: RunRecord) -> None:
+def _begin_cell(history: History, record: RunRecord) -> None:
     """What the first run fixes for good: units, the mount's place, the point about which it is watched."""
-    centre, radius = middle_seen(record)
+    centre, radius = scanned_middle(record)
     history.state(
         {
             "length_unit": record.length_unit,
@@ -101,16 +101,16 @@ def _require_same_cell(history: History, record: RunRecord) -> None:
             )
 
 
-def _hand_eye(history: History, record: RunRecord) -> list[Estimate]:
+def _hand_eye_estimates(history: History, record: RunRecord) -> list[Estimate]:
     first, centre = np.array(history.stated("hand_eye_first")), np.array(history.stated("centre_scanner"))
     values = mount_twist(record.T_mount, first, centre)
     sigmas = np.sqrt(np.maximum(np.diag(twist_covariance(record.covariance, record.T_mount, first, centre)), 0.0))
     units = ["rad"] * 3 + [record.length_unit] * 3
-    own = zip(NAMES, units, values, sigmas, strict=True)
+    own = zip(TWIST_NAMES, units, values, sigmas, strict=True)
     return [Estimate(f"hand_eye.{name}", unit, float(value), float(sigma)) for name, unit, value, sigma in own]
 
 
-def _know_parameters(history: History, record: RunRecord, estimates: Sequence[Estimate]) -> None:
+def _insert_parameters(history: History, record: RunRecord, estimates: Sequence[Estimate]) -> None:
     units = dict(history.sql("SELECT name, unit FROM parameters"))
     for estimate in estimates:
         if estimate.name not in units:
@@ -122,7 +122,7 @@ def _know_parameters(history: History, record: RunRecord, estimates: Sequence[Es
             )
 
 
-def _channels_changed(history: History, record: RunRecord) -> bool:
+def _update_channels(history: History, record: RunRecord) -> bool:
     """Whether what parameters may follow is another now: then all is followed anew."""
     before, references = history.stated("channels"), history.stated("channel_references")
     if record.covariates.keys() <= references.keys():
@@ -134,5 +134,9 @@ def _channels_changed(history: History, record: RunRecord) -> bool:
 
 
 def _numbers_hash(record: RunRecord) -> str:
-    told = as_text(record.T_mount) + as_text(record.covariance) + repr([(e.name, e.value) for e in record.estimates])
+    told = (
+        matrix_json(record.T_mount)
+        + matrix_json(record.covariance)
+        + repr([(e.name, e.value) for e in record.estimates])
+    )
     return hashlib.sha256(told.encode()).hexdigest()

@@ -6,18 +6,18 @@ from scipy.special import stdtr
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.watch.catch_up import last_state
-from stitch.watch.cell_report import CellReport, Follows, ParameterReport
-from stitch.watch.changes import Change, changes
+from stitch.watch.cell_report import CellReport, FollowedChannel, ParameterReport
+from stitch.watch.changes import Change, find_changes
 from stitch.watch.history import History
-from stitch.watch.regressors import DAY
+from stitch.watch.regressors import DAY_SECONDS
 from stitch.watch.state_bank import COVARIATES, SLOPE, Bank
-from stitch.watch.stored_sessions import Names, names_of, sessions_from
+from stitch.watch.stored_sessions import SessionColumns, session_columns, sessions_from
 from stitch.watch.validity import days_valid
 
 # A slope or a share of a channel that is so unlikely by chance is named (per parameter and channel).
-_NAMED = 1e-4
+_FOLLOWS_P_LIMIT = 1e-4
 # Expanded uncertainty: within which a calibration claims to be right.
-_K = 2.0
+_COVERAGE_FACTOR = 2.0
 
 
 def cell_report(history: History, tolerance: float | None = None) -> CellReport:
@@ -33,22 +33,22 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
     found = last_state(history)
     if found is None:
         raise InputError(f"{history.folder}: has no sessions yet; to fix: append one with --add RUN")
-    names, bank, events = names_of(history), found.state.bank, changes(history)
+    names, bank, events = session_columns(history), found.state.bank, find_changes(history)
     last_run, last = history.sql("SELECT id, time FROM runs ORDER BY time DESC, id DESC LIMIT 1")[0]
     calibration = history.stated("in_use")
     used, in_use, used_time = history.sql("SELECT id, name, time FROM runs WHERE run_hash = ?", calibration)[0]
     ends = sessions_from(history, [used, last_run])
     at = {run: k for k, run in enumerate(ends.ids)}
-    limits = _limits(history, names, ends.sigmas[at[used]], tolerance)
+    limits = _parameter_limits(history, names, ends.sigmas[at[used]], tolerance)
     best = bank.chosen(bank.best)
     days = days_valid(best, ends.covariates[at[used]], ends.values[at[used]], limits)
-    common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * _typical(ends.sigmas, best)
+    common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * _typical_sigmas(ends.sigmas, best)
     run_names, times = _runs_of(history, events)
     parameters = [
-        _parameter(p, names, best, _sloped(bank), ends.covariates[at[last_run]], common[p])
+        _assess_parameter(p, names, best, _likeliest_sloped(bank), ends.covariates[at[last_run]], common[p])
         | {"in_use": float(ends.values[at[used], p]), "limit": float(limits[p])}
-        | {"valid_until": float(last + DAY * days[p]) if np.isfinite(days[p]) else None}
-        | _events(p, events, times, used_time, _sloped(bank))
+        | {"valid_until": float(last + DAY_SECONDS * days[p]) if np.isfinite(days[p]) else None}
+        | _standing_events(p, events, times, used_time, _likeliest_sloped(bank))
         for p in range(len(names.parameters))
     ]
     return CellReport(
@@ -72,7 +72,9 @@ def _runs_of(history: History, events: list[Change]) -> tuple[dict[int, str], di
     return {run: str(name) for run, name, _ in rows}, {run: float(time) for run, _, time in rows}
 
 
-def _parameter(p: int, names: Names, best: Bank, sloped: Bank, conditions: Array, common: float) -> dict[str, object]:
+def _assess_parameter(
+    p: int, names: SessionColumns, best: Bank, sloped: Bank, conditions: Array, common: float
+) -> dict[str, object]:
     x = np.concatenate([[1.0, 0.0], conditions])
     unit, scatter = best.unit[p], best.scatter[p, 0]
     own = unit * np.sqrt(max(x @ best.covariance[p, 0] @ x, 0.0) * scatter)
@@ -87,44 +89,46 @@ def _parameter(p: int, names: Names, best: Bank, sloped: Bank, conditions: Array
         "drift_per_day": float(unit * slope),
         "drift_sigma": float(unit * np.sqrt(max(variance, 0.0))),
         "process_noise": float(unit * np.sqrt(best.noise[p, 0, 0] * scatter)),
-        "follows": tuple(_follows(p, names, best)),
+        "follows": tuple(_followed_channels(p, names, best)),
     }
 
 
-def _follows(p: int, names: Names, best: Bank) -> list[Follows]:
+def _followed_channels(p: int, names: SessionColumns, best: Bank) -> list[FollowedChannel]:
     out = []
     for c, channel in enumerate(names.channels):
         size = best.mean[p, 0, COVARIATES + c]
         sigma = np.sqrt(best.covariance[p, 0, COVARIATES + c, COVARIATES + c] * best.scatter[p, 0])
         p_value = 2 * float(stdtr(max(best.count[p] - 4, 1), -abs(size) / max(sigma, 1e-300)))
-        if p_value < _NAMED:
-            out.append(Follows(channel, float(best.unit[p] * size), float(best.unit[p] * sigma), p_value))
+        if p_value < _FOLLOWS_P_LIMIT:
+            out.append(FollowedChannel(channel, float(best.unit[p] * size), float(best.unit[p] * sigma), p_value))
     return out
 
 
-def _events(p: int, events: list[Change], times: dict[int, float], used: float, sloped: Bank) -> dict[str, object]:
+def _standing_events(
+    p: int, events: list[Change], times: dict[int, float], used: float, sloped: Bank
+) -> dict[str, object]:
     """Changes of a parameter; an alarm stands until a calibration after it is in use, a drift as long as it goes on."""
     own = tuple(c for c in events if c.parameter == p)
     slope, sigma = sloped.mean[p, 0, SLOPE], np.sqrt(sloped.covariance[p, 0, SLOPE, SLOPE] * sloped.scatter[p, 0])
-    moves = 2 * stdtr(max(sloped.count[p] - 4, 1), -abs(slope) / max(sigma, 1e-300)) < _NAMED
+    moves = 2 * stdtr(max(sloped.count[p] - 4, 1), -abs(slope) / max(sigma, 1e-300)) < _FOLLOWS_P_LIMIT
     standing = [c for c in own if times[c.since] > used or (c.kind == "drift" and moves)]
     return {"changes": own, "alarm": max(standing, key=lambda c: times[c.raised], default=None)}
 
 
-def _sloped(bank: Bank) -> Bank:
+def _likeliest_sloped(bank: Bank) -> Bank:
     """The likeliest member that believes in a slope."""
     believes = np.flatnonzero(bank.covariance[:, :, SLOPE, SLOPE].min(axis=0) > 0)
     return bank.chosen(believes[np.argmax(bank.log_likelihood[:, believes], axis=1)])
 
 
-def _typical(sigmas: Array, bank: Bank) -> Array:
+def _typical_sigmas(sigmas: Array, bank: Bank) -> Array:
     """(P,) stated sigma: of the last session that shows a parameter, else of the first."""
     return np.where(np.isfinite(sigmas[-1]), sigmas[-1], bank.unit)
 
 
-def _limits(history: History, names: Names, sigmas: Array, tolerance: float | None) -> Array:
+def _parameter_limits(history: History, names: SessionColumns, sigmas: Array, tolerance: float | None) -> Array:
     """(P,) how far a parameter may be from the calibration in use; NaN where that does not have it."""
-    limits = _K * sigmas
+    limits = _COVERAGE_FACTOR * sigmas
     if tolerance is not None:
         radius = float(history.stated("radius"))
         own = {f"hand_eye.{axis}": tolerance for axis in "xyz"}

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
-from stitch.watch.catch_up import after, alarms_of, last_state, start_of
+from stitch.watch.catch_up import last_state, sessions_after, state_or_first, stored_alarms
 from stitch.watch.cell_report import CellReport
 from stitch.watch.history import History
-from stitch.watch.smoother import smoothed
+from stitch.watch.smoother import smoothed_states
 
 # Sessions that a page shows: a month of 20 a day.
-SHOWN = 600
+MAX_SESSIONS = 600
 
 
 @dataclass(frozen=True)
-class CellCourse:
+class CellTrend:
     """n sessions, P parameters of the report, in its units."""
 
     report: CellReport
@@ -29,19 +29,19 @@ class CellCourse:
     channels: dict[str, Array]  # (n,) NaN where a session does not tell
 
 
-def cell_course(history: History, report: CellReport, shown: int = SHOWN) -> CellCourse:
+def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SESSIONS) -> CellTrend:
     """The last sessions of a cell, smoothed."""
-    rows = history.sql("SELECT time FROM runs ORDER BY time DESC, id DESC LIMIT ?", shown)
+    rows = history.sql("SELECT time FROM runs ORDER BY time DESC, id DESC LIMIT ?", max_sessions)
     kept, last = last_state(history, before=rows[-1][0]), last_state(history)
     assert last is not None
-    sessions, moved = after(history, kept), defaultdict(list)
-    for alarm in alarms_of(history):
+    sessions, moved = sessions_after(history, kept), defaultdict(list)
+    for alarm in stored_alarms(history):
         moved[alarm.onset].append(alarm.parameter)
-    seen = smoothed(start_of(history, kept), sessions, moved, last.state)
-    part = slice(max(len(sessions.ids) - shown, 0), None)
+    seen = smoothed_states(state_or_first(history, kept), sessions, moved, last.state)
+    part = slice(max(len(sessions.ids) - max_sessions, 0), None)
     common = np.array([p.common_sigma for p in report.parameters])
     times = dict(history.sql("SELECT id, time FROM runs"))
-    return CellCourse(
+    return CellTrend(
         report=report,
         times=np.array([times[run] for run in sessions.ids[part]]),
         values=sessions.values[part],

@@ -6,7 +6,7 @@ from stitch.watch.changes import Change
 
 
 @dataclass(frozen=True)
-class Follows:
+class FollowedChannel:
     """A channel that a parameter follows."""
 
     channel: str
@@ -28,7 +28,7 @@ class ParameterReport:
     drift_per_day: float
     drift_sigma: float
     process_noise: float  # per √day, of the likeliest member
-    follows: tuple[Follows, ...]
+    follows: tuple[FollowedChannel, ...]
     in_use: float  # in the calibration in use; NaN where that does not have it
     limit: float  # how far from there it may be
     valid_until: float | None  # s since 1970; None beyond the horizon

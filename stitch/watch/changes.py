@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.watch.catch_up import alarms_of
+from stitch.watch.catch_up import stored_alarms
 from stitch.watch.follow import Alarm, Sessions
 from stitch.watch.history import History
 from stitch.watch.onset import Onset, find_onset
@@ -30,22 +30,22 @@ class Change:
     chart: str
 
 
-def changes(history: History) -> list[Change]:
+def find_changes(history: History) -> list[Change]:
     """All events in the order in which they were raised; a drift that goes on is one."""
-    alarms, out = alarms_of(history), list[Change]()
+    alarms, out = stored_alarms(history), list[Change]()
     order = {run: k for k, (run,) in enumerate(history.sql("SELECT id FROM runs ORDER BY time, id"))}
     for parameter in sorted({a.parameter for a in alarms}):
         own = sorted((a for a in alarms if a.parameter == parameter), key=lambda a: order[a.raised])
         drifting = False
         for i in range(len(own)):
-            found = _change(history, own, i, order, drifting)
+            found = _assess_change(history, own, i, order, drifting)
             if not (drifting and found.kind == "drift"):
                 out.append(found)
             drifting = found.kind == "drift"
     return sorted(out, key=lambda c: (order[c.raised], c.parameter))
 
 
-def _change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int], drifting: bool) -> Change:
+def _assess_change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int], drifting: bool) -> Change:
     """Judged from the event before until the next was seen.
 
     Args:
@@ -55,7 +55,7 @@ def _change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int
     begin = max(order[own[i - 1].onset] if i else 0, at - _AROUND)
     end = min(order[own[i + 1].raised] if i + 1 < len(own) else len(order), max(at + _AROUND, order[alarm.raised] + 1))
     runs = list(order)[begin:end]
-    found = _found(sessions_from(history, runs), alarm.parameter, drifting)
+    found = _find_alarm_onset(sessions_from(history, runs), alarm.parameter, drifting)
     shape = "step" if found is None else found.shape
     return Change(
         parameter=alarm.parameter,
@@ -70,7 +70,7 @@ def _change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int
     )
 
 
-def _found(sessions: Sessions, parameter: int, drifting: bool) -> Onset | None:
+def _find_alarm_onset(sessions: Sessions, parameter: int, drifting: bool) -> Onset | None:
     base = [sessions.covariates, sessions.days[:, None]] if drifting else [sessions.covariates]
     values = sessions.values[:, parameter]
     if np.isfinite(values).sum() < 3:

@@ -14,9 +14,9 @@ from stitch.frames import Array, Mask
 from stitch.watch.run_length import cusum_limit, ewma_limit
 from stitch.watch.state_bank import WILD
 
-REFERENCES = (0.25, 2.0)
-WEIGHT = 0.05
-NAMES = ("CUSUM 0.25", "CUSUM 2", "EWMA 0.05")
+CUSUM_REFERENCES = (0.25, 2.0)
+EWMA_WEIGHT = 0.05
+CHART_NAMES = ("CUSUM 0.25", "CUSUM 2", "EWMA 0.05")
 # Beside the charts: odds of a slope since the first session, for what moves from the beginning on, when no chart has
 # seen the parameter still. With this probability a cell ever alarms falsely by them.
 ODDS = "odds of a slope"
@@ -35,24 +35,24 @@ class Charts:
         return {"cusums": self.cusums, "ewma": self.ewma}
 
 
-def no_charts(parameters: int) -> Charts:
+def empty_charts(parameters: int) -> Charts:
     """Charts that begin."""
-    return Charts(np.zeros((parameters, len(REFERENCES), 2)), np.zeros(parameters))
+    return Charts(np.zeros((parameters, len(CUSUM_REFERENCES), 2)), np.zeros(parameters))
 
 
-def with_rows(charts: Charts, more: int) -> Charts:
+def extended_charts(charts: Charts, more: int) -> Charts:
     """The charts of further parameters beside them."""
-    new = no_charts(more)
+    new = empty_charts(more)
     return Charts(np.concatenate([charts.cusums, new.cusums]), np.concatenate([charts.ewma, new.ewma]))
 
 
-def charted(charts: Charts, innovations: Array) -> Charts:
+def updated_charts(charts: Charts, innovations: Array) -> Charts:
     """One session more; innovations (P,), NaN where there is none."""
     seen = np.isfinite(innovations)
     u = np.clip(np.where(seen, innovations, 0.0), -WILD, WILD)
     signed = u[:, None, None] * np.array([1.0, -1.0])
-    cusums = np.maximum(charts.cusums + signed - np.array(REFERENCES)[:, None], 0.0)
-    ewma = (1 - WEIGHT) * charts.ewma + WEIGHT * u
+    cusums = np.maximum(charts.cusums + signed - np.array(CUSUM_REFERENCES)[:, None], 0.0)
+    ewma = (1 - EWMA_WEIGHT) * charts.ewma + EWMA_WEIGHT * u
     return Charts(np.where(seen[:, None, None], cusums, charts.cusums), np.where(seen, ewma, charts.ewma))
 
 
@@ -64,14 +64,14 @@ def restarted(charts: Charts, moved: Mask) -> Charts:
 
 
 @cache
-def limits(sessions: float, parameters: int) -> tuple[float, ...]:
+def chart_limits(sessions: float, parameters: int) -> tuple[float, ...]:
     """Limit of each chart of `NAMES` so that the whole cell alarms falsely once in so many sessions.
 
     The rate is split evenly over charts and parameters: were they independent, rates would add up; as the charts of one
     parameter go together, the cell's rate is smaller.
     """
-    own = sessions * parameters * len(NAMES)
-    return (*(cusum_limit(k, own) for k in REFERENCES), ewma_limit(WEIGHT, own))
+    own = sessions * parameters * len(CHART_NAMES)
+    return (*(cusum_limit(k, own) for k in CUSUM_REFERENCES), ewma_limit(EWMA_WEIGHT, own))
 
 
 def odds_limit(parameters: int) -> float:
@@ -79,6 +79,6 @@ def odds_limit(parameters: int) -> float:
     return float(np.log(max(parameters, 1) / _EVER))
 
 
-def beyond(charts: Charts, limit: tuple[float, ...]) -> Array:
+def limit_shares(charts: Charts, limit: tuple[float, ...]) -> Array:
     """(P, 3) each chart as a share of its limit; an alarm from 1 on."""
     return np.column_stack([*(charts.cusums.max(axis=2) / np.array(limit[:-1])).T, np.abs(charts.ewma) / limit[-1]])

@@ -31,9 +31,9 @@ def dfq_text(history: History, report: CellReport) -> str:
         )
     )
     scales = [_SCALES.get(p.unit, (1.0, p.unit)) for p in report.parameters]
-    lines = [f"K0100 {len(scales)}", "K1001 1", f"K1002 {_plain(report.name)}"]
+    lines = [f"K0100 {len(scales)}", "K1001 1", f"K1002 {_dfq_text_safe(report.name)}"]
     for i, (p, (scale, unit)) in enumerate(zip(report.parameters, scales, strict=True)):
-        lines += [f"K2001/{i + 1} {i + 1}", f"K2002/{i + 1} {_plain(p.name)}", f"K2142/{i + 1} {unit}"]
+        lines += [f"K2001/{i + 1} {i + 1}", f"K2002/{i + 1} {_dfq_text_safe(p.name)}", f"K2142/{i + 1} {unit}"]
         if i in stated and np.isfinite(p.limit):
             middle = scale * stated[i]
             limits = (("K2101", middle), ("K2110", middle - scale * p.limit), ("K2111", middle + scale * p.limit))
@@ -41,15 +41,15 @@ def dfq_text(history: History, report: CellReport) -> str:
     factors = np.array([scale for scale, _ in scales])
     for (_, time), values in zip(rows, sessions.values * factors, strict=True):
         when = datetime.fromtimestamp(time, UTC).strftime("%d.%m.%Y/%H:%M:%S")
-        lines.append(_VALUE.join(_entry(x, when) for x in values))
+        lines.append(_VALUE.join(_dfq_entry(x, when) for x in values))
     return "\r\n".join([*lines, ""])
 
 
-def _entry(value: float, when: str) -> str:
+def _dfq_entry(value: float, when: str) -> str:
     measured = bool(np.isfinite(value))
     return _FIELD.join([f"{value:.9g}" if measured else "0", str(_VALID if measured else _MISSING), when])
 
 
-def _plain(text: str) -> str:
+def _dfq_text_safe(text: str) -> str:
     """Without what parts fields and lines."""
     return "".join(c if c.isprintable() else " " for c in text)

@@ -12,20 +12,20 @@ import numpy as np
 
 from stitch.frames import Array
 from stitch.watch.control_charts import (
-    NAMES,
+    CHART_NAMES,
     ODDS,
     Charts,
-    beyond,
-    charted,
-    limits,
-    no_charts,
+    chart_limits,
+    empty_charts,
+    extended_charts,
+    limit_shares,
     odds_limit,
     restarted,
-    with_rows,
+    updated_charts,
 )
 from stitch.watch.onset import find_onset
 from stitch.watch.slope_odds import slope_odds
-from stitch.watch.state_bank import Bank, empty_bank, freed, predicted, updated, with_parameters
+from stitch.watch.state_bank import Bank, empty_bank, predicted_bank, reset_moved, updated_bank, with_parameters
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Sessions:
     values: Array  # (n, P) NaN where a session does not show a parameter
     sigmas: Array  # (n, P)
     covariates: Array  # (n, c) less those of the first
-    believed: Array  # (c,) how far, in sigmas, a parameter may follow each by one unit
+    prior_sigmas: Array  # (c,) how far, in sigmas, a parameter may follow each by one unit
     channels: Sequence[str]
 
 
 @dataclass(frozen=True)
-class State:
+class CellState:
     """What is known after a session."""
 
     bank: Bank
@@ -60,12 +60,12 @@ class Alarm:
     chart: str
 
 
-def first_state(covariates: int) -> State:
+def first_state(covariates: int) -> CellState:
     """Before the first session."""
-    return State(empty_bank(covariates), no_charts(0), 0.0)
+    return CellState(empty_bank(covariates), empty_charts(0), 0.0)
 
 
-def one_more(state: State, sessions: Sessions, k: int, moved: Collection[int] = ()) -> State:
+def next_state(state: CellState, sessions: Sessions, k: int, moved: Collection[int] = ()) -> CellState:
     """The state after session k.
 
     Args:
@@ -75,17 +75,20 @@ def one_more(state: State, sessions: Sessions, k: int, moved: Collection[int] = 
     bank, charts = state.bank, state.charts
     known = len(bank.origin)
     if len(values) > known:
-        fresh = _beginning(sessions, known)
-        bank, charts = with_parameters(bank, *fresh, sessions.believed), with_rows(charts, len(values) - known)
-    bank = predicted(bank, max(sessions.days[k] - state.day, 0.0))
+        fresh = _first_values(sessions, known)
+        bank, charts = (
+            with_parameters(bank, *fresh, sessions.prior_sigmas),
+            extended_charts(charts, len(values) - known),
+        )
+    bank = predicted_bank(bank, max(sessions.days[k] - state.day, 0.0))
     if moved:
         mask = np.isin(np.arange(len(values)), list(moved))
-        bank, charts = freed(bank, mask), restarted(charts, mask)
-    bank, innovations = updated(bank, values, sigmas, sessions.covariates[k])
-    return State(bank, charted(charts, innovations), float(sessions.days[k]))
+        bank, charts = reset_moved(bank, mask), restarted(charts, mask)
+    bank, innovations = updated_bank(bank, values, sigmas, sessions.covariates[k])
+    return CellState(bank, updated_charts(charts, innovations), float(sessions.days[k]))
 
 
-def _beginning(sessions: Sessions, known: int) -> tuple[Array, Array]:
+def _first_values(sessions: Sessions, known: int) -> tuple[Array, Array]:
     """First value and first sigma of the parameters from number `known` on."""
     values, sigmas = sessions.values[:, known:], sessions.sigmas[:, known:]
     seen = np.isfinite(values) & (sigmas > 0)
@@ -94,13 +97,16 @@ def _beginning(sessions: Sessions, known: int) -> tuple[Array, Array]:
     return np.where(told, values[first, own], 0.0), np.where(told, sigmas[first, own], 1.0)
 
 
-def alarmed(state: State, run_length: float) -> list[tuple[int, str]]:
+def alarming_parameters(state: CellState, run_length: float) -> list[tuple[int, str]]:
     """Parameters whose charts are beyond their limits, with the chart that is farthest."""
     parameters = len(state.bank.origin)
     share = np.column_stack(
-        [beyond(state.charts, limits(run_length, parameters)), slope_odds(state.bank) / odds_limit(parameters)]
+        [
+            limit_shares(state.charts, chart_limits(run_length, parameters)),
+            slope_odds(state.bank) / odds_limit(parameters),
+        ]
     )
-    return [(int(p), (*NAMES, ODDS)[int(np.argmax(share[p]))]) for p in np.flatnonzero(share.max(axis=1) >= 1)]
+    return [(int(p), (*CHART_NAMES, ODDS)[int(np.argmax(share[p]))]) for p in np.flatnonzero(share.max(axis=1) >= 1)]
 
 
 def raise_alarm(sessions: Sessions, k: int, parameter: int, chart: str, before: Sequence[Alarm]) -> Alarm:

@@ -16,8 +16,8 @@ from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.watch.run_record import RunRecord
 
-FILE = "history.sqlite"
-FORMAT = "stitch-history/1"
+HISTORY_FILE = "history.sqlite"
+HISTORY_FORMAT = "stitch-history/1"
 _WAIT = 60.0  # s for another process to finish its append
 _SCHEMA = """
 CREATE TABLE cell (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -74,7 +74,7 @@ class History:
 
 
 @contextmanager
-def opened(folder: Path, new: bool = False) -> Iterator[History]:
+def open_history(folder: Path, new: bool = False) -> Iterator[History]:
     """The history of a cell folder.
 
     Args:
@@ -84,7 +84,7 @@ def opened(folder: Path, new: bool = False) -> Iterator[History]:
         InputError: no cell folder, or its history is none.
         NoResultError: another process holds it for long.
     """
-    file = folder / FILE
+    file = folder / HISTORY_FILE
     if file.exists() and not file.is_file():
         raise InputError(f"{file}: is no file; to fix: move it away, or name another folder for the cell")
     begun = not file.exists()
@@ -142,7 +142,7 @@ def _prepare(file: Path, connection: sqlite3.Connection) -> None:
     if not connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'cell'").fetchone()[0]:
         for statement in _SCHEMA.split(";"):
             connection.execute(statement)
-        connection.execute("INSERT INTO cell VALUES ('format', ?)", (json.dumps(FORMAT),))
+        connection.execute("INSERT INTO cell VALUES ('format', ?)", (json.dumps(HISTORY_FORMAT),))
     connection.commit()
 
 
@@ -152,11 +152,13 @@ def _require_history(file: Path, connection: sqlite3.Connection) -> None:
     if not tables:
         return
     own = connection.execute("SELECT value FROM cell WHERE key = 'format'").fetchall() if "states" in tables else []
-    if own != [(json.dumps(FORMAT),)]:
-        raise InputError(f"{file}: is no history in the form {FORMAT}; to fix: name another folder for the cell")
+    if own != [(json.dumps(HISTORY_FORMAT),)]:
+        raise InputError(
+            f"{file}: is no history in the form {HISTORY_FORMAT}; to fix: name another folder for the cell"
+        )
 
 
-def as_text(matrix: Array) -> str:
+def matrix_json(matrix: Array) -> str:
     """A matrix as JSON with all digits."""
     return json.dumps(matrix.tolist())
 
@@ -164,7 +166,7 @@ def as_text(matrix: Array) -> str:
 def insert_run(history: History, record: RunRecord, numbers_hash: str) -> int:
     """A row of `runs`; its number."""
     row: list[Any] = [record.time, record.time_from, record.name, str(record.path), record.session, record.run_hash]
-    row += [record.session_hash, numbers_hash, as_text(record.T_mount), as_text(record.covariance)]
+    row += [record.session_hash, numbers_hash, matrix_json(record.T_mount), matrix_json(record.covariance)]
     columns = "time, time_from, name, run, session, run_hash, session_hash, numbers_hash, hand_eye, covariance, numbers"
     text = f"INSERT INTO runs ({columns}) VALUES ({', '.join('?' * 11)}) RETURNING id"
     return int(history.sql(text, *row, json.dumps(record.numbers))[0][0])

@@ -10,7 +10,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 
-NAMES = ("rx", "ry", "rz", "x", "y", "z")
+TWIST_NAMES = ("rx", "ry", "rz", "x", "y", "z")
 
 
 def mount_twist(T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
@@ -19,13 +19,13 @@ def mount_twist(T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> 
     Args:
         centre_scanner: (3,) the middle of what the first run saw, scanner frame.
     """
-    about = _about(T_mount_first, centre_scanner)
+    about = _watch_frame(T_mount_first, centre_scanner)
     return np.asarray(frames.log(frames.inverse(about) @ T_mount @ frames.inverse(T_mount_first) @ about))
 
 
 def twist_covariance(covariance: Array, T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
     """(6, 6) of `mount_twist` from that of the right perturbation T_mount·exp(ξ), to first order."""
-    J = frames.adjoint(frames.inverse(_about(T_mount_first, centre_scanner)) @ T_mount)
+    J = frames.adjoint(frames.inverse(_watch_frame(T_mount_first, centre_scanner)) @ T_mount)
     return np.asarray(J @ covariance @ J.T)
 
 
@@ -39,6 +39,6 @@ def middle_in_scanner(poses: Array, middle: Array) -> Array:
     return np.asarray(frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0))
 
 
-def _about(T_mount_first: Array, centre_scanner: Array) -> Array:
+def _watch_frame(T_mount_first: Array, centre_scanner: Array) -> Array:
     """(4, 4) axes of the mount frame at the centre."""
     return frames.make(np.eye(3), frames.transform(T_mount_first, centre_scanner[None])[0])

@@ -20,7 +20,7 @@ _FEW = 3
 # Sessions after an onset from which a line, or a response to a channel, can be told from a step.
 _COURSE = 6
 # Share of a column that must be left beside the columns of the undisturbed parameter.
-_TOLD = 1e-6
+_MIN_COLUMN_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,16 @@ def find_onset(values: Array, sigmas: Array, days: Array, covariates: Array, cha
     n = len(seen)
     # What a few sessions follow cannot be told.
     follows = covariates[seen] if n >= _FEW * (1 + covariates.shape[1]) else np.zeros((n, 0))
-    base, _ = np.linalg.qr(_kept(np.column_stack([np.ones(n), follows])) / sigmas[seen, None])
+    base, _ = np.linalg.qr(_varying_columns(np.column_stack([np.ones(n), follows])) / sigmas[seen, None])
     if n < base.shape[1] + 2:
         return None
-    y: Array = _beside(base, (values[seen] / sigmas[seen])[:, None])[:, 0]
+    y: Array = _without_base(base, (values[seen] / sigmas[seen])[:, None])[:, 0]
     best, tried, square = (0.0, "", 0, 0.0), 0, float(y @ y)
-    for shape, columns in _shapes(days[seen], covariates[seen], channels).items():
+    for shape, columns in _change_shapes(days[seen], covariates[seen], channels).items():
         white = columns / sigmas[seen, None]
-        left = _beside(base, white)
+        left = _without_base(base, white)
         length = np.sum(left**2, axis=0)
-        told = length > _TOLD * np.maximum(np.sum(white**2, axis=0), 1e-300)
+        told = length > _MIN_COLUMN_SHARE * np.maximum(np.sum(white**2, axis=0), 1e-300)
         gains = np.where(told, (y @ left) ** 2 / np.where(told, length, 1.0), 0.0)
         tried += int(told.sum())
         at = int(np.argmax(gains))
@@ -70,7 +70,7 @@ def find_onset(values: Array, sigmas: Array, days: Array, covariates: Array, cha
     return Onset(int(seen[at]), shape, size, abs(size) / float(t), p_value)
 
 
-def _shapes(days: Array, covariates: Array, channels: Sequence[str]) -> dict[str, Array]:
+def _change_shapes(days: Array, covariates: Array, channels: Sequence[str]) -> dict[str, Array]:
     """(n, n) columns by shape: in column k what begins at session k, per day and per unit of the channel."""
     after = np.tri(len(days)).astype(float)
     out, long = {"step": after}, after.copy()
@@ -81,11 +81,11 @@ def _shapes(days: Array, covariates: Array, channels: Sequence[str]) -> dict[str
     return out
 
 
-def _kept(columns: Array) -> Array:
+def _varying_columns(columns: Array) -> Array:
     """Without columns that hardly change: they would be taken for the constant."""
     spread = np.ptp(columns, axis=0)
     return columns[:, (spread > 1e-9 * np.abs(columns).max(axis=0)) | (np.arange(columns.shape[1]) == 0)]
 
 
-def _beside(base: Array, columns: Array) -> Array:
+def _without_base(base: Array, columns: Array) -> Array:
     return np.asarray(columns - base @ (base.T @ columns))

@@ -13,7 +13,7 @@ from stitch.stages.coarse import REUSED
 from stitch.stored.run_documents import read_result
 from stitch.watch.mount_twist import middle_in_scanner
 from stitch.watch.run_record import Estimate, RunRecord
-from stitch.watch.session_conditions import conditions
+from stitch.watch.session_conditions import session_conditions
 
 # Tables by which a session is known again; its clouds may be gigabytes.
 _TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
@@ -36,8 +36,8 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
             "session without --hand-eye"
         )
     session = Path(document["session"])
-    found = conditions(session, folder / "result.json")
-    run_hash = _hash([folder / "model.toml", folder / "result.json"])
+    found = session_conditions(session, folder / "result.json")
+    run_hash = _files_hash([folder / "model.toml", folder / "result.json"])
     own = [session / name for name in _TABLES if (session / name).is_file()]
     repeatability = document["repeatability"]
     return RunRecord(
@@ -45,7 +45,7 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
         session=document["session"],
         name=document.get("name") or session.name,
         run_hash=run_hash,
-        session_hash=_hash(own) if own else run_hash,
+        session_hash=_files_hash(own) if own else run_hash,
         time=found.time if at is None else at,
         time_from=found.time_from if at is None else "stated",
         length_unit=model.length_unit,
@@ -69,14 +69,14 @@ def _estimates(model: ModelFile) -> list[Estimate]:
     ]
 
 
-def _hash(files: Sequence[Path]) -> str:
+def _files_hash(files: Sequence[Path]) -> str:
     found = hashlib.sha256()
     for file in files:
         found.update(file.name.encode() + b"\0" + file.read_bytes())
     return found.hexdigest()
 
 
-def middle_seen(record: RunRecord) -> tuple[Array, float]:
+def scanned_middle(record: RunRecord) -> tuple[Array, float]:
     """(3,) middle of what a run saw, scanner frame, and how far its points lie from there, rms."""
     points = _points(record)
     middle = points.mean(axis=0)

@@ -7,32 +7,32 @@ from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.changes import Change
 from stitch.watch.sentences import headline
 
-FORMAT = "stitch-watch/1"
+REPORT_FORMAT = "stitch-watch/1"
 
 
 def report_document(report: CellReport) -> dict[str, Any]:
     """A cell report as plain data; times in ISO 8601, UTC."""
     return {
-        "format": FORMAT,
+        "format": REPORT_FORMAT,
         "cell": report.name,
         "sentence": headline(report),
         "length_unit": report.length_unit,
         "sessions": report.sessions,
-        "first": iso(report.first),
-        "last": iso(report.last),
+        "first": iso_time(report.first),
+        "last": iso_time(report.last),
         "in_use": report.in_use,
-        "recalibrate_before": iso(report.recalibrate_before),
+        "recalibrate_before": iso_time(report.recalibrate_before),
         "sessions_to_a_false_alarm": report.run_length,
-        "parameters": [_parameter(report, p) for p in report.parameters],
+        "parameters": [_parameter_document(report, p) for p in report.parameters],
     }
 
 
-def iso(time: float | None) -> str | None:
+def iso_time(time: float | None) -> str | None:
     """Seconds since 1970 as ISO 8601."""
     return None if time is None else datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
 
 
-def _parameter(report: CellReport, p: ParameterReport) -> dict[str, Any]:
+def _parameter_document(report: CellReport, p: ParameterReport) -> dict[str, Any]:
     return {
         "name": p.name,
         "unit": p.unit,
@@ -45,16 +45,16 @@ def _parameter(report: CellReport, p: ParameterReport) -> dict[str, Any]:
         "process_noise": p.process_noise,
         "follows": [vars(f) for f in p.follows],
         "limit": p.limit,
-        "valid_until": iso(p.valid_until),
-        "alarm": None if p.alarm is None else _change(report, p.alarm),
-        "changes": [_change(report, c) for c in p.changes],
+        "valid_until": iso_time(p.valid_until),
+        "alarm": None if p.alarm is None else _change_document(report, p.alarm),
+        "changes": [_change_document(report, c) for c in p.changes],
     }
 
 
-def _change(report: CellReport, c: Change) -> dict[str, Any]:
+def _change_document(report: CellReport, c: Change) -> dict[str, Any]:
     return {
         "since": report.run_names[c.since],
-        "since_time": iso(report.run_times[c.since]),
+        "since_time": iso_time(report.run_times[c.since]),
         "raised": report.run_names[c.raised],
         "kind": c.kind,
         "p_value": c.p_value,

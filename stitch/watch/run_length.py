@@ -23,7 +23,7 @@ def cusum_run_length(reference: float, limit: float, shift: float = 0.0) -> floa
     upper = ndtr(edge)
     # The first state takes all that would fall below zero.
     chain = np.column_stack([upper[:, 0], np.diff(upper, axis=1)])
-    return _mean_time(chain, 0)
+    return _mean_exit_time(chain, 0)
 
 
 def ewma_run_length(weight: float, limit: float, shift: float = 0.0) -> float:
@@ -32,29 +32,29 @@ def ewma_run_length(weight: float, limit: float, shift: float = 0.0) -> float:
     centre = -limit + width * (np.arange(_STATES) + 0.5)
     edges = np.append(centre - width / 2, limit)
     reached = ndtr((edges[None, :] - (1 - weight) * centre[:, None]) / weight - shift)
-    return _mean_time(np.diff(reached, axis=1), _STATES // 2)
+    return _mean_exit_time(np.diff(reached, axis=1), _STATES // 2)
 
 
 def cusum_limit(reference: float, run_length: float) -> float:
     """Limit of a CUSUM of which both sides together run so long on average."""
-    return _found(lambda limit: cusum_run_length(reference, limit) / 2, run_length, 30.0 / (1 + reference) + 10)
+    return _bisect_limit(lambda limit: cusum_run_length(reference, limit) / 2, run_length, 30.0 / (1 + reference) + 10)
 
 
 def ewma_limit(weight: float, run_length: float) -> float:
     """Limit of a two-sided EWMA that runs so long on average."""
-    return _found(lambda limit: ewma_run_length(weight, limit), run_length, 12 * np.sqrt(weight / (2 - weight)))
+    return _bisect_limit(lambda limit: ewma_run_length(weight, limit), run_length, 12 * np.sqrt(weight / (2 - weight)))
 
 
-def _mean_time(chain: Array, start: int) -> float:
+def _mean_exit_time(chain: Array, start: int) -> float:
     """Mean number of steps until the chain is left."""
     return float(np.linalg.solve(np.eye(len(chain)) - chain, np.ones(len(chain)))[start])
 
 
-def _found(run_length_at: Callable[[float], float], wanted: float, highest: float) -> float:
+def _bisect_limit(run_length_at: Callable[[float], float], target: float, highest: float) -> float:
     """By bisection: run lengths grow with the limit. A chain that is hardly ever left cannot be solved: too high."""
     low, high = 0.0, highest
     for _ in range(_STEPS):
         middle = (low + high) / 2
         length = run_length_at(middle)
-        low, high = (middle, high) if 0 < length < wanted else (low, middle)
+        low, high = (middle, high) if 0 < length < target else (low, middle)
     return high

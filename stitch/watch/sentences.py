@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from stitch.units import length_text, told_in
+from stitch.units import display_unit, length_text
 from stitch.watch.cell_report import CellReport, ParameterReport
 from stitch.watch.changes import Change
 
@@ -21,21 +21,24 @@ def headline(report: CellReport) -> str:
     """The verdict on a cell in one line."""
     told = event_sentences(report)
     if not told:
-        return f"{report.name}: nothing moves in {report.sessions:,} sessions; {_recalibrate(report)}."
-    return f"{report.name}: {'; '.join(told)}; {_recalibrate(report)}."
+        return f"{report.name}: nothing moves in {report.sessions:,} sessions; {_recalibration_note(report)}."
+    return f"{report.name}: {'; '.join(told)}; {_recalibration_note(report)}."
 
 
 def event_sentences(report: CellReport) -> list[str]:
     """One for every event that stands, in the order of their onsets."""
-    left, groups = sorted(report.alarms, key=lambda item: _doubt(item[1])), list[list[_Alarmed]]()
+    left, groups = sorted(report.alarms, key=lambda item: _significance_rank(item[1])), list[list[_Alarmed]]()
     while left:
         # Small steps are dated by the large one beside them.
-        groups.append([item for item in left if _one_event(report, left[0], item)])
+        groups.append([item for item in left if _is_same_event(report, left[0], item)])
         left = [item for item in left if item not in groups[-1]]
-    return [_event(report, group) for group in sorted(groups, key=lambda group: report.run_times[group[0][1].since])]
+    return [
+        _event_sentence(report, group)
+        for group in sorted(groups, key=lambda group: report.run_times[group[0][1].since])
+    ]
 
 
-def notes(report: CellReport) -> list[str]:
+def report_notes(report: CellReport) -> list[str]:
     """What to know before trusting the verdict."""
     wide = [p for p in report.parameters if p.scatter > _WIDE]
     if not wide:
@@ -52,7 +55,7 @@ def size_text(value: float, unit: str, sigma: float | None = None) -> str:
     told = value if sigma is None or not np.isfinite(sigma) else float(f"{value:.{_digits(value, sigma)}g}")
     if unit in ("mm", "m"):
         return length_text(told, unit)
-    factor, name = told_in(unit)
+    factor, name = display_unit(unit)
     return f"{factor * told:.4g} {name}"
 
 
@@ -67,25 +70,25 @@ def _digits(value: float, sigma: float) -> int:
     return int(np.clip(np.floor(np.log10(abs(value))) - np.floor(np.log10(sigma)) + 2, 1, 6))
 
 
-def _doubt(change: Change) -> tuple[float, float]:
+def _significance_rank(change: Change) -> tuple[float, float]:
     """The clearest first; beyond the smallest number that there is, by size in sigmas."""
     return (change.p_value if np.isfinite(change.p_value) else 1.0, -abs(change.size) / max(change.sigma, 1e-300))
 
 
-def _one_event(report: CellReport, clearest: _Alarmed, other: _Alarmed) -> bool:
+def _is_same_event(report: CellReport, clearest: _Alarmed, other: _Alarmed) -> bool:
     (p, a), (q, b) = clearest, other
     near = abs(report.run_times[a.since] - report.run_times[b.since]) <= _TOGETHER
-    return p.name == q.name or (near and a.kind == b.kind == "step" and _effect(p) == _effect(q))
+    return p.name == q.name or (near and a.kind == b.kind == "step" and _effect_name(p) == _effect_name(q))
 
 
-def _effect(parameter: ParameterReport) -> str:
+def _effect_name(parameter: ParameterReport) -> str:
     return parameter.name.partition(".")[0]
 
 
-def _event(report: CellReport, group: Sequence[_Alarmed]) -> str:
+def _event_sentence(report: CellReport, group: Sequence[_Alarmed]) -> str:
     clearest = group[0][1]
     since = f"{report.run_names[clearest.since]} ({day_text(report.run_times[clearest.since])})"
-    effect = _effect(group[0][0])
+    effect = _effect_name(group[0][0])
     if clearest.kind == "step":
         sizes = ", ".join(f"{p.name.partition('.')[2]} {size_text(c.size, p.unit, c.sigma)}" for p, c in group)
         return f"{_PLACES.get(effect, effect)} jumped before session {since}: {sizes}"
@@ -99,7 +102,7 @@ def _event(report: CellReport, group: Sequence[_Alarmed]) -> str:
     return f"{parameter.name} drifts since session {since}, {rate}"
 
 
-def _recalibrate(report: CellReport) -> str:
+def _recalibration_note(report: CellReport) -> str:
     end = report.recalibrate_before
     if end is None:
         return "the calibration in use holds"

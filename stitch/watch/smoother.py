@@ -10,22 +10,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array
-from stitch.watch.follow import Sessions, State, one_more
-from stitch.watch.state_bank import Bank, freed, predicted, transition
+from stitch.watch.follow import CellState, Sessions, next_state
+from stitch.watch.state_bank import Bank, predicted_bank, reset_moved, transition
 
 # Directions of a predicted covariance below this share of its largest are not known to move.
 _SINGULAR = 1e-13
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class SmoothedStates:
     """n sessions, P parameters, in their units."""
 
     values: Array  # (n, P) at the conditions of each session
     own_sigmas: Array  # (n, P) without what all sessions have in common
 
 
-def smoothed(state: State, sessions: Sessions, moved: Mapping[int, Sequence[int]], last: State) -> Smoothed:
+def smoothed_states(
+    state: CellState, sessions: Sessions, moved: Mapping[int, Sequence[int]], last: CellState
+) -> SmoothedStates:
     """The sessions after a state, smoothed.
 
     Args:
@@ -37,15 +39,15 @@ def smoothed(state: State, sessions: Sessions, moved: Mapping[int, Sequence[int]
     # Parameters that came since the state join all members and are thinned with the others.
     filtered, state = list[Bank](), state
     for k, run in enumerate(sessions.ids):
-        state = one_more(state, sessions, k, moved.get(run, ()))
+        state = next_state(state, sessions, k, moved.get(run, ()))
         own = state.bank
         filtered.append(own.chosen(members[: len(own.origin)]))
-    return _backwards(filtered, sessions, moved, last.bank.chosen(members))
+    return _smooth_backwards(filtered, sessions, moved, last.bank.chosen(members))
 
 
-def _backwards(
+def _smooth_backwards(
     filtered: Sequence[Bank], sessions: Sessions, moved: Mapping[int, Sequence[int]], last: Bank
-) -> Smoothed:
+) -> SmoothedStates:
     n, P, d = len(filtered), len(last.origin), last.mean.shape[2]
     means, covariances = np.full((n, P, d), np.nan), np.full((n, P, d, d), np.nan)
     mean, covariance = filtered[-1].mean[:, 0], filtered[-1].covariance[:, 0]
@@ -53,9 +55,9 @@ def _backwards(
     for k in range(n - 2, -1, -1):
         now, known = filtered[k], len(filtered[k].origin)
         days = sessions.days[k + 1] - sessions.days[k]
-        ahead = predicted(now, max(days, 0.0))
+        ahead = predicted_bank(now, max(days, 0.0))
         if happened := moved.get(sessions.ids[k + 1], ()):
-            ahead = freed(ahead, np.isin(np.arange(known), list(happened)))
+            ahead = reset_moved(ahead, np.isin(np.arange(known), list(happened)))
         F = transition(d, max(days, 0.0))
         P_ahead = ahead.covariance[:, 0]
         gain = now.covariance[:, 0] @ F.T @ _inverse(P_ahead)
@@ -64,7 +66,7 @@ def _backwards(
         means[k, :known], covariances[k, :known] = mean, covariance
     x = np.column_stack([np.ones(n), np.zeros(n), sessions.covariates])
     variance = np.einsum("ni,npij,nj->np", x, covariances, x) * last.scatter[:, 0]
-    return Smoothed(
+    return SmoothedStates(
         values=last.origin + last.unit * np.einsum("npi,ni->np", means, x),
         own_sigmas=last.unit * np.sqrt(np.maximum(variance, 0.0)),
     )

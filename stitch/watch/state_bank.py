@@ -21,7 +21,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from stitch.frames import Array, Indices, Mask
-from stitch.watch.student_t import as_normal, log_density
+from stitch.watch.student_t import normal_equivalent, student_log_density
 
 LEVEL, SLOPE, COVARIATES = 0, 1, 2
 # Process noise of the members: of the level per √day, of the slope at the start per day, of the slope per day and
@@ -39,7 +39,7 @@ MEMBERS = (
     (0.3, 1.0, 0.1),
 )
 # Variance of what is not known at all, and above which an innovation only says where that is.
-_UNKNOWN, _STARTS = 1e8, 1e5
+_UNKNOWN, _START_VARIANCES = 1e8, 1e5
 # A session farther off than so many sigmas counts as so many: one wild session must not carry the level away.
 WILD = 4.0
 # Degrees of freedom that the stated sigmas are worth: few, for they may be twice too small; enough that a jump of a
@@ -93,13 +93,13 @@ def with_parameters(
     bank: Bank,
     values: Array,
     sigmas: Array,
-    believed: Array | None = None,
+    prior_sigmas: Array | None = None,
     members: Sequence[tuple[float, float, float]] = MEMBERS,
 ) -> Bank:
     """The bank with further parameters that begin with values and sigmas (K,).
 
     Args:
-        believed: (d − 2,) how far, in sigmas, a parameter may follow a covariate by one unit; inf: anything.
+        prior_sigmas: (d − 2,) how far, in sigmas, a parameter may follow a covariate by one unit; inf: anything.
     """
     K, M, d = len(values), len(members), bank.mean.shape[2]
     level, start, wander = (np.array(column) ** 2 for column in zip(*members, strict=True))
@@ -107,14 +107,14 @@ def with_parameters(
     covariance[..., LEVEL, LEVEL] = _UNKNOWN
     covariance[..., SLOPE, SLOPE] = start
     free = np.arange(COVARIATES, d)
-    covariance[..., free, free] = _UNKNOWN if believed is None else np.minimum(believed**2, _UNKNOWN)
+    covariance[..., free, free] = _UNKNOWN if prior_sigmas is None else np.minimum(prior_sigmas**2, _UNKNOWN)
     noise = np.broadcast_to(np.stack([level, wander], axis=1), (K, M, 2))
     new = {"mean": np.zeros((K, M, d)), "covariance": covariance, "squares": np.zeros((K, M)), "count": np.zeros(K)}
     new |= {"log_likelihood": np.zeros((K, M)), "noise": noise, "origin": values, "unit": sigmas}
     return Bank(**{name: np.concatenate([own, new[name]]) for name, own in bank.arrays().items()})
 
 
-def freed(bank: Bank, moved: Mask) -> Bank:
+def reset_moved(bank: Bank, moved: Mask) -> Bank:
     """The bank after something happened to some parameters (P,): their levels and slopes are open again."""
     covariance = bank.covariance.copy()
     covariance[moved, :, LEVEL, LEVEL] += _UNKNOWN
@@ -122,7 +122,7 @@ def freed(bank: Bank, moved: Mask) -> Bank:
     return replace(bank, covariance=covariance)
 
 
-def predicted(bank: Bank, days: float) -> Bank:
+def predicted_bank(bank: Bank, days: float) -> Bank:
     """The bank some days later, with nothing measured since."""
     F = transition(bank.mean.shape[2], days)
     covariance = F @ bank.covariance @ F.T
@@ -141,7 +141,7 @@ def transition(d: int, days: float) -> Array:
     return F
 
 
-def updated(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tuple[Bank, Array]:
+def updated_bank(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tuple[Bank, Array]:
     """One session more.
 
     Args:
@@ -160,7 +160,7 @@ def updated(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tupl
     carried = bank.covariance @ x  # (P, M, d)
     F = carried @ x + R
     e = y - bank.mean @ x
-    told = (seen[:, None] & (F < _STARTS * R))[:, :1]
+    told = (seen[:, None] & (F < _START_VARIANCES * R))[:, :1]
     freedom, spread = bank.count + _STATED, np.sqrt(F * bank.scatter)
     e_calm = np.clip(e, -WILD * spread, WILD * spread)
     gain = np.where(seen[:, None], 1.0, 0.0)[..., None] * carried / F[..., None]
@@ -171,6 +171,6 @@ def updated(bank: Bank, values: Array, sigmas: Array, covariates: Array) -> tupl
         covariance=(covariance + np.swapaxes(covariance, -1, -2)) / 2,
         squares=bank.squares + np.where(told, e_calm**2 / F, 0.0),
         count=bank.count + told[:, 0],
-        log_likelihood=bank.log_likelihood + np.where(told, log_density(e_calm, spread, freedom[:, None]), 0.0),
+        log_likelihood=bank.log_likelihood + np.where(told, student_log_density(e_calm, spread, freedom[:, None]), 0.0),
     )
-    return after, as_normal(np.where(told, e / spread, np.nan)[:, 0], freedom)
+    return after, normal_equivalent(np.where(told, e / spread, np.nan)[:, 0], freedom)

@@ -10,13 +10,13 @@ from stitch.watch.read_record import read_record
 from stitch.watch.run_record import RunRecord
 
 
-def use(history: History, run_hash: str) -> None:
+def use_calibration(history: History, run_hash: str) -> None:
     """From now on the cell uses the calibration of this run."""
     with history.writing():
         history.state({"in_use": run_hash})
 
 
-def known_run(history: History, run: Path, added: Sequence[RunRecord]) -> str:
+def known_run_hash(history: History, run: Path, added: Sequence[RunRecord]) -> str:
     """The hash of a run that is in the history, or will be.
 
     Raises:

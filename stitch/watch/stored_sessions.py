@@ -9,14 +9,14 @@ import numpy as np
 from stitch.frames import Array
 from stitch.watch.follow import Sessions
 from stitch.watch.history import History
-from stitch.watch.regressors import DAY, LOOK_BACK, believed, regressors
+from stitch.watch.regressors import DAY_SECONDS, LOOK_BACK, regressor_prior_sigmas, regressors
 
 # So many rows are asked for by their numbers; of more the table is read.
 _MANY = 2000
 
 
 @dataclass(frozen=True)
-class Names:
+class SessionColumns:
     """What the columns of `Sessions` are."""
 
     parameters: Sequence[str]
@@ -25,10 +25,10 @@ class Names:
     first: float  # time of the first session, s since 1970
 
 
-def names_of(history: History) -> Names:
+def session_columns(history: History) -> SessionColumns:
     """Parameters in the order in which they came, channels as `chosen_channels` says."""
     parameters = history.sql("SELECT name, unit FROM parameters ORDER BY id")
-    return Names(
+    return SessionColumns(
         parameters=[name for name, _ in parameters],
         units=[unit for _, unit in parameters],
         channels=history.stated("channels") or [],
@@ -38,7 +38,7 @@ def names_of(history: History) -> Names:
 
 def sessions_from(history: History, ids: Sequence[int]) -> Sessions:
     """Sessions by their numbers."""
-    names, wanted = names_of(history), set(ids)
+    names, wanted = session_columns(history), set(ids)
     if len(ids) > _MANY:
         rows = [row for row in history.sql("SELECT id, time FROM runs ORDER BY time, id") if row[0] in wanted]
     else:
@@ -48,37 +48,37 @@ def sessions_from(history: History, ids: Sequence[int]) -> Sessions:
     times = np.array([time for _, time in rows], float)
     values = np.full((len(rows), len(names.parameters)), np.nan)
     sigmas = values.copy()
-    for run, parameter, value, sigma in _of_runs(history, "estimates", list(place)):
+    for run, parameter, value, sigma in _rows_of_runs(history, "estimates", list(place)):
         values[place[run], parameter - 1], sigmas[place[run], parameter - 1] = value, sigma
     return Sessions(
         ids=list(place),
-        days=(times - names.first) / DAY,
+        days=(times - names.first) / DAY_SECONDS,
         values=values,
         sigmas=sigmas,
         covariates=_regressors(history, names, rows),
-        believed=believed(names.channels),
+        prior_sigmas=regressor_prior_sigmas(names.channels),
         channels=names.channels,
     )
 
 
-def _regressors(history: History, names: Names, rows: Sequence[tuple[int, float]]) -> Array:
+def _regressors(history: History, names: SessionColumns, rows: Sequence[tuple[int, float]]) -> Array:
     """(n, c) of some sessions; those before them tell what a temperature lags behind."""
     if not rows:
-        return np.zeros((0, len(believed(names.channels))))
+        return np.zeros((0, len(regressor_prior_sigmas(names.channels))))
     span = (rows[0][1] - LOOK_BACK, rows[-1][1])
     around = history.sql("SELECT id, time FROM runs WHERE time BETWEEN ? AND ? ORDER BY time, id", *span)
     place = {run: k for k, (run, _) in enumerate(around)}
     reference = history.stated("channel_references") or {}
     channels = np.full((len(around), len(names.channels)), np.nan)
     column = {name: c for c, name in enumerate(names.channels)}
-    for run, name, value in _of_runs(history, "covariates", list(place)):
+    for run, name, value in _rows_of_runs(history, "covariates", list(place)):
         if name in column:
             channels[place[run], column[name]] = value - reference[name]
     found = regressors(np.array([time for _, time in around], float), channels, names.channels)
     return found[[place[run] for run, _ in rows]]
 
 
-def _of_runs(history: History, table: str, runs: Sequence[int]) -> list[tuple[Any, ...]]:
+def _rows_of_runs(history: History, table: str, runs: Sequence[int]) -> list[tuple[Any, ...]]:
     """Rows of a table that belong to some runs."""
     if len(runs) > _MANY:
         known = set(runs)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from stitch.frames import Array
-from stitch.watch.state_bank import Bank, predicted
+from stitch.watch.state_bank import Bank, predicted_bank
 
 HORIZON = 180.0  # days that are looked ahead
 _RISK = 0.05
@@ -26,7 +26,7 @@ def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> A
     ahead = np.linspace(0.0, HORIZON, _STEPS + 1)
     risk = np.zeros((len(ahead), len(in_use)))
     for k, days in enumerate(ahead):
-        then = predicted(bank, float(days))
+        then = predicted_bank(bank, float(days))
         off = bank.origin + bank.unit * (then.mean[:, 0] @ x) - in_use
         sigma = bank.unit * np.sqrt(np.maximum(x @ then.covariance[:, 0] @ x, 0.0) * bank.scatter[:, 0])
         sigma = np.maximum(sigma, 1e-12 * limits)

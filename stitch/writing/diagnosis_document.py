@@ -34,11 +34,11 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "time_law": None if d.time_curve is None else _time_curve(d.time_curve),
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
-        "log_odds_over_nothing": d.over_nothing if np.isfinite(d.over_nothing) else None,
+        "log_odds_over_nothing": d.log_odds_over_nothing if np.isfinite(d.log_odds_over_nothing) else None,
         "notes": list(d.notes),
         "doubts": list(d.doubts),
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),
-        "field_map": _field_map(d.smooth),
+        "field_map": _field_map(d.scanner_error),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,
     }
@@ -113,8 +113,8 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
         "rms_if_added": inside,
         "heldout_rms_if_added": heldout,
         # Of the parameter that these views know best against its plausible size; all below.
-        "minimum_detectable": detectable.get(_clearest(candidate) or ""),
-        "minimum_detectable_of": _clearest(candidate),
+        "minimum_detectable": detectable.get(_clearest_parameters(candidate) or ""),
+        "minimum_detectable_of": _clearest_parameters(candidate),
         "minimum_detectable_each": detectable,
         "hand_eye_if_missed": candidate.hand_eye,
         "aliases": [{"effect": a.name, "correlation": a.correlation} for a in candidate.aliases],
@@ -122,7 +122,7 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
     }
 
 
-def _clearest(candidate: CandidateEffect) -> str | None:
+def _clearest_parameters(candidate: CandidateEffect) -> str | None:
     sizes = {p.name: p.typical for p in candidate.ranked.score.candidate.parameters}
     found = candidate.detectable
     return min(found, key=lambda name: found[name] / sizes[name]) if found else None

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from stitch.comparison.model_history import change_of, model_history
+from stitch.comparison.model_history import effect_changes, model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.model.hand_eye_uncertainty import hand_eye_lines
 from stitch.runs.run import Run
@@ -60,4 +60,6 @@ def _history(run: Run) -> list[str]:
     unit = run.session.length_unit
     if len(run.ledger) < 2:
         return []
-    return [f"{change_of(run.ledger, i) + ':':<30}{length_text(s.heldout_rms, unit)}" for i, s in enumerate(run.ledger)]
+    return [
+        f"{effect_changes(run.ledger, i) + ':':<30}{length_text(s.heldout_rms, unit)}" for i, s in enumerate(run.ledger)
+    ]

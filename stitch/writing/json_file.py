@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 
 
 def write_json(document: Any, path: Path) -> None:
     """Write JSON whole or not at all; what is not known is null."""
-    with whole(path) as file:
+    with whole_file(path) as file:
         file.write_text(to_json(document) + "\n", encoding="utf-8")
 
 

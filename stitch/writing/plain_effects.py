@@ -26,11 +26,11 @@ _WORDS = {
 }
 
 
-def what_it_is(name: str) -> str:
+def effect_description(name: str) -> str:
     """An effect in a few words; nothing of one of one's own."""
     return _WORDS.get(name, "")
 
 
-def in_words(name: str) -> str:
+def effect_in_words(name: str) -> str:
     """An effect's name with what it is; of an effect of one's own the name alone."""
-    return f"{name} ({what_it_is(name)})" if what_it_is(name) else name
+    return f"{name} ({effect_description(name)})" if effect_description(name) else name

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import expanded
+from stitch.model.hand_eye_uncertainty import expanded_uncertainty
 from stitch.planning.expected_hand_eye import ExpectedHandEye
 from stitch.planning.outlook import EffectOutlook, Outlook
-from stitch.planning.plan import Plan, Proposed
-from stitch.planning.rivals import Pair
+from stitch.planning.plan import Plan, ProposedView
+from stitch.planning.rivals import EffectPair
 from stitch.writing.session_files import pose_columns
 
 FORMAT = "stitch-plan/1"
@@ -37,13 +37,13 @@ def _outlook(o: Outlook, T_mount: Array) -> dict[str, Any]:
         "hand_eye_of_an_ordinary_arm": _hand_eye(o.ordinary, T_mount),
         "effects": [_effect(e) for e in o.effects],
         "pairs": [_pair(pair) for pair in o.pairs],
-        "not_asked": {name: list(needs) for name, needs in o.not_asked.items()},
+        "not_asked": {name: list(needs) for name, needs in o.untestable.items()},
     }
 
 
 def _hand_eye(found: ExpectedHandEye, T_mount: Array) -> dict[str, Any]:
     """U (k = 2) of rotation vector and position in the mount frame, as `run` prints it, and at the part."""
-    return {"U": expanded(T_mount, found.covariance).tolist(), "U_at_part": found.U}
+    return {"U": expanded_uncertainty(T_mount, found.covariance).tolist(), "U_at_part": found.U}
 
 
 def _effect(e: EffectOutlook) -> dict[str, Any]:
@@ -62,18 +62,18 @@ def _effect(e: EffectOutlook) -> dict[str, Any]:
     }
 
 
-def _pair(pair: Pair) -> dict[str, Any]:
+def _pair(pair: EffectPair) -> dict[str, Any]:
     return {"effects": [pair.a, pair.b], "identifiable": {pair.a: pair.size_a, pair.b: pair.size_b}}
 
 
-def _proposed(view: Proposed) -> dict[str, Any]:
+def _proposed(view: ProposedView) -> dict[str, Any]:
     return {
         "view": view.name,
         "joints_deg": np.round(np.degrees(view.joints), 3).tolist(),
         "pose": view.T_base_flange.tolist(),
         "travel_deg": round(float(np.degrees(view.travel)), 1),
         "U_at_part": view.U,
-        "told_apart": view.apart,
+        "told_apart": view.separated_share,
     }
 
 

@@ -10,7 +10,7 @@ from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.measurement.session import View
 from stitch.model.model_toml import ModelFile
-from stitch.runs.run import LeftOut, Run, StageResult
+from stitch.runs.run import ExcludedView, Run, StageResult
 from stitch.writing.run_contents import FORMAT
 from stitch.writing.target_rows import labelled_facts, target_rows, targets_of
 
@@ -132,7 +132,7 @@ def _disagreement(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _left_out_view(item: LeftOut) -> dict[str, Any]:
+def _left_out_view(item: ExcludedView) -> dict[str, Any]:
     """A view that is not fused: its pose is what the robot and the model say."""
     return {
         "view": item.view,

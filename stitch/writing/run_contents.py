@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stitch.errors import InputError
-from stitch.reading.json_object import json_object
+from stitch.reading.json_object import read_json_object
 from stitch.system.whole_folder import Ours
 
 # Of result.json.
@@ -44,9 +44,9 @@ _PICTURES = {
 }
 
 
-def ours(path: Path) -> Ours:
+def is_run_file(path: Path) -> Ours:
     """Whether a path inside the run folder `path` was written by stitch."""
-    inner = set(_inner(path))
+    inner = set(_runs_of_rig(path))
 
     def is_ours(inside: Path) -> bool:
         if inside.parts[0] in inner:
@@ -65,7 +65,10 @@ def sessions_in(path: Path) -> list[str] | None:
     """Paths of the sessions of a run folder as it states them; None for a folder that is no run."""
     if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
         return None
-    told = [_session(file) for file in (path / "result.json", *(path / name / "result.json" for name in _inner(path)))]
+    told = [
+        _session_path(file)
+        for file in (path / "result.json", *(path / name / "result.json" for name in _runs_of_rig(path)))
+    ]
     found = [session for session in told if session is not None]
     return found or None
 
@@ -100,17 +103,17 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
 def others_of_rig(run: Path) -> list[str]:
     """Names of the runs that one rig's folder holds beside a run."""
     own = run.resolve()
-    return [name for name in _inner(own.parent) if name != own.name]
+    return [name for name in _runs_of_rig(own.parent) if name != own.name]
 
 
-def _inner(path: Path) -> list[str]:
+def _runs_of_rig(path: Path) -> list[str]:
     """Names of the runs in the folder of a rig, which has no result of its own."""
     if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():
         return []
-    return sorted(file.parent.name for file in path.glob("*/result.json") if _session(file) is not None)
+    return sorted(file.parent.name for file in path.glob("*/result.json") if _session_path(file) is not None)
 
 
-def _session(file: Path) -> str | None:
-    document = json_object(file)
+def _session_path(file: Path) -> str | None:
+    document = read_json_object(file)
     session = document.get("session") if document.get("format") == FORMAT else None
     return session if isinstance(session, str) and "\0" not in session else None

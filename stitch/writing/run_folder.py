@@ -11,10 +11,10 @@ from typing import Any
 from stitch.errors import InputError
 from stitch.model.model_toml import write_model
 from stitch.runs.run import Run
-from stitch.system.whole_folder import claimed, rewritten
+from stitch.system.whole_folder import claim_folder, rewrite_folder
 from stitch.writing.json_file import write_json
 from stitch.writing.result_document import ledger, model_of, result_document
-from stitch.writing.run_contents import ours, require_free
+from stitch.writing.run_contents import is_run_file, require_free
 from stitch.writing.tables import write_cloud, write_residuals
 
 
@@ -32,19 +32,19 @@ def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Ite
         InputError: `path` is no place for this run, or another process writes there.
     """
     require_free(path, sessions, force)
-    with rewritten(path, ours(path)) as scratch:
+    with rewrite_folder(path, is_run_file(path)) as scratch:
         yield scratch
 
 
 @contextmanager
-def changed(path: Path) -> Iterator[Path]:
+def replace_run_files(path: Path) -> Iterator[Path]:
     """A scratch folder whose files take the place of all that was made of the old model if the block succeeds."""
-    with rewritten(path, ours(path)) as scratch:
+    with rewrite_folder(path, is_run_file(path)) as scratch:
         yield scratch
 
 
 @contextmanager
-def held(path: Path) -> Iterator[None]:
+def lock_run_folder(path: Path) -> Iterator[None]:
     """Hold a run folder as its only writer, from reading it to writing into it.
 
     Raises:
@@ -53,19 +53,19 @@ def held(path: Path) -> Iterator[None]:
     if not path.parent.is_dir():
         yield
         return
-    with claimed(path):
+    with claim_folder(path):
         if (path / "pictures").is_symlink():
             raise InputError(f"{path}/pictures: is a link, and pictures would be written where it points; remove it")
         yield
 
 
-def extend(group: str, *arguments: Any) -> None:
+def call_entry_points(group: str, *arguments: Any) -> None:
     """Call what other packages offer under an entry-point group."""
     for entry in entry_points(group=group):
         entry.load()(*arguments)
 
 
-def load_early(group: str) -> None:
+def preload_entry_points(group: str) -> None:
     """Load beside the fit what `extend` calls after it: it leaves a core idle, and drawing takes a second to load."""
 
     def load() -> None:
@@ -92,7 +92,7 @@ def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> N
     _write_documents(run, folder)
     with ThreadPoolExecutor(1) as beside:
         written = beside.submit(_write_points, run, folder)
-        extend("stitch.reports", run, folder / "report.html", tolerance)
+        call_entry_points("stitch.reports", run, folder / "report.html", tolerance)
         written.result()
 
 

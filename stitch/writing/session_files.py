@@ -20,9 +20,9 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.cloud import Cloud
-from stitch.reading.session_toml import FORMAT
+from stitch.reading.session_toml import SESSION_FORMAT
 
-Columns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
+TableColumns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class SessionFiles:
     name: str
     length_unit: str
     mount: str
-    views: Columns  # columns of views.csv, the first called `view`
+    views: TableColumns  # columns of views.csv, the first called `view`
     tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of session.toml, e.g. {"scanner": {…}}
     clouds: Mapping[str, Cloud] = field(default_factory=dict)  # by file, relative to the folder; scanner frame
-    points: Columns | None = None  # view, target, x, y, z and sigma where it is known
-    frames: Columns | None = None  # view, x, y, z, qx, qy, qz, qw of a probe in the sensor's frame
+    points: TableColumns | None = None  # view, target, x, y, z and sigma where it is known
+    frames: TableColumns | None = None  # view, x, y, z, qx, qy, qz, qw of a probe in the sensor's frame
     targets: Mapping[str, Array] = field(default_factory=dict)  # nominal places (3,), part frame
     copies: Sequence[Path] = ()  # files that lie beside session.toml, such as the part's CAD
     texts: Mapping[str, str] = field(default_factory=dict)  # by file: others that lie there, such as a URDF
@@ -96,7 +96,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 def _write(folder: Path, session: SessionFiles) -> None:
     folder.mkdir(exist_ok=True)
-    head = {"format": FORMAT, "name": session.name}
+    head = {"format": SESSION_FORMAT, "name": session.name}
     head |= {"length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
     for name, text in session.texts.items():
@@ -128,12 +128,12 @@ def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
 
 
-def write_table(file: Path, columns: Columns) -> None:
+def write_table(file: Path, columns: TableColumns) -> None:
     """Write one table of a session."""
     file.write_text(table_text(columns), encoding="utf-8", newline="")
 
 
-def table_text(columns: Columns) -> str:
+def table_text(columns: TableColumns) -> str:
     """A table as CSV."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

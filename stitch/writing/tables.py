@@ -14,7 +14,7 @@ from stitch.frames import Array
 from stitch.measurement.session import Session, View
 from stitch.observations.surfaces.match import Match
 from stitch.runs.run import FusedCloud, Run
-from stitch.system.mapped_file import release
+from stitch.system.mapped_file import release_mapped
 from stitch.writing.target_rows import residual_columns
 
 _Value = TypeVar("_Value")
@@ -22,7 +22,7 @@ _Value = TypeVar("_Value")
 # Rows that are in memory at a time.
 _ROWS = 1_000_000
 _PLACE = ("x", "y", "z", "nx", "ny", "nz")
-_OWN = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
+_RESERVED_COLUMNS = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
@@ -41,7 +41,7 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
             vertex["count"] = cloud.count[part]
             vertex.tofile(out)
             for values in vars(cloud).values():
-                release(values)
+                release_mapped(values)
 
 
 def write_residuals(run: Run, path: Path) -> None:
@@ -55,7 +55,7 @@ def residual_table(run: Run) -> Any:
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
     What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
     """
-    session = _renamed(run.session)
+    session = _without_reserved_covariates(run.session)
     of_views = {key for view in session.views for key in view.covariates}
     of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}
     parts = [] if run.overlaps is None else [_columns(session, m, of_views, of_points) for m in run.overlaps.matches]
@@ -70,11 +70,11 @@ def residual_table(run: Run) -> Any:
     return pa.table(arrays)
 
 
-def _renamed(session: Session) -> Session:
+def _without_reserved_covariates(session: Session) -> Session:
     """The session without covariates that would take the place of a column."""
 
     def free(values: dict[str, _Value]) -> dict[str, _Value]:
-        return {f"covariate_{key}" if key in _OWN else key: value for key, value in values.items()}
+        return {f"covariate_{key}" if key in _RESERVED_COLUMNS else key: value for key, value in values.items()}
 
     def renamed(view: View) -> View:
         cloud = None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars))

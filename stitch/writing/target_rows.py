@@ -9,12 +9,12 @@ from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
 from stitch.model.model import Target
-from stitch.observations.targets.outliers import Outlier, outside
-from stitch.observations.targets.target_fit import TargetFit
+from stitch.observations.targets.outliers import Outlier, mask_outliers
+from stitch.observations.targets.target_fit import TargetModelFit
 from stitch.runs.run import Run
 
 
-def targets_of(found: TargetFit | None) -> dict[str, Target]:
+def targets_of(found: TargetModelFit | None) -> dict[str, Target]:
     """The targets that were seen, for model.toml."""
     if found is None:
         return {}
@@ -27,13 +27,13 @@ def targets_of(found: TargetFit | None) -> dict[str, Target]:
     }
 
 
-def target_rows(found: TargetFit | None) -> list[dict[str, Any]]:
+def target_rows(found: TargetModelFit | None) -> list[dict[str, Any]]:
     """The list `targets` of result.json, reference frame."""
     targets = targets_of(found)
     if found is None:
         return []
     sightings = found.rows.sightings
-    seen = dict(zip(sightings.targets, sightings.seen, strict=True))
+    seen = dict(zip(sightings.targets, sightings.view_counts, strict=True))
     return [
         {"target": name, "position": t.position.tolist(), "sigma": t.sigma.tolist(), "seen": int(seen[name])}
         | ({} if t.orientation is None else {"orientation": t.orientation.tolist()})
@@ -67,7 +67,7 @@ def _sizes(distances: Array) -> dict[str, float]:
     return {"mean": float(d.mean()), "median": float(np.median(d)), "max": float(d.max())}
 
 
-def residual_columns(found: TargetFit, session: Session) -> dict[str, Array]:
+def residual_columns(found: TargetModelFit, session: Session) -> dict[str, Array]:
     """Columns of residuals.parquet, a row per target and view: `partner` is the target, `residual` the 3D distance."""
     rows, s = found.rows, found.rows.sightings
     v, slot = np.nonzero(s.used)
@@ -84,14 +84,14 @@ def residual_columns(found: TargetFit, session: Session) -> dict[str, Array]:
     return out | {"time_s": np.array([view.time_s for view in session.views], float)[v]}
 
 
-def as_counted(measurement: Measurement, session: Session, document: dict[str, Any]) -> Measurement:
+def restore_counted_targets(measurement: Measurement, session: Session, document: dict[str, Any]) -> Measurement:
     """The measurement as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
     s, outliers = measurement.capture.sightings, document.get("outliers", ())
     if s is None:
         return measurement
     number = {view.name: v for v, view in enumerate(session.views)}
     gone = [Outlier(number[o["view"]], o["target"], np.nan, np.nan) for o in outliers if o["view"] in number]
-    used = outside(s.used, gone, s.targets, s.target)
+    used = mask_outliers(s.used, gone, s.targets, s.target)
     factor = document.get("cloud_noise_factor", measurement.capture.noise_factor)
     own = replace(measurement.capture, sightings=replace(s, used=used), noise_factor=factor)
     return replace(measurement, capture=own)

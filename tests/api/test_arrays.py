@@ -185,8 +185,8 @@ def test_labelled_points_of_a_view():
 
 def test_a_thinned_cloud_gives_all_of_its_points():
     from stitch.measurement.session import Scanner
-    from stitch.measurement.thinning import thinned_cloud
+    from stitch.measurement.thinning import thin_cloud
 
     dense = RNG.normal(size=(500, 3)) + np.array([0, 0, 500.0])
-    thin = thinned_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))
+    thin = thin_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))
     assert len(thin.points) == 100 and np.array_equal(cloud_of(thin, "v").points, dense)

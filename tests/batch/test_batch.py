@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stitch.batch import cluster, one_session
-from stitch.batch.job import Job
+from stitch.batch.job import BatchJob
 from stitch.batch.one_session import run_session
-from stitch.batch.results import results
+from stitch.batch.results import run_jobs
 from stitch.batch.session_row import SessionRow
 from viz.batch_page import write_page
 from viz.unbroken import unbroken
@@ -37,13 +37,15 @@ def test_it_goes_on_after_whatever_befalls_one_session(sessions, result, monkeyp
 def test_the_workers_of_a_scheduler(sessions, tmp_path):
     """Two threads of this process as workers; a session that cannot be read does not stop the others."""
     distributed = pytest.importorskip("distributed")
-    jobs = [Job(path, tmp_path / "runs" / path.name, "a", recording=False) for path in (*sessions, tmp_path / "gone")]
+    jobs = [
+        BatchJob(path, tmp_path / "runs" / path.name, "a", recording=False) for path in (*sessions, tmp_path / "gone")
+    ]
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address="127.0.0.1:0"
     ) as two:
-        rows = {row.name: row for row in results(jobs, scheduler=two.scheduler_address)}
+        rows = {row.name: row for row in run_jobs(jobs, scheduler=two.scheduler_address)}
     assert "gone/session.toml: not found" in rows["gone"].error and rows["gone"].bad_input
-    alone = run_session(Job(sessions[0], tmp_path / "alone", "b", recording=False))
+    alone = run_session(BatchJob(sessions[0], tmp_path / "alone", "b", recording=False))
     numbers = ("residual_um", "registered_um", "noise_floor_um", "worst_view_um", "coarse_um")
     assert [getattr(rows["monday"], key) for key in numbers] == [getattr(alone, key) for key in numbers]
     assert np.isfinite(alone.residual_um)
@@ -83,7 +85,7 @@ def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys,
     monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", stopped)
     batch(*sessions, code=1)
     assert "stitch: stopped with 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
-    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", results)
+    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", run_jobs)
     batch(*sessions)
     assert ran == ["monday", "tuesday"]
 

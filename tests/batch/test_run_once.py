@@ -10,7 +10,7 @@ import pytest
 
 from data_synth.fixtures.edits import edit
 from stitch.batch import finished, one_session
-from stitch.batch.job import Job
+from stitch.batch.job import BatchJob
 from stitch.batch.one_session import run_session
 from stitch.cli.main import main
 from stitch.writing.run_folder import write_with_page
@@ -63,19 +63,19 @@ def test_all_that_a_run_reads_counts_as_content(sessions):
     seen = []
     for text in ("solid", "solid again"):
         part.write_text(text)
-        seen.append(finished.content_of(sessions[0]))
+        seen.append(finished.session_content_hash(sessions[0]))
     assert None not in seen and seen[0] != seen[1]
-    assert finished.content_of(sessions[0] / "nowhere") is None
+    assert finished.session_content_hash(sessions[0] / "nowhere") is None
 
 
 def test_one_that_was_given_up_and_still_writes_is_waited_for(sessions, ran, tmp_path):
     """As after a worker that the scheduler has lost but that lives: the second finds what the first wrote."""
-    job = Job(sessions[0], tmp_path / "runs" / "monday", "a", recording=False)
-    content = finished.content_of(job.session)
+    job = BatchJob(sessions[0], tmp_path / "runs" / "monday", "a", recording=False)
+    content = finished.session_content_hash(job.session)
     result = one_session.run(one_session.load_session(job.session), None)
     with one_session.run_folder.new_folder(job.run, [job.session]) as scratch:
         write_with_page(result, scratch)
-        finished.mark(job, content, scratch)
+        finished.write_mark(job, content, scratch)
     kept = job.run.rename(tmp_path / "kept")
     held = os.open(job.run.parent / ".monday.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(held, fcntl.LOCK_EX)
@@ -95,7 +95,7 @@ def test_one_that_was_given_up_and_still_writes_is_waited_for(sessions, ran, tmp
 def test_all_again_runs_each_session_once(sessions, ran, tmp_path):
     """With --force too a session that comes to a second worker of the same batch is not run twice."""
     rows = [
-        run_session(Job(sessions[0], tmp_path / "runs" / "monday", name, force=True, recording=False))
+        run_session(BatchJob(sessions[0], tmp_path / "runs" / "monday", name, force=True, recording=False))
         for name in ("first", "second", "second")
     ]
     assert not any(row.skipped or row.error for row in rows)

@@ -12,14 +12,14 @@ from data_synth.fixtures.labelled_arm import (
     labelled_cell,
 )
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.calibrate.robot_calibration import calibrated
+from stitch.calibrate.robot_calibration import calibrated_robot_of_run
 from stitch.calibrate.robot_table import dh_rows
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import forward
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.term import term_of
 from stitch.pipeline import run
 from stitch.reading.dh_rows import robot_from_dh
@@ -50,14 +50,14 @@ def test_rows_and_urdf_place_the_flange_as_the_chain_does(convention, tmp_path):
     views = tuple(replace(v, T_base_flange=forward(nominal, v.joints)) for v in session.views)
     # What was seen does not matter here, and would contradict the other robot.
     found, session = run(session), replace(session, robot=nominal, views=views)
-    found = replace(found, session=session, measurement=measurement_of(session, capture(session)))
+    found = replace(found, session=session, measurement=measurement_of(session, prepare_capture(session)))
     zero = [term_of(found.measurement, EFFECTS[name]) for name in ("joint_offset", "link_geometry")]
     model = found.model.with_terms([term.at(1e-3 * rng.normal(size=len(term.parameters))) for term in zero])
-    arm = calibrated(replace(found, model=model)).robot
+    arm = calibrated_robot_of_run(replace(found, model=model)).robot
     (tmp_path / "a.urdf").write_text(to_urdf(arm))
     urdf = robot_from_urdf(tmp_path / "a.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
     rows = robot_from_dh("arm", convention, dh_rows(arm), None, np.array([0, 0, -9.81]), "mm")
-    own = corrected(found.measurement, model)
+    own = corrected_capture(found.measurement, model)
     T_base_flange = np.linalg.inv(own.T_reference_mount)
     for robot in (urdf, rows):
         np.testing.assert_allclose(

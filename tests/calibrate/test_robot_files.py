@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.calibrate.link_table import LinkTable
-from stitch.calibrate.robot_calibration import calibrated
-from stitch.calibrate.robot_files import document_of, write_robot
+from stitch.calibrate.robot_calibration import calibrated_robot_of_run
+from stitch.calibrate.robot_files import robot_document, write_robot
 from stitch.cli.terminal.calibration_summary import show_robot
 from stitch.measurement.robot import forward
 from stitch.measurement.session import StatedRepeatability
@@ -41,11 +41,11 @@ def cell(folder, reported):
 def written(session, folder, effects=("joint_offset",)):
     """robot.toml of a table that is said to be proved, and what the terminal shows of it."""
     found = run(session, effects=["joint_offset"])
-    robot = calibrated(found).robot if effects else session.robot
+    robot = calibrated_robot_of_run(found).robot if effects else session.robot
     table = LinkTable(robot, effects, 0.1, 0.2)
     folder.mkdir()
     write_robot(table, found, folder)
-    show_robot(found, document_of(found, table, [], ""), [], folder)
+    show_robot(found, robot_document(found, table, [], ""), [], folder)
     return found, (folder / "robot.toml").read_text()
 
 
@@ -64,7 +64,7 @@ def test_a_session_that_follows_the_advice_has_the_new_arm(tmp_path, capsys, rep
     if reported:
         views.write_text("\n".join(",".join(row.split(",")[:7]) for row in views.read_text().split()) + "\n")
     again = load_session(tmp_path / "s")
-    arm = calibrated(found).robot
+    arm = calibrated_robot_of_run(found).robot
     np.testing.assert_allclose([v.T_base_flange for v in again.views], forward(arm, session.joints), atol=1e-6)
 
 
@@ -88,4 +88,4 @@ def test_what_was_found_and_not_proved_is_named(tmp_path, capsys):
     assert f"# {said}\n" in text and said in capsys.readouterr().err
     assert "No other error" not in text and "Take x" not in text
     assert "No other error of the arm was found." in written(session, tmp_path / "proved")[1]
-    assert document_of(found, LinkTable(session.robot, ()), [], "")["unproved"] == ["joint_offset"]
+    assert robot_document(found, LinkTable(session.robot, ()), [], "")["unproved"] == ["joint_offset"]

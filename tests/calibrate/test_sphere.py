@@ -10,8 +10,8 @@ from data_synth.fixtures.sphere_scans import RADIUS, SphereCell, area_scan, sphe
 from stitch import frames
 from stitch.calibrate.sphere_calibration import calibrate_sphere
 from stitch.calibrate.sphere_fit import fit_sphere
-from stitch.calibrate.sphere_report import document_of
-from stitch.calibrate.sphere_start import decoupled, global_start
+from stitch.calibrate.sphere_report import sphere_document
+from stitch.calibrate.sphere_start import global_start, solve_decoupled
 from stitch.calibrate.sphere_views import arc_normal, centres, sphere_view
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
@@ -30,7 +30,7 @@ def test_real_laser_lines(shared_data):
     """Against two independent solutions of the same data, (−149.94, 714.56, 482.43) and (−149.86, 714.42, 483.40)."""
     session = load_session(shared_data / "fanuc-line-sphere")
     result = calibrate_sphere(session)
-    document = document_of(result, session)
+    document = sphere_document(result, session)
     t, sigma = result.fit.T_mount[:3, 3], np.array(document["translation_sigma_mount"])
     assert np.all(np.abs(t - [-149.9, 714.5, 482.9]) < 2 * sigma) and np.all(sigma < 1.0)
     assert result.fit.rms <= 0.092
@@ -89,7 +89,7 @@ def test_orientations_equal_to_a_fiftieth_of_a_degree_at_two_metres():
         seen = frames.transform(frames.inverse(G @ cell.T_mount), cell.centre[None])[:, 0]
         cell = SphereCell(cell.T_mount, cell.centre, G, [area_scan(q, rng, 0.002) for q in seen])
         q = centres(views_of(cell), np.zeros(len(G)))
-        T = decoupled(G, q)
+        T = solve_decoupled(G, q)
         fit = fit_sphere(G, views_of(cell), T, RADIUS)
         loose.append(np.linalg.norm(T[:3, 3] - cell.T_mount[:3, 3]))
         right.append(np.linalg.norm(fit.T_mount[:3, 3] - cell.T_mount[:3, 3]))
@@ -100,8 +100,8 @@ def test_orientations_equal_to_a_fiftieth_of_a_degree_at_two_metres():
 def test_decoupled_is_exact_where_orientations_are_equal_and_absent_where_none_are():
     cell = sphere_cell(1, "area", pose_noise=0.0, noise=0.0, pause=3)
     q = frames.transform(frames.inverse(cell.G @ cell.T_mount), cell.centre[None])[:, 0]
-    assert np.abs(twist(cell, decoupled(cell.G, q)) * [100, 100, 100, 1, 1, 1]).max() < 1e-6
-    assert decoupled(cell.G[3:], q[3:]) is None
+    assert np.abs(twist(cell, solve_decoupled(cell.G, q)) * [100, 100, 100, 1, 1, 1]).max() < 1e-6
+    assert solve_decoupled(cell.G[3:], q[3:]) is None
 
 
 @pytest.mark.parametrize("mount", [pytest.param("eye_in_hand", marks=pytest.mark.slow), "eye_to_hand"])
@@ -139,7 +139,7 @@ def test_a_wrong_pose_is_named_and_hardly_counts(kind, tmp_path):
         cell = sphere_cell(seed, kind, turns=0.6)
         cell.G[5, :3, 3] += [3.0, -4.0, 2.0]
         result = calibrate_sphere(session := load_session(write_spheres(cell, tmp_path / f"s{seed}")))
-        notes = [note for note in document_of(result, session)["notes"] if note.startswith("View")]
+        notes = [note for note in sphere_document(result, session)["notes"] if note.startswith("View")]
         assert [note.split()[1] for note in notes] == ["v5"] and "contradicts" in notes[0]
         assert np.abs(twist(cell, result.fit.T_mount) / np.sqrt(np.diag(result.fit.covariance))[:6]).max() < 4
         assert np.linalg.norm(twist(cell, result.fit.T_mount)[3:]) < 2.0
@@ -149,7 +149,7 @@ def test_sides_given_by_the_session_lead_to_the_decoupled_start(tmp_path):
     cell = sphere_cell(8, "line", pause=4, turns=0.6)
     normal = np.array([arc_normal(cloud, np.array([0.0, 1, 0])) @ [0, 1, 0] for cloud in cell.clouds])
     result = calibrate_sphere(
-        load_session(write_spheres(cell, tmp_path / "s", extra=("sphere_side", normal.astype(int))))
+        load_session(write_spheres(cell, tmp_path / "s", effect_twists=("sphere_side", normal.astype(int))))
     )
     assert result.start.startswith("decoupled") and not result.sides_found
     assert np.linalg.norm(twist(cell, result.fit.T_mount)[:3]) < 0.02
@@ -160,7 +160,7 @@ def test_a_free_radius_reveals_a_wrong_one(tmp_path):
     session = load_session(write_spheres(cell, tmp_path / "s", radius=RADIUS + 0.15))
     result = calibrate_sphere(session, radius_free=True)
     assert result.fit.radius == pytest.approx(RADIUS, abs=0.01)
-    assert any("is not what the session says" in note for note in document_of(result, session)["notes"])
+    assert any("is not what the session says" in note for note in sphere_document(result, session)["notes"])
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,9 @@ def test_refusals_name_the_reason(tmp_path):
     with pytest.raises(InputError, match="larger than the sphere's"):
         calibrate_sphere(load_session(write_spheres(cell, tmp_path / "small", radius=20.0)))
     with pytest.raises(InputError, match="sphere_side is 2"):
-        calibrate_sphere(load_session(write_spheres(cell, tmp_path / "side", extra=("sphere_side", [2] * len(cell.G)))))
+        calibrate_sphere(
+            load_session(write_spheres(cell, tmp_path / "side", effect_twists=("sphere_side", [2] * len(cell.G))))
+        )
     still = sphere_cell(2, "area", turns=0.0)
     with pytest.raises(NoResultError, match="one orientation"):
         calibrate_sphere(load_session(write_spheres(still, tmp_path / "still")))

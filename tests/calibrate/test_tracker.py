@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.calibrate.tracker_calibration import calibrate_tracker, document_of
+from stitch.calibrate.tracker_calibration import calibrate_tracker, tracker_document
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.reading.session_folder import load_session
@@ -45,7 +45,7 @@ def session(folder, mount, seed=0, count=40, noise=1.0, turn=None):
 def test_real_tracker(shared_data):
     """1,495 poses of a UR10: base and tool alone leave 1.03 mm in the position of views left out."""
     loaded = load_session(shared_data / "ur10-tmac")
-    document = document_of(calibrate_tracker(loaded), loaded)
+    document = tracker_document(calibrate_tracker(loaded), loaded)
     assert document["heldout_position_error"]["mean"] == pytest.approx(1.03, abs=0.005)
     assert document["views"] == 1495
     assert any("times the sensor's noise" in note for note in document["notes"])
@@ -59,7 +59,7 @@ def test_error_is_that_of_the_covariance(mount, tmp_path):
     for seed in range(20):
         truth = session(tmp_path / f"s{seed}", mount, seed)
         loaded = load_session(tmp_path / f"s{seed}")
-        document = document_of(calibrate_tracker(loaded), loaded)
+        document = tracker_document(calibrate_tracker(loaded), loaded)
         xi = frames.log(frames.inverse(np.array(document["hand_eye"])) @ truth)
         squares.append(xi @ np.linalg.solve(np.array(document["hand_eye_covariance"]), xi))
     assert 3.5 < np.mean(squares) < 8.5

@@ -13,17 +13,17 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
 from stitch import frames
-from stitch.cells.window.allowance import Wanted, allowance_sentence, read_allowance
+from stitch.cells.window.allowance import AllowancePrior, allowance_sentence, read_allowance
 from stitch.cells.window.biweight import TUKEY, biweight
-from stitch.cells.window.cad import nearest, surface
-from stitch.cells.window.cad_fit import fit
+from stitch.cells.window.cad import cad_surface, nearest_partners
+from stitch.cells.window.cad_fit import fit_cad
 from stitch.cells.window.cell_weights import cell_weights
-from stitch.cells.window.joined_scans import Joined, join
+from stitch.cells.window.joined_scans import JoinedScans, join_scans
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 
-FREE, VARYING = Wanted(free=True), Wanted(free=True, varying=True)
+FREE, VARYING = AllowancePrior(free=True), AllowancePrior(free=True, varying=True)
 STOCK = 0.3
 
 
@@ -34,7 +34,7 @@ def blade():
 
 @pytest.fixture(scope="module")
 def blade_cad(blade):
-    return surface(blade)
+    return cad_surface(blade)
 
 
 def even(points):
@@ -55,7 +55,7 @@ def scanned(mesh, stock, seed, views=6, rays=60, noise=0.02):
     clouds = [scan(with_stock(mesh, stock), pose, tool, window_scans.NO_FIELD, rng).points for pose in poses]
     off = frames.exp(rng.normal(size=6) * np.repeat([4e-3, 0.6], 3))
     centre = frames.make(np.eye(3), mesh.bounds.mean(axis=0))
-    return join([prepare_view("", c) for c in clouds], T @ poses), T, T @ centre @ off @ np.linalg.inv(centre)
+    return join_scans([prepare_scan("", c) for c in clouds], T @ poses), T, T @ centre @ off @ np.linalg.inv(centre)
 
 
 def error(found, T, cad):
@@ -71,7 +71,7 @@ def casting(blade):
 
 def test_an_even_allowance_is_found_and_the_pose_stays(casting, blade_cad):
     joined, T, start = casting
-    found = fit(joined, blade_cad, start, wanted=FREE)
+    found = fit_cad(joined, blade_cad, start, prior=FREE)
     assert abs(found.allowance.value - STOCK) < 0.005
     assert abs(found.allowance.value - STOCK) < 4 * found.allowance.sigma < 0.005
     off = error(found, T, blade_cad)
@@ -81,17 +81,17 @@ def test_an_even_allowance_is_found_and_the_pose_stays(casting, blade_cad):
 
 def test_too_little_stock_is_minus(blade, blade_cad):
     joined, _, start = scanned(blade, lambda p: -0.2 * np.ones(len(p)), 1)
-    assert fit(joined, blade_cad, start, wanted=FREE).allowance.value == pytest.approx(-0.2, abs=0.005)
+    assert fit_cad(joined, blade_cad, start, prior=FREE).allowance.value == pytest.approx(-0.2, abs=0.005)
 
 
 def test_the_fit_makes_the_variance_smallest(casting, blade_cad):
     """Variance-minimisation matching (λ = 0): from where the fit stands, its step −D⁻¹b is none."""
     joined, _, start = casting
-    found = fit(joined, blade_cad, start, wanted=FREE)
+    found = fit_cad(joined, blade_cad, start, prior=FREE)
     T = frames.inverse(found.T_base_part)
     usable = joined.take(joined.usable)
     local = frames.transform(T, usable.points)
-    seen = nearest(blade_cad, local, frames.rotate(T, usable.normals))
+    seen = nearest_partners(blade_cad, local, frames.rotate(T, usable.normals))
     d = seen.distance
     rest = d - found.allowance.value
     w = seen.accept * biweight(rest / (TUKEY * found.scale))
@@ -111,13 +111,13 @@ def test_flash_on_one_side_does_not_pull_the_allowance(casting, blade_cad):
     rng = np.random.default_rng(3)
     out = np.where(rng.random(len(joined.points)) < 0.125, rng.uniform(0.02, 0.2, len(joined.points)), 0.0)
     joined = replace(joined, points=joined.points + out[:, None] * joined.normals)
-    found = fit(joined, blade_cad, start, wanted=FREE)
+    found = fit_cad(joined, blade_cad, start, prior=FREE)
     assert abs(found.allowance.value - STOCK) < 0.005
 
 
 def test_a_varying_allowance_is_found_at_its_places(blade, blade_cad):
     joined, T, start = scanned(blade, slow, 2)
-    found = fit(joined, blade_cad, start, wanted=VARYING)
+    found = fit_cad(joined, blade_cad, start, prior=VARYING)
     places = frames.transform(np.linalg.inv(T), joined.points[joined.usable])
     off = found.allowance.at(places) - slow(places)
     assert np.sqrt(np.mean(off**2)) < 0.005
@@ -129,7 +129,7 @@ def test_a_varying_allowance_is_found_at_its_places(blade, blade_cad):
 
 def test_where_nothing_varies_the_field_shrinks_to_nothing(casting, blade_cad):
     joined, T, start = casting
-    field, flat = (fit(joined, blade_cad, start, wanted=w).allowance for w in (VARYING, FREE))
+    field, flat = (fit_cad(joined, blade_cad, start, prior=w).allowance for w in (VARYING, FREE))
     assert field.value == pytest.approx(flat.value, abs=0.5 * flat.sigma)
     assert field.highest - field.lowest < 0.005
 
@@ -139,7 +139,7 @@ HALF = np.array([100.0, 75.0, 50.0])
 
 @pytest.fixture(scope="module")
 def box_cad():
-    return surface(trimesh.creation.box(2 * HALF))
+    return cad_surface(trimesh.creation.box(2 * HALF))
 
 
 def box_sides(*sides):
@@ -150,35 +150,35 @@ def box_sides(*sides):
         own[:, axis] = sign * (HALF[axis] + STOCK) + 0.01 * rng.standard_normal(600)
         normal[:, axis] = sign
     ones = np.ones(600 * len(sides))
-    return Joined(points.reshape(-1, 3), normals.reshape(-1, 3), ones > 0, ones, 3.0, 0.01)
+    return JoinedScans(points.reshape(-1, 3), normals.reshape(-1, 3), ones > 0, ones, 3.0, 0.01)
 
 
 def test_what_a_shift_imitates_is_no_allowance(box_cad):
     """Three sides of one corner fix the pose but not the stock: a shift along the diagonal does the same."""
     joined = box_sides((0, 1), (1, 1), (2, 1))
     with pytest.raises(NoResultError, match=r"cannot be told from a shift .* \((0.58 0.58 0.58|-0.58 -0.58 -0.58)\)"):
-        fit(joined, box_cad, np.eye(4), wanted=FREE)
-    stated = fit(joined, box_cad, np.eye(4), wanted=Wanted(known=STOCK))
+        fit_cad(joined, box_cad, np.eye(4), prior=FREE)
+    stated = fit_cad(joined, box_cad, np.eye(4), prior=AllowancePrior(known=STOCK))
     assert np.abs(stated.T_base_part - np.eye(4)).max() < 0.01
     assert stated.allowance.value == STOCK
     assert "as stated" in allowance_sentence(stated.allowance, "mm")
 
 
 def test_an_opposite_side_tells_it(box_cad):
-    found = fit(box_sides((0, 1), (0, -1), (1, 1), (2, 1)), box_cad, np.eye(4), wanted=FREE)
+    found = fit_cad(box_sides((0, 1), (0, -1), (1, 1), (2, 1)), box_cad, np.eye(4), prior=FREE)
     assert abs(found.allowance.value - STOCK) < 4 * found.allowance.sigma < 0.005
 
 
 def test_a_plate_seen_from_above_says_so(box_cad):
     with pytest.raises(NoResultError, match="of a plate the allowance is a shift along its normal"):
-        fit(box_sides((2, 1)), box_cad, np.eye(4), wanted=FREE)
+        fit_cad(box_sides((2, 1)), box_cad, np.eye(4), prior=FREE)
 
 
 def test_what_the_option_takes():
-    assert read_allowance(None) == Wanted()
+    assert read_allowance(None) == AllowancePrior()
     assert read_allowance("free") == FREE
     assert read_allowance("varying") == VARYING
-    assert read_allowance("-0.25") == Wanted(known=-0.25)
+    assert read_allowance("-0.25") == AllowancePrior(known=-0.25)
 
 
 @pytest.mark.parametrize("text", ["frei", "nan", "inf", "", "0,3"])
@@ -202,7 +202,7 @@ def test_sigmas_of_allowance_and_pose_hold(blade, blade_cad):
     z = []
     for seed in range(100, 124):
         joined, T, start = scanned(blade, even, seed)
-        found = fit(joined, blade_cad, start, wanted=FREE)
+        found = fit_cad(joined, blade_cad, start, prior=FREE)
         off = (found.allowance.value - STOCK) / found.allowance.sigma
         z.append([off, *error(found, T, blade_cad) / found.sigma])
         assert abs(found.allowance.value - STOCK) < 0.005

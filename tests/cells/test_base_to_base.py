@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.stand import Stand, Touched
+from stitch.cells.base_to_base.stand import Stand, TouchedPoints
 from stitch.cells.base_to_base.stand_file import read_stand
-from stitch.cells.base_to_base.stand_fit import fit
+from stitch.cells.base_to_base.stand_fit import fit_stand
 from stitch.cells.base_to_base.stand_projection import project
-from stitch.cells.base_to_base.stand_solution import solve
+from stitch.cells.base_to_base.stand_solution import solve_stand
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
@@ -32,7 +32,7 @@ def printed(slide, angles, lengths, joints):
 def stand(P, R, slide, angles, lengths, sigma=1e-4, level=1e-4, rail_slide=(np.nan, 0.0)):
     def touched(letter, points):
         names = tuple(f"{letter}{i + 1}" for i in range(len(points)))
-        return Touched(names, np.array(points), np.tile(np.eye(3) * sigma**2, (len(points), 1, 1)))
+        return TouchedPoints(names, np.array(points), np.tile(np.eye(3) * sigma**2, (len(points), 1, 1)))
 
     return Stand(
         length_unit="m",
@@ -57,7 +57,7 @@ def test_printed_readings_give_the_printed_transform(rod, t):
     """Both rod angles are rounded by up to 5e-5 rad: 5e-5·L across at each end of R1R2 = 0.607 m, and at O2."""
     rounded = 5e-5 * max(rod[2])
     s = printed(*rod, (0.6283, 0.4488))
-    for T in (project(s).T_base1_base2, fit(s).T_base1_base2):
+    for T in (project(s).T_base1_base2, fit_stand(s).T_base1_base2):
         assert np.abs(T[:3, 3] - t).max() < 3 * rounded
         assert np.abs(T[:3, :3] - [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]).max() < 2 * rounded / 0.607
 
@@ -70,7 +70,7 @@ def test_experiment_2_as_printed_is_refused_with_the_size():
     with pytest.raises(
         NoResultError, match=rf"R1 to R2 is {by_rod:.4f} m .*{by_joints:.4f} m .*\+{by_joints - by_rod:.4f} m"
     ):
-        solve(s)
+        solve_stand(s)
     found = compare_distances(s)[0]
     # Sigma of the joints' side: 1e-4·√2; of the rod's side: two lengths almost along, two angles almost across it.
     assert 1.4e-4 < found.sigma < 6e-4
@@ -100,7 +100,7 @@ def general(seed, points, settings, noise=0.0):
 def test_many_points_without_a_level_of_the_second_base():
     for seed in range(10):
         R, t, s = general(seed, points=3, settings=5)
-        found = fit(s)
+        found = fit_stand(s)
         assert np.abs(found.T_base1_base2[:3, :3] - R).max() < 1e-7
         assert np.abs(found.T_base1_base2[:3, 3] - t).max() < 1e-7
         with pytest.raises(NoResultError):
@@ -119,7 +119,7 @@ def test_covariance_is_the_scatter_of_repeated_measurements():
         readings = {key: getattr(s, key) for key in ("slide", "angle", "length", "rail_slide")}
         noisy = {key: value + rng.normal(0, 1e-4, len(value)) for key, value in readings.items()}
         s = replace(s, rail=rail, rod=rod, **noisy)
-        found = fit(s)
+        found = fit_stand(s)
         turn = Rotation.from_matrix(found.T_base1_base2[:3, :3] @ R.T).as_rotvec()
         scaled.append(
             np.concatenate([turn, found.T_base1_base2[:3, 3] - t])
@@ -131,7 +131,7 @@ def test_covariance_is_the_scatter_of_repeated_measurements():
 def test_two_points_leave_the_turn_about_their_line_open():
     s = replace(printed(*EXPERIMENT_1, (0.6283, 0.4488)), sigma_level_base=None)
     with pytest.raises(NoResultError, match="third point"):
-        fit(s)
+        fit_stand(s)
 
 
 def test_mirrored_stand_gives_the_mirrored_transform():
@@ -141,7 +141,7 @@ def test_mirrored_stand_gives_the_mirrored_transform():
     m = replace(
         s, turn=-1.0, rail=replace(s.rail, points=s.rail.points * flip), rod=replace(s.rod, points=s.rod.points * flip)
     )
-    for solver in (project, fit):
+    for solver in (project, fit_stand):
         T, M = solver(s).T_base1_base2, solver(m).T_base1_base2
         assert np.allclose(M, np.diag([*flip, 1]) @ T @ np.diag([*flip, 1]), atol=1e-9)
 
@@ -165,7 +165,7 @@ def errors():
         rod = [[z.real, z.imag, 0.3] for z in R]
         s = stand(rail, rod, 3.8822, np.arctan2(arm.real, arm.imag), np.abs(arm), sigma=1e-4)
         s = replace(s, sigma_angle=1e-6, sigma_length=1e-6, sigma_slide=1e-6)
-        for name, T in (("projection", project(s).T_base1_base2), ("least squares", fit(s).T_base1_base2)):
+        for name, T in (("projection", project(s).T_base1_base2), ("least squares", fit_stand(s).T_base1_base2)):
             turn = Rotation.from_matrix(T[:3, :3] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])).magnitude()
             found[name].append([turn, np.linalg.norm(T[:3, 3] - [4, -1, 1])])
     return {name: np.array(values) for name, values in found.items()}
@@ -239,7 +239,7 @@ def test_another_arrangement_is_left_to_the_least_squares():
     cups = P2 + 3.88 * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
     turn = Rotation.from_rotvec([0, 0, -1.57])
     s = stand([P2 - 1.7 * x, P2], turn.inv().apply(cups - t), 3.88, theta, length)
-    result = solve(s)
+    result = solve_stand(s)
     assert result.projection is None and "as the source places it" in result.no_projection
     assert np.abs(result.fit.T_base1_base2[:3, 3] - t).max() < 1e-6
     assert np.abs(result.fit.T_base1_base2[:3, :3] - turn.as_matrix()).max() < 1e-6
@@ -268,10 +268,10 @@ def test_millimetres_and_degrees_give_the_same(tmp_path):
             elif i == 1:
                 lines += ["slide = 0"]
     (tmp_path / "mm.toml").write_text("\n".join(lines), encoding="utf-8")
-    found = solve(read_stand(tmp_path / "mm.toml")).fit
+    found = solve_stand(read_stand(tmp_path / "mm.toml")).fit
     covariance = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
     rail, rod = (replace(touched, covariance=covariance) for touched in (s.rail, s.rod))
-    wanted = fit(replace(s, rail=rail, rod=rod, sigma_level_base=np.radians(0.0573)))
+    wanted = fit_stand(replace(s, rail=rail, rod=rod, sigma_level_base=np.radians(0.0573)))
     scale = np.diag([1, 1, 1, 1000.0, 1000, 1000])
     assert np.allclose(found.T_base1_base2[:3, 3], wanted.T_base1_base2[:3, 3] * 1000, atol=1e-3)
     assert np.allclose(found.covariance, scale @ wanted.covariance @ scale, rtol=1e-3, atol=1e-12)
@@ -282,7 +282,7 @@ def test_a_wrong_height_shows_in_the_chi_square():
     s = printed(*EXPERIMENT_1, (0.6283, 0.4488))
     wrong = replace(s, rod=replace(s.rod, points=s.rod.points + np.array([[0, 0, 0], [0, 0, 0.01]])))
     with pytest.raises(NoResultError, match="chi-square"):
-        solve(wrong)
+        solve_stand(wrong)
 
 
 def main_(arguments):

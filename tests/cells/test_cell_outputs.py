@@ -234,11 +234,11 @@ def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monk
 
 def test_expected_shape_is_what_the_commanded_clamps_do():
     """A clamp that is lifted by what its three points need leaves nothing; one point alone cannot turn it."""
-    from stitch.cells.panel.panel_job import read_job
-    from stitch.cells.panel.panel_solution import solve_job
+    from stitch.cells.panel.panel_job import read_panel_job
+    from stitch.cells.panel.panel_solution import solve_panel_job
 
-    job = read_job(JOBS["panel"])
-    result = solve_job(job)
+    job = read_panel_job(JOBS["panel"])
+    result = solve_panel_job(job)
     remaining = viz.cells.panel_figures.expected_after(job, result)
     assert np.abs(remaining).max() < 0.05
     assert result.shape_largest.max() > 3.0
@@ -254,8 +254,8 @@ def test_session_never_overwrites(handed_out, capsys):
 def test_page_into_a_missing_folder_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.drilling.write_page)])
     with pytest.raises(InputError, match="its folder does not exist"):
-        outputs.show("drill", None, tmp_path / "nowhere" / "page.html")
+        outputs.write_recording_and_page("drill", None, tmp_path / "nowhere" / "page.html")
     monkeypatch.setattr(outputs, "entry_points", lambda group, name: [])
     with pytest.raises(InputError, match="no writer for `stitch drill`"):
-        outputs.show("drill", tmp_path / "x.rrd", None)
+        outputs.write_recording_and_page("drill", tmp_path / "x.rrd", None)
     assert not list(tmp_path.iterdir())

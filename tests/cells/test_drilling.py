@@ -14,15 +14,15 @@ from stitch import frames
 from stitch.cells.drilling import hole_image
 from stitch.cells.drilling.base_frame import base_frame, fit_circle
 from stitch.cells.drilling.camera_effects import select_effects
-from stitch.cells.drilling.camera_model import Observations, distort, undistort
-from stitch.cells.drilling.compensation import compensate
-from stitch.cells.drilling.drill_job import read_job
-from stitch.cells.drilling.drill_procedure import calibrate, run_group
-from stitch.cells.drilling.drill_solution import solve_job
+from stitch.cells.drilling.camera_model import HoleObservations, distort, undistort
+from stitch.cells.drilling.compensation import compensate_group
+from stitch.cells.drilling.drill_job import read_drill_job
+from stitch.cells.drilling.drill_procedure import calibrate_sensors, run_group
+from stitch.cells.drilling.drill_solution import solve_drill_job
 from stitch.cells.drilling.hole_frame import drive_pose, euler_zyx, hole_rotation
 from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
-from stitch.cells.drilling.rangers import Rangers, fit_ranger, surface
-from stitch.cells.drilling.servo import Seeing, place, upright
+from stitch.cells.drilling.rangers import Rangers, fit_ranged_plane, fit_ranger
+from stitch.cells.drilling.servo import FlangeSensors, align_tool_axis, servo_to_hole
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
@@ -104,7 +104,7 @@ def test_surface_of_a_tilted_plane():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     normal = Rotation.from_euler("xy", [0.03, -0.05]).apply([0.0, 0, 1])
     d = ((np.array([0, 0, 186.0]) - origins) @ normal) / (directions @ normal)
-    seen = surface(Rangers(origins, directions), d)
+    seen = fit_ranged_plane(Rangers(origins, directions), d)
     assert seen.height == pytest.approx(186, abs=1e-9)
     assert seen.tilt == pytest.approx(np.arccos(np.cos(0.03) * np.cos(0.05)), abs=1e-9)
 
@@ -161,14 +161,14 @@ def test_upright_turns_the_axis_onto_the_normal():
     rng = np.random.default_rng(5)
     T = random_pose(rng)
     normal = Rotation.from_euler("xy", [0.05, 0.02]).apply([0.0, 0, 1])
-    turned = upright(T, normal)
+    turned = align_tool_axis(T, normal)
     assert np.allclose(turned[:3, 2], T[:3, :3] @ normal) and np.allclose(turned[:3, 3], T[:3, 3])
-    assert np.allclose(upright(T, np.array([0, 0, 1.0])), T)
+    assert np.allclose(align_tool_axis(T, np.array([0, 0, 1.0])), T)
 
 
 def ideal_sensors():
     beams = Rangers(np.array([[30.0, 0, 100], [0, 30, 100], [-30, -30, 100]]), np.tile([0.0, 0, 1], (3, 1)))
-    return Seeing(beams, np.diag([20.0, 20.0, 1.0]), 186.0)
+    return FlangeSensors(beams, np.diag([20.0, 20.0, 1.0]), 186.0)
 
 
 def test_servo_ends_within_the_three_thresholds():
@@ -183,9 +183,9 @@ def test_servo_ends_within_the_three_thresholds():
         # The ideal camera looks straight down the tool axis.
         return d, 20 * centre[:2]
 
-    end = place(measure, seeing, np.eye(4))
-    x, y, dh = end.sight.offset
-    assert end.sight.tilt < np.radians(0.35) and abs(dh) < 0.5 and np.hypot(x, y) < 0.2 and end.steps <= 4
+    end = servo_to_hole(measure, seeing, np.eye(4))
+    x, y, dh = end.final_sight.offset
+    assert end.final_sight.tilt < np.radians(0.35) and abs(dh) < 0.5 and np.hypot(x, y) < 0.2 and end.steps <= 4
     # The height is read on the tool axis: off by tilt times offset, at most 0.006 rad · 0.2 mm.
     assert np.abs(end.hole - hole).max() < 2e-3
 
@@ -193,19 +193,19 @@ def test_servo_ends_within_the_three_thresholds():
 def test_servo_that_does_not_settle_says_so():
     """Rangers that show the same tilt whatever the robot does."""
     with pytest.raises(NoResultError, match="did not converge"):
-        place(lambda T: (np.array([86.0, 87.0, 88.0]), np.zeros(2)), ideal_sensors(), np.eye(4))
+        servo_to_hole(lambda T: (np.array([86.0, 87.0, 88.0]), np.zeros(2)), ideal_sensors(), np.eye(4))
 
 
 def test_compensation_recovers_a_rigid_motion():
     rng = np.random.default_rng(6)
     T = random_pose(rng)
     nominal = rng.normal(0, 100, (4, 3))
-    found = compensate(nominal, frames.transform(T, nominal))
+    found = compensate_group(nominal, frames.transform(T, nominal))
     assert np.abs(found.T_actual_nominal - T).max() < 1e-9 and np.abs(found.residuals).max() < 1e-9
     positions, directions = found.apply(nominal, np.tile([0.0, 0, 1], (4, 1)))
     assert np.allclose(directions, T[:3, 2]) and np.allclose(positions, frames.transform(T, nominal))
     with pytest.raises(NoResultError, match="three or more"):
-        compensate(np.outer(np.arange(4.0), [1, 2, 3]), nominal)
+        compensate_group(np.outer(np.arange(4.0), [1, 2, 3]), nominal)
 
 
 def test_distortion_and_its_inverse():
@@ -225,7 +225,7 @@ def test_hidden_effects_are_named_with_their_size(k1, plate):
         cell = DrillingCell(seed, Sizes(k1=k1, plate_height=plate))
         (xyz, uv), (check_xyz, check_uv) = cell.plate(), cell.check_holes()
         on_plate = np.arange(9 + len(check_xyz)) < 9
-        seen = Observations(np.vstack([xyz, check_xyz]), np.vstack([uv, check_uv]), on_plate, IMAGE)
+        seen = HoleObservations(np.vstack([xyz, check_xyz]), np.vstack([uv, check_uv]), on_plate, IMAGE)
         found = select_effects(seen)
         present = {name for name, size in (("k1", k1), ("plate_height", plate)) if size}
         assert {trial.effect for trial in found.trials if trial.accepted} == present
@@ -267,7 +267,7 @@ def test_too_few_holes_in_the_image():
 def experiment(seed):
     """True errors (8, 2) in mm and deg of the holes to drill, before and after."""
     cell = DrillingCell(seed)
-    seeing = calibrate(*cell.plate(), *cell.plane_readings(), HEIGHT)
+    seeing = calibrate_sensors(*cell.plate(), *cell.plane_readings(), HEIGHT)
     before, after = [], []
     for references, targets in GROUPS.values():
         before += [cell.errors(name, drive_pose(*cell.nominal[name])) for name in targets]
@@ -308,7 +308,7 @@ def test_a_turned_tool_frame_is_named_and_taken_up(tmp_path):
     for seed in range(5):
         cell = DrillingCell(seed)
         write_job(tmp_path, cell)
-        result = solve_job(read_job(tmp_path / "job.toml"))
+        result = solve_drill_job(read_drill_job(tmp_path / "job.toml"))
         assert result.tool_axis.accepted
         truth = cell.tool_turn.apply([0.0, 0, 1])
         assert np.arccos(result.tool_axis.axis @ truth) < 4 * result.tool_axis.sigma
@@ -321,7 +321,7 @@ def test_a_true_tool_frame_is_left_alone(tmp_path):
     found = 0
     for seed in range(20):
         write_job(tmp_path, DrillingCell(seed, Sizes(tool_tilt=0.0)))
-        found += solve_job(read_job(tmp_path / "job.toml")).tool_axis.accepted
+        found += solve_drill_job(read_drill_job(tmp_path / "job.toml")).tool_axis.accepted
     assert found <= 3
 
 
@@ -329,11 +329,11 @@ def test_effects_left_out_leave_the_reference_holes_wrong(tmp_path):
     """Without checks.csv the wrong plate height of 1 mm shifts every hole by tan(25°) mm and is not seen."""
     cell = DrillingCell(2, Sizes(plate_height=1.0))
     write_job(tmp_path, cell)
-    job = read_job(tmp_path / "job.toml")
-    named = solve_job(job)
+    job = read_drill_job(tmp_path / "job.toml")
+    named = solve_drill_job(job)
     job_file = tmp_path / "job.toml"
     job_file.write_text(job_file.read_text(encoding="utf-8").replace("checks =", "#"), encoding="utf-8")
-    blind = solve_job(read_job(job_file))
+    blind = solve_drill_job(read_drill_job(job_file))
     errors = [
         np.mean([cell.errors(d.hole.name, drive_pose(d.position, d.direction))[0] for d in r.drives])
         for r in (named, blind)
@@ -366,7 +366,7 @@ def test_bad_input_is_named(tmp_path, file, old, new, part):
     assert old in text
     (tmp_path / file).write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError) as error:
-        read_job(tmp_path / "job.toml")
+        read_drill_job(tmp_path / "job.toml")
     assert part in str(error.value) and str(tmp_path) in str(error.value)
 
 
@@ -375,7 +375,7 @@ def test_directions_out_of_the_part_are_refused(tmp_path):
     cell.nominal = {name: (position, -direction) for name, (position, direction) in cell.nominal.items()}
     write_job(tmp_path, cell)
     with pytest.raises(InputError, match="point into the part"):
-        read_job(tmp_path / "job.toml")
+        read_drill_job(tmp_path / "job.toml")
 
 
 def test_two_reference_holes_are_too_few(tmp_path):
@@ -384,4 +384,4 @@ def test_two_reference_holes_are_too_few(tmp_path):
     kept = [line for line in text if not line.startswith(("101,1", "106,1"))]
     (tmp_path / "holes.csv").write_text("\n".join(kept), encoding="utf-8")
     with pytest.raises(NoResultError, match="group 1: 2 reference holes"):
-        solve_job(read_job(tmp_path / "job.toml"))
+        solve_drill_job(read_drill_job(tmp_path / "job.toml"))

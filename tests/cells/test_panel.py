@@ -12,12 +12,12 @@ from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
 from stitch import frames
-from stitch.cells.panel.errors_along import along
-from stitch.cells.panel.global_model import Readings, RobotModel, calibrate
-from stitch.cells.panel.laser_tracker import Tracker
-from stitch.cells.panel.layout import Layout, contacts
+from stitch.cells.panel.errors_along import errors_along_motion
+from stitch.cells.panel.global_model import ReflectorReadings, RobotModel, calibrate_robot
+from stitch.cells.panel.laser_tracker import LaserTracker
+from stitch.cells.panel.layout import ClampLayout, clamp_contacts
 from stitch.cells.panel.legs import Legs, find_leg_offset, leg_jacobian, true_flanges
-from stitch.cells.panel.panel_loops import Stage, run_pose, run_shape
+from stitch.cells.panel.panel_loops import PanelSetup, run_pose, run_shape
 from stitch.cells.panel.panel_motion import adjust_pose, follow, preposition
 from stitch.cells.panel.rigid_fit import rigid_fit
 from stitch.cells.panel.shape_control import ControlPoints, shape_step
@@ -25,7 +25,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "panel"
-LAYOUT = Layout(**panel_job.LAYOUT, columns=3)
+LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
 LEGS = Legs(hexapod.BASE, hexapod.PLATFORM)
 
 
@@ -35,7 +35,7 @@ def pose(a, b, c, *t):
 
 def test_layout_keeps_its_chords_heights_and_edges():
     """Distances between the pads are the stated ones; every pad lies on the cylinder; the frames look to its axis."""
-    c = contacts(LAYOUT)
+    c = clamp_contacts(LAYOUT)
     axis_distance = np.hypot(c.pads[..., 1], c.pads[..., 2] + LAYOUT.radius)
     assert np.allclose(axis_distance, LAYOUT.radius, atol=1e-9)
     for first, second, third in c.pads:
@@ -52,7 +52,7 @@ def test_layout_keeps_its_chords_heights_and_edges():
 
 def test_layout_that_cannot_be_is_refused():
     with pytest.raises(InputError, match="edge and clamp_height"):
-        contacts(Layout(2960, 360, 290, 360, 1300, 3100, 3))
+        clamp_contacts(ClampLayout(2960, 360, 290, 360, 1300, 3100, 3))
 
 
 def test_preposition_closes_the_chain():
@@ -88,10 +88,12 @@ def test_rigid_fit_covariance_is_the_spread_of_draws():
 
 def measured(seed, poses=40, hidden=None, leg=0.0):
     cell = PanelCell(seed, Sizes(leg=leg), np.zeros((6, 6)) if hidden is None else hidden)
-    tracker = Tracker(cell.tracker)
+    tracker = LaserTracker(cell.tracker)
     commands = panel_job.calibration_poses(poses, seed)
     seen = panel_job.calibration(cell, commands)
-    return cell, [Readings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)]
+    return cell, [
+        ReflectorReadings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)
+    ]
 
 
 def test_global_model_is_within_its_sigmas():
@@ -99,7 +101,7 @@ def test_global_model_is_within_its_sigmas():
     cell, readings = measured(5)
     p = []
     for i, reading in enumerate(readings):
-        model = calibrate(reading)
+        model = calibrate_robot(reading)
         off = frames.log(np.linalg.inv(cell.T_world_base[i]) @ model.T_world_base)
         assert off @ np.linalg.solve(model.covariance[:6, :6], off) < 27.9  # chi-square of 6, chance 1e-4
         p.append(model.p_value)
@@ -128,8 +130,8 @@ def test_hidden_leg_offset_is_found_in_its_robot_only():
     hidden = np.zeros((6, 6))
     hidden[2, 3] = 0.5
     _, readings = measured(11, hidden=hidden, leg=0.004)
-    found = [find_leg_offset(r, calibrate(r), LEGS, 36) for r in readings]
-    assert [f.found for f in found] == [False, False, True, False, False, False]
+    found = [find_leg_offset(r, calibrate_robot(r), LEGS, 36) for r in readings]
+    assert [f.detected for f in found] == [False, False, True, False, False, False]
     assert found[2].leg == 4
     assert abs(found[2].offset - 0.5) < 4 * found[2].sigma < 0.2
 
@@ -148,11 +150,11 @@ def toy_models(turn):
 def test_drift_of_a_translation_is_turn_times_distance():
     """δR·d with δR a turn of σ about each axis: rms σ·d·√2, no change of direction; 2000 draws, 2 % and to spare."""
     flange = np.tile(frames.make(np.eye(3), [0, 0, 700.0]), (2, 1, 1))
-    errors = along(toy_models(1e-4), flange, 0, np.array([0.0, 100.0]), turn=False, draws=2000)
+    errors = errors_along_motion(toy_models(1e-4), flange, 0, np.array([0.0, 100.0]), turn=False, draws=2000)
     assert errors.position[:, 1, 1] == pytest.approx(np.full(3, 1e-4 * 100 * np.sqrt(2)), rel=0.08)
     assert errors.position[:, 0].max() < 1e-9
     assert errors.angle.max() < 1e-12
-    turned = along(toy_models(1e-4), flange, 0, np.radians([2.0]), turn=True, draws=2000)
+    turned = errors_along_motion(toy_models(1e-4), flange, 0, np.radians([2.0]), turn=True, draws=2000)
     assert turned.angle[:, 0, 1] == pytest.approx(np.full(3, 1e-4 * np.radians(2.0) * np.sqrt(2)), rel=0.08)
     # The clamp stands 2000 mm from the master: turning about z carries it 2000·sin 2° and errs with that.
     assert turned.position[2, 0, 1] > 1e-4 * 2000 * np.radians(2.0)
@@ -195,12 +197,12 @@ def test_plate_strip_bends_as_a_beam():
 
 def ready(seed):
     cell, readings = measured(seed, leg=0.004)
-    models = [calibrate(r) for r in readings]
+    models = [calibrate_robot(r) for r in readings]
     base, contact = (np.array([getattr(m, n) for m in models]) for n in ("T_world_base", "T_flange_contact"))
-    start = preposition(base, cell.target, contacts(LAYOUT).T_panel_contact, contact)
+    start = preposition(base, cell.target, clamp_contacts(LAYOUT).T_panel_contact, contact)
     cell.drive(start)
     cell.lay()
-    return cell, Stage(models, 1, Tracker(cell.tracker), cell.target), start
+    return cell, PanelSetup(models, 1, LaserTracker(cell.tracker), cell.target), start
 
 
 def test_pose_after_one_adjustment_and_shape_within_three_iterations():
@@ -215,7 +217,7 @@ def test_pose_after_one_adjustment_and_shape_within_three_iterations():
 
     cell.compliant = True
     control, clamp = panel_job.control_points()
-    contact = contacts(LAYOUT).T_panel_contact
+    contact = clamp_contacts(LAYOUT).T_panel_contact
     run = run_shape(cell, stage, ControlPoints(control, clamp, contact), stand, tolerance=0.6)
     assert run.deviations[0].max() > 3
     assert len(run.deviations) <= 4
@@ -229,7 +231,7 @@ def test_pose_after_one_adjustment_and_shape_within_three_iterations():
 
 def test_shape_step_undoes_a_turned_clamp():
     """Points turned 2 mrad about the contact's x and lifted 1 mm: the step is the opposite, and nothing else moves."""
-    contact = contacts(LAYOUT).T_panel_contact
+    contact = clamp_contacts(LAYOUT).T_panel_contact
     control, clamp = panel_job.control_points()
     wrong = np.array([2e-3, 0, 0, 0, 0, 1.0])
     pushed = contact @ frames.exp(wrong) @ np.linalg.inv(contact)

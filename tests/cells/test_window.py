@@ -13,19 +13,19 @@ from data_synth import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames
-from stitch.cells.window.cad import nearest, surface
-from stitch.cells.window.cad_fit import fit
-from stitch.cells.window.cad_start import find_start
-from stitch.cells.window.deviation import deviations
+from stitch.cells.window.cad import cad_surface, nearest_partners
+from stitch.cells.window.cad_fit import fit_cad
+from stitch.cells.window.cad_start import find_cad_start
+from stitch.cells.window.deviation import measure_deviations
 from stitch.cells.window.edge import find_edge
-from stitch.cells.window.instances import split
-from stitch.cells.window.joined_scans import join
+from stitch.cells.window.instances import split_instances
+from stitch.cells.window.joined_scans import join_scans
 from stitch.cells.window.path_correction import correct_path
 from stitch.cells.window.regions import Box, Regions
 from stitch.cells.window.seam import Limits, Station, measure_seam
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "window"
 NOISE = 0.05
@@ -38,7 +38,7 @@ def truth(seed):
 
 
 def joined(clouds, poses):
-    return join([prepare_view("", c) for c in clouds], poses)
+    return join_scans([prepare_scan("", c) for c in clouds], poses)
 
 
 def furthest(T, true, mesh):
@@ -59,7 +59,7 @@ def pane():
 
 @pytest.fixture(scope="module")
 def pane_cad(pane):
-    return surface(pane)
+    return cad_surface(pane)
 
 
 def scan_pane(pane, T, seed):
@@ -74,7 +74,7 @@ def test_distances_are_those_of_trimesh(pane, pane_cad):
     points, faces = trimesh.sample.sample_surface(pane, 60, seed=1)
     normals = pane.face_normals[faces]
     off = points + rng.uniform(-1.5, 1.5, (60, 1)) * normals
-    found = nearest(pane_cad, off, normals)
+    found = nearest_partners(pane_cad, off, normals)
     count = len(pane.faces)
     place = trimesh.triangles.closest_point(np.tile(pane.triangles, (60, 1, 1)), np.repeat(off, count, axis=0))
     wanted = np.linalg.norm(place.reshape(60, count, 3) - off[:, None], axis=2).min(axis=1)
@@ -85,8 +85,8 @@ def test_distances_are_those_of_trimesh(pane, pane_cad):
 def test_fit_without_a_guess(pane, pane_cad):
     seed, T = 3, truth(3)
     scan = scan_pane(pane, T, seed)
-    start = find_start(scan, pane_cad)
-    found = fit(scan, pane_cad, start.T_base_part)
+    start = find_cad_start(scan, pane_cad)
+    found = fit_cad(scan, pane_cad, start.T_base_part)
     assert furthest(found.T_base_part, T, pane) < 0.05
     # The truth lies within the stated covariance: chi-square of 6, chance 1e-4, with the sandwich's own doubt.
     shift = frames.make(np.eye(3), pane_cad.centre)
@@ -97,15 +97,15 @@ def test_fit_without_a_guess(pane, pane_cad):
 def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     """A dent of 3 mm (σ 60 mm) on a door of 600 mm; start 6 mm and 0.5° off."""
     weld = window_scans.Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
-    warped, cad, T = window_scans.warp(door, weld), surface(door), truth(1)
+    warped, cad, T = window_scans.warp(door, weld), cad_surface(door), truth(1)
     far, poses = window_scans.scan_outside(warped, T, NOISE, 1, (2, 2), rays=110, distance=500.0)
     near, close = window_scans.scan_edges(warped, T, CarDoor(**DOOR), "door", NOISE, 2, count=8, rays=80)
     scan = joined(far + near, np.concatenate([poses, close]))
     centre = frames.make(np.eye(3), cad.centre)
     start = T @ centre @ frames.exp(np.array([6e-3, -5e-3, 6e-3, 4, -3, 3.5])) @ np.linalg.inv(centre)
-    found = fit(scan, cad, start)
+    found = fit_cad(scan, cad, start)
     assert furthest(found.T_base_part, T, door) < 0.05
-    shown = deviations(scan, cad, found.T_base_part, 0.5, 15.0)
+    shown = measure_deviations(scan, cad, found.T_base_part, 0.5, 15.0)
     # Compared where the outer skin is flat enough for a dent along y to be one along the normal within 5 %.
     slope = np.gradient(car_door.outer_surface(CarDoor(**DOOR), np.full(3, 170.0), np.array([88.0, 90.0, 92.0])), 2.0)[
         1
@@ -126,14 +126,14 @@ def test_two_parts_in_one_scan(pane, pane_cad):
     scans = [scan_pane(pane, T, 5 + i) for i, T in enumerate(Ts)]
     columns = (np.concatenate([getattr(s, n) for s in scans]) for n in ("points", "normals", "usable", "area"))
     both = type(scans[0])(*columns, scans[0].spacing, scans[0].noise)
-    heaps = split(both, pane_cad, 2)
+    heaps = split_instances(both, pane_cad, 2)
     middles = [s.points.mean(axis=0) for s in scans]
     whose = [int(np.argmin([np.linalg.norm(h.points.mean(axis=0) - m) for m in middles])) for h in heaps]
     assert sorted(whose) == [0, 1]
     for heap, k in zip(heaps, whose, strict=True):
-        assert furthest(fit(heap, pane_cad, Ts[k]).T_base_part, Ts[k], pane) < 0.05
+        assert furthest(fit_cad(heap, pane_cad, Ts[k]).T_base_part, Ts[k], pane) < 0.05
     with pytest.raises(NoResultError, match="2 separate parts"):
-        split(both, pane_cad, 3)
+        split_instances(both, pane_cad, 3)
 
 
 def test_forbidden_region_keeps_a_gripper_out_of_the_fit(pane, pane_cad):
@@ -144,18 +144,18 @@ def test_forbidden_region_keeps_a_gripper_out_of_the_fit(pane, pane_cad):
     box = Box("gripper", np.array([250.0, -99, -99]), np.array([430.0, 99, 999]))
     lifted = scan.points + np.where(box.holds(local), 1.0, 0.0)[:, None] * scan.normals
     scan = type(scan)(lifted, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
-    found = fit(scan, pane_cad, T, Regions(forbidden=(box,)))
+    found = fit_cad(scan, pane_cad, T, Regions(forbidden=(box,)))
     assert furthest(found.T_base_part, T, pane) < 0.05
 
 
 def test_a_plane_fixes_no_pose(pane_cad):
     box = trimesh.creation.box([300, 200, 10])
-    cad = surface(box)
+    cad = cad_surface(box)
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-140, 140, 4000), rng.uniform(-90, 90, 4000), np.full(4000, 5.0)])
     scan = joined([points - [0, 0, 500.0]], np.array([frames.make(np.eye(3), [0, 0, 500.0])]))
     with pytest.raises(NoResultError, match="leaves a direction open"):
-        fit(scan, cad, np.eye(4))
+        fit_cad(scan, cad, np.eye(4))
 
 
 def test_edge_of_two_planes():
@@ -261,4 +261,4 @@ def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
     points = scan.points + np.where(np.arange(len(scan.points)) < 2000, 1e8, 0.0)[:, None]
     thrown = type(scan)(points, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
     with pytest.raises(NoResultError, match="correct a scanner's pose"):
-        find_start(thrown, pane_cad)
+        find_cad_start(thrown, pane_cad)

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from stitch.cli.terminal import live_line
-from stitch.cli.terminal.live_line import TimeLeft, told
+from stitch.cli.terminal.live_line import TimeLeft, time_left_text
 from stitch.system.steps import steps, watched
 from stitch.system.threads import parallel
 
@@ -42,7 +42,7 @@ def said(monkeypatch):
     ],
 )
 def test_time_left_is_that_of_the_steps_before(done, seconds, text):
-    assert told("scans", done, 40, seconds) == text
+    assert time_left_text("scans", done, 40, seconds) == text
 
 
 def test_loops_within_loops_are_told_together(said):

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from stitch.cli.main import main
-from stitch.system.whole_file import whole
-from stitch.system.whole_folder import rewritten
+from stitch.system.whole_file import whole_file
+from stitch.system.whole_folder import rewrite_folder
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="nobody may make a folder in /proc")
@@ -20,14 +20,14 @@ def test_the_folder_that_was_asked_for_is_named(session, capsys):
 
 def test_the_file_that_was_asked_for_is_named(tmp_path):
     asked = tmp_path / "nowhere" / "diagnosis.json"
-    with pytest.raises(OSError) as error, whole(asked) as scratch:
+    with pytest.raises(OSError) as error, whole_file(asked) as scratch:
         scratch.write_text("")
     assert error.value.filename == str(asked)
 
 
 def test_an_error_at_another_file_keeps_its_name(tmp_path):
     other = tmp_path / "nowhere" / "other"
-    with pytest.raises(OSError) as error, whole(tmp_path / "a") as scratch:
+    with pytest.raises(OSError) as error, whole_file(tmp_path / "a") as scratch:
         scratch.write_text("")
         other.write_text("")
     assert error.value.filename == str(other)
@@ -40,6 +40,6 @@ def test_a_scratch_folder_that_cannot_be_made_names_the_folder(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     Path("run").mkdir()
     monkeypatch.setattr("tempfile._os.mkdir", refused)
-    with pytest.raises(PermissionError) as error, rewritten(Path("run"), lambda inside: True):
+    with pytest.raises(PermissionError) as error, rewrite_folder(Path("run"), lambda inside: True):
         pass
     assert error.value.filename == "run"

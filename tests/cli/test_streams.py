@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from stitch.cli.terminal.streams import emit, results_alone
+from stitch.cli.terminal.streams import emit, stdout_for_results
 
 PRINTS = """
 import os, sys
@@ -22,7 +22,7 @@ MAIN = [sys.executable, "-c", "from stitch.cli.main import main; main()"]
 
 
 def test_what_is_printed_on_the_way_goes_aside(capsys):
-    @results_alone
+    @stdout_for_results
     def command():
         print("noise")
         emit("result")

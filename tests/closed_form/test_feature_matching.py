@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch import frames
-from stitch.closed_form.feature_matching import align, describe, register, thin
+from stitch.closed_form.feature_matching import align_icp, compute_fpfh, register_ransac, voxel_downsample
 
 
 def samples(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +43,7 @@ def simple_histogram(points, normals, i, radius) -> tuple[np.ndarray, list[tuple
 def test_histograms_are_the_papers():
     points, normals = samples(400, 0)
     radius = 15.0
-    found = describe(points, normals, radius).histograms
+    found = compute_fpfh(points, normals, radius).histograms
     for i in range(0, 400, 40):
         own, neighbours = simple_histogram(points, normals, i, radius)
         assert 3 < len(neighbours) < 99
@@ -62,24 +62,24 @@ def test_the_motion_between_two_samples_of_half_a_part_is_found(seed):
     for number, (side, T) in enumerate([(1, np.eye(4)), (-1, true)]):
         points, normals = samples(40_000, 10 * seed + number)
         seen = side * (points[:, 2] - 100) > -60
-        points, normals = thin(points[seen], normals[seen], size / 2)
-        surfaces.append(describe(frames.transform(T, points), frames.rotate(T, normals), 2.5 * size))
-    coarse = register(surfaces[0], surfaces[1], reach=1.5 * size, draws=10_000)
+        points, normals = voxel_downsample(points[seen], normals[seen], size / 2)
+        surfaces.append(compute_fpfh(frames.transform(T, points), frames.rotate(T, normals), 2.5 * size))
+    coarse = register_ransac(surfaces[0], surfaces[1], reach=1.5 * size, draws=10_000)
     corners = trimesh.bounds.corners(mesh_of("blade").bounds)
     off = frames.transform(coarse, corners) - frames.transform(true, corners)
     assert np.linalg.norm(off, axis=1).max() < 2 * 1.5 * size
-    fine = align(surfaces[0], surfaces[1], coarse, reach=size)
+    fine = align_icp(surfaces[0], surfaces[1], coarse, reach=size)
     off = frames.transform(fine, corners) - frames.transform(true, corners)
     assert np.linalg.norm(off, axis=1).max() < size / 4
 
 
 def test_same_surfaces_same_motion_bit_for_bit():
-    a, b = (describe(*samples(800, seed), 15.0) for seed in (1, 2))
-    assert np.array_equal(register(a, b, 9.0, 2000, seed=3), register(a, b, 9.0, 2000, seed=3))
+    a, b = (compute_fpfh(*samples(800, seed), 15.0) for seed in (1, 2))
+    assert np.array_equal(register_ransac(a, b, 9.0, 2000, seed=3), register_ransac(a, b, 9.0, 2000, seed=3))
 
 
 def test_nothing_in_common_is_no_motion():
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
-    one = describe(points, np.tile([0, 0, 1.0], (5, 1)), 0.5)
-    other = describe(1e3 * points, np.tile([0, 0, 1.0], (5, 1)), 0.5)
-    assert np.array_equal(register(one, other, 0.1, 100), np.eye(4))
+    one = compute_fpfh(points, np.tile([0, 0, 1.0], (5, 1)), 0.5)
+    other = compute_fpfh(1e3 * points, np.tile([0, 0, 1.0], (5, 1)), 0.5)
+    assert np.array_equal(register_ransac(one, other, 0.1, 100), np.eye(4))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stitch.comparison.table import table_of
-from stitch.comparison.tables import Comparison, binned
+from stitch.comparison.tables import ResidualTables, equal_count_bins
 from stitch.comparison.view_scatter import view_statistics
 
 
@@ -11,8 +11,8 @@ def compared(errors, properties, rms=1.0):
     """Of views that are off by `errors` (V,), each with 1000 rows, by properties name -> (V,)."""
     tables = []
     for name, values in properties.items():
-        edges, bins = binned(values)
+        edges, bins = equal_count_bins(values)
         n = (bins == np.arange(len(edges) - 1)[:, None]) * 1000.0
         statistics = view_statistics(n, n * errors, n * errors**2)
         tables.append(table_of(name, "deg", (edges[:-1], edges[1:]), (), statistics))
-    return Comparison(tuple(tables), rms, rms)
+    return ResidualTables(tuple(tables), rms, rms)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.comparison.tables import binned, changes, comparison_document
+from stitch.comparison.tables import comparison_document, equal_count_bins, property_varies
 from tests.comparison.compared_views import compared
 
 
@@ -49,9 +49,9 @@ def test_a_bin_and_all_outside_of_it_are_one_mean():
 
 
 def test_the_two_ways_to_come_are_two_bins():
-    _, bins = binned(np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0]))
+    _, bins = equal_count_bins(np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0]))
     assert bins.tolist() == [1, 0, 2, 2, 0, 2, 2]
-    edges, bins = binned(np.array([1.0, -1.0, 1.0]))
+    edges, bins = equal_count_bins(np.array([1.0, -1.0, 1.0]))
     assert edges.tolist() == [-1.0, 0.0, 1.0] and bins.tolist() == [1, 0, 1]
 
 
@@ -66,4 +66,4 @@ def test_the_two_ways_to_come_are_two_bins():
     ],
 )
 def test_what_does_not_change_is_left_out(name, values, expected):
-    assert changes(name, np.array(values)) is expected
+    assert property_varies(name, np.array(values)) is expected

@@ -12,8 +12,8 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.comparison.model_history import model_history
 from stitch.comparison.patches import patches_of
-from stitch.observations.surfaces.match import distances, sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.match import sample_points, signed_distances
+from stitch.observations.surfaces.overlaps import collect_overlaps
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.revision import add
@@ -80,9 +80,9 @@ def test_the_standard_error_of_a_patch_is_its_scatter_about_the_truth():
     """With true poses all that is left is noise: values in units of their standard errors are normal."""
     measured, capture = captured_blade(1, views=6, pixels=90, repeatability=(0.0, 0.0))
     T = measured.T_reference_scanner
-    overlaps = collect(capture, T, 1.5, [sample(scan, 3000) for scan in capture.scans])
-    e = distances(overlaps.matches, T, [scan.points for scan in capture.scans])
-    field = patches_of(overlaps.matches, len(T), overlaps.gram.scale, shown=e).field(e)
+    overlaps = collect_overlaps(capture, T, 1.5, [sample_points(scan, 3000) for scan in capture.scans])
+    e = signed_distances(overlaps.matches, T, [scan.points for scan in capture.scans])
+    field = patches_of(overlaps.matches, len(T), overlaps.gram.scale, model_distances=e).field(e)
     z = (field.values / field.sigma)[np.isfinite(field.values)]
     # A standard error from a few cells is good to a factor; the median |z| of a normal variable is 0.6745.
     assert 1 / 1.5 < np.median(np.abs(z)) / 0.6745 < 1.5
@@ -92,12 +92,12 @@ def test_the_standard_error_of_a_patch_is_its_scatter_about_the_truth():
 def test_a_view_that_is_moved_lies_off_by_its_motion():
     measured, capture = captured_blade(1, views=6, pixels=90, repeatability=(0.0, 0.0))
     T, points = measured.T_reference_scanner, [scan.points for scan in capture.scans]
-    overlaps = collect(capture, T, 1.5, [sample(scan, 3000) for scan in capture.scans])
+    overlaps = collect_overlaps(capture, T, 1.5, [sample_points(scan, 3000) for scan in capture.scans])
     shift = np.array([0.11, -0.07, 0.05])
     moved = T.copy()
     moved[2, :3, 3] += shift
-    e = [distances(overlaps.matches, poses, points) for poses in (T, moved)]
-    patches = patches_of(overlaps.matches, len(T), overlaps.gram.scale, shown=e[1])
+    e = [signed_distances(overlaps.matches, poses, points) for poses in (T, moved)]
+    patches = patches_of(overlaps.matches, len(T), overlaps.gram.scale, model_distances=e[1])
     gained = patches.field(e[1]).values - patches.field(e[0]).values
     seen = np.isfinite(gained[2])
     # Where the part bends within a patch its normal is one of many.

@@ -9,9 +9,9 @@ from data_synth import kinematics
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.write import write_session
 from stitch import frames, pipeline
-from stitch.measurement.capture import capture
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect
+from stitch.measurement.capture import prepare_capture
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect_overlaps
 from stitch.reading.session_folder import load_session
 from stitch.system.threads import library_threads_off
 
@@ -27,10 +27,10 @@ def leaves(folder, hidden: dict[str, float], scene: str = "blade"):
     write_session(folder / "s", measured, "s")
     session = load_session(folder / "s")
     run = pipeline.run(session)
-    own = capture(session)
+    own = prepare_capture(session)
     with library_threads_off():
-        true = collect(own, measured.T_reference_scanner, run.overlaps.gate,
-                       [sample(scan, FINE_SAMPLES) for scan in own.scans]).gram.rms  # fmt: skip
+        true = collect_overlaps(own, measured.T_reference_scanner, run.overlaps.gate,
+                       [sample_points(scan, FINE_SAMPLES) for scan in own.scans]).gram.rms  # fmt: skip
     return run.stages[1].rms, true, run, measured
 
 

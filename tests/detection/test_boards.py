@@ -7,8 +7,8 @@ import pytest
 
 from data_synth.fixtures.board_scans import board_print, checkerboard_print, poses_before, scan_print
 from stitch.detection.board import parse_board
-from stitch.detection.board_points import boards_in, judged
-from stitch.detection.lift import lift
+from stitch.detection.board_points import board_sightings, boards_in
+from stitch.detection.lift import lift_points
 from stitch.errors import InputError
 from stitch.measurement.range_image import RangeImage
 
@@ -32,7 +32,7 @@ def scans(charuco):
 def sightings(scans, stated):
     board = parse_board(stated)
     views = [boards_in(RangeImage(s.points, s.grey), board, cv2) for s in scans]
-    return judged(views, board, 1.0, board.kind)[0]
+    return board_sightings(views, board, 1.0, board.kind)[0]
 
 
 def numbers(sighting):
@@ -85,7 +85,7 @@ def test_noise_of_a_plane_averages_over_the_window():
     heights, told = [], []
     for seed in range(60):
         z = 100 + np.random.default_rng(seed).normal(0, 0.2, u.shape)
-        points, sigma = lift(
+        points, sigma = lift_points(
             RangeImage(np.dstack([u, v, z]), z.astype(np.uint8)), np.array([[20.0, 20.0]]), np.array([8.0]), 0.0
         )
         heights.append(points[0, 2] - 100)
@@ -98,7 +98,7 @@ def test_noise_of_a_plane_averages_over_the_window():
 def test_another_surface_in_the_window_does_not_pull_the_corner():
     v, u = np.mgrid[:41, :41].astype(float)
     z = np.where(u > 24, 160.0, 100.0)
-    points, _ = lift(
+    points, _ = lift_points(
         RangeImage(np.dstack([u, v, z]), z.astype(np.uint8)), np.array([[20.3, 19.8]]), np.array([8.0]), 0.1
     )
     assert points[0] == pytest.approx([20.3, 19.8, 100.0], abs=1e-6)

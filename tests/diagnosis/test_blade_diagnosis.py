@@ -102,7 +102,7 @@ def test_turning_the_last_joint_alone_names_nothing():
 def test_prediction_of_the_null_is_the_present_residual():
     _, result = blade_run(6, {})
     linear = linear_model_of(state_of(result))
-    g, present = linear.observation.freed.overlaps.gram, linear.present
+    g, present = linear.observation.unconstrained.overlaps.gram, linear.baseline_trial
     assert np.sqrt(present.squares(present.solve()).sum() / g.weight.sum()) == pytest.approx(
         result.residual_rms, rel=0.15
     )

@@ -12,14 +12,14 @@ from numpy.polynomial import Polynomial
 from data_synth import kinematics
 from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch import frames
-from stitch.diagnosis.course_sentences import course_texts, curve_text
+from stitch.diagnosis.course_sentences import curve_sentences, joint_curve_sentence
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.clear_joints import clear_laws
+from stitch.diagnosis.unknown.clear_joints import significant_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_by, some_law
+from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_of_kinds, log_posterior_of_any
 from stitch.diagnosis.variance_budget import variance_budget
-from stitch.observations.flange_errors import usual_step
-from stitch.observations.joint_processes import ITS_LOAD, THE_WAY, TIME_ALONE, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.observations.flange_errors import usual_time_step
+from stitch.observations.joint_processes import JOINT_LOAD, TIME_ONLY, TRAVEL, TWO_ANGLES, WAVES, WITH_TIME
 from tests.diagnosis.freed_blade import freed_blade
 
 
@@ -40,27 +40,27 @@ def test_a_joint_is_told_where_all_of_them_together_explain_no_more(cell):
     off[:, 4] = 3e-4 * np.sin(2 * cell.measured.plan.joints[:, 4])
     linear = with_joints_off(cell, off)
     assert joint_laws(linear)[0].log_bayes_factor < ODDS
-    assert [law.joint for law in clear_laws(linear)] == [5]
+    assert [law.joint for law in significant_laws(linear)] == [5]
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
 def test_no_joint_is_told_where_all_are_off(cell, size):
     for seed in range(4):
         arm = draw_arm(cell.measured.plan.arm.joints, size, np.random.default_rng(seed))
-        assert not clear_laws(cell.seen(arm.flange(cell.measured.plan.arm, cell.measured.plan.joints)))
+        assert not significant_laws(cell.seen(arm.flange(cell.measured.plan.arm, cell.measured.plan.joints)))
 
 
 def test_that_some_law_is_there_is_their_mean_over_a_twentieth():
     """However many kinds of laws are asked for: those that explain nothing take their share of the prior."""
     factors = np.array([50.0, 3.0, 1.0, 0.0])
-    asked = some_law(np.log(np.maximum(factors, 1e-300))[:, None])
+    asked = log_posterior_of_any(np.log(np.maximum(factors, 1e-300))[:, None])
     assert asked.shape == (1,) and np.exp(asked[0] + ANY_SIZE) == pytest.approx(0.05 * factors.mean())
 
 
 def test_no_joint_is_told_where_poses_wander(cell):
     for seed in range(4):
         wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([4e-5, 0.04], 3)
-        assert not clear_laws(cell.seen(cell.measured.T_base_flange @ frames.exp(wander)))
+        assert not significant_laws(cell.seen(cell.measured.T_base_flange @ frames.exp(wander)))
 
 
 def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
@@ -69,12 +69,12 @@ def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
     move = np.diff(q, axis=0, prepend=q[:1])
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.tanh(4 * move[:, 4])
-    laws = clear_laws(with_joints_off(cell, off))
-    assert [(law.joint, law.follows) for law in laws] == [(5, THE_WAY)]
+    laws = significant_laws(with_joints_off(cell, off))
+    assert [(law.joint, law.follows) for law in laws] == [(5, TRAVEL)]
     course = joint_curves(laws)[0]
     true = 4e-4 * np.tanh(4 * np.radians(course.at)) - off[:, 4].mean()
     assert course.covariate == "j5_move_deg"
-    np.testing.assert_allclose(course.stood, np.degrees(move[:, 4]))
+    np.testing.assert_allclose(course.view_values, np.degrees(move[:, 4]))
     assert np.all(np.abs(course.error - true) < 3 * course.sigma)
     assert all(a <= b + 1e-5 for a, b in pairwise(course.error)) and np.ptp(course.error) > 0.6 * np.ptp(true)
 
@@ -84,7 +84,7 @@ def test_two_joints_that_drag_each_other_are_told_by_the_two_angles(cell):
     q = cell.measured.plan.joints
     off = np.zeros_like(q)
     off[:, 2] = 3e-4 * np.sin(q[:, 2]) * np.sin(2 * q[:, 4])
-    (law,) = clear_laws(with_joints_off(cell, off))
+    (law,) = significant_laws(with_joints_off(cell, off))
     assert (law.joint, law.follows, law.errors.others[law.process]) == (3, TWO_ANGLES, 4)
     curves = joint_curves([law])
     assert {c.covariate for c in curves} <= {"j3_deg", "j5_deg"} and curves[0].covariate == "j5_deg"
@@ -96,18 +96,18 @@ def test_what_a_joint_does_by_two_angles_is_the_mean_over_its_partners(cell):
     off = np.zeros_like(q)
     off[:, 3] = 2e-4 * np.sin(q[:, 1])
     linear = with_joints_off(cell, off)
-    smooth = linear.pose_errors.of_one_joint[TWO_ANGLES]
+    smooth = linear.pose_errors.joint_processes[TWO_ANGLES]
     factors = []
     for p in smooth.of_joint(3):
-        own = replace(smooth, joints=(3,), columns=smooth.columns[:, [p]], alike=smooth.alike[[p]])
-        errors = replace(linear.pose_errors, of_one_joint={TWO_ANGLES: own})
-        (law,) = laws_by(replace(linear, pose_errors=errors), [TWO_ANGLES])
+        own = replace(smooth, joints=(3,), columns=smooth.columns[:, [p]], kernel=smooth.kernel[[p]])
+        errors = replace(linear.pose_errors, joint_processes={TWO_ANGLES: own})
+        (law,) = laws_of_kinds(replace(linear, pose_errors=errors), [TWO_ANGLES])
         factors.append(np.exp(law.log_bayes_factor))
-    whole = next(law for law in laws_by(linear, [TWO_ANGLES]) if law.joint == 4)
+    whole = next(law for law in laws_of_kinds(linear, [TWO_ANGLES]) if law.joint == 4)
     assert len(factors) == 5 and np.exp(whole.log_bayes_factor) == pytest.approx(np.mean(factors))
     apart = 2 * np.sin(0.5 * np.abs(q[0] - q[5]))
     process = smooth.of_joint(3)[0]
-    alike = smooth.alike_of(process)[0, 5]
+    alike = smooth.kernel_of(process)[0, 5]
     assert alike == pytest.approx(np.exp(-0.5 * (apart[3] ** 2 + apart[smooth.others[process]] ** 2)))
 
 
@@ -117,7 +117,7 @@ def test_the_teeth_of_a_belt_are_told_as_waves_with_their_period(cell):
     tooth = np.radians(20.0)
     off = np.zeros_like(q)
     off[:, 4] = 6e-4 * (np.mod(q[:, 4] / tooth, 1.0) - 0.5)
-    laws = joint_laws(with_joints_off(cell, off).arm_right)
+    laws = joint_laws(with_joints_off(cell, off).without_arm)
     law = laws[0]
     assert (law.joint, law.follows) == (5, WAVES)
     # Half a wave more or less over the range looks alike.
@@ -133,15 +133,17 @@ def test_the_course_in_time_of_a_joint_that_warms_is_the_true_one_within_its_sig
     steps = np.arange(14.0)
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 8e-4 * (1 - np.exp(-steps / 4.0))
-    (law,) = clear_laws(with_joints_off(cell, off))
-    assert (law.joint, law.follows) == (5, TIME_ALONE)
+    (law,) = significant_laws(with_joints_off(cell, off))
+    assert (law.joint, law.follows) == (5, TIME_ONLY)
     (course,) = joint_curves([law])
     assert course.covariate == "time_s"
-    at = (course.at - course.at.min()) / usual_step(law.model.measurement)
+    at = (course.at - course.at.min()) / usual_time_step(law.model.measurement)
     true = 8e-4 * (1 - np.exp(-at / 4.0)) - off[:, 4].mean()
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)
     assert np.corrcoef(course.error, true)[0, 1] > 0.9
-    assert re.fullmatch(r"Joint 5 is off by -\S+ ± \S+ mrad 0 s into the session, and by .*", curve_text(course))
+    assert re.fullmatch(
+        r"Joint 5 is off by -\S+ ± \S+ mrad 0 s into the session, and by .*", joint_curve_sentence(course)
+    )
 
 
 def test_a_joint_that_swings_in_time_does_so_at_every_pose_and_its_share_is_no_scatter(cell):
@@ -149,7 +151,7 @@ def test_a_joint_that_swings_in_time_does_so_at_every_pose_and_its_share_is_no_s
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 5e-4 * np.sin(0.7 * np.arange(14.0))
     linear = with_joints_off(cell, off)
-    law = next(law for law in joint_laws(linear) if law.follows == TIME_ALONE)
+    law = next(law for law in joint_laws(linear) if law.follows == TIME_ONLY)
     (course,) = joint_curves([law])
     assert law.joint == 5 and course.covariate == "time_s" and course.share > 0.9
     assert np.ptp(course.error) == pytest.approx(np.ptp(off[:, 4]), rel=0.2)
@@ -165,10 +167,10 @@ def test_what_a_joint_may_follow_as_well_is_said(cell):
     off[:, 4] = 5e-4 * np.sin(0.5 * np.arange(14.0))
     linear = with_joints_off(cell, off)
     factors = {law.follows: law.log_bayes_factor for law in joint_laws(linear) if law.joint == 5}
-    (law,) = clear_laws(linear)
+    (law,) = significant_laws(linear)
     assert (factors[WITH_TIME] > max(factors.values()) - ODDS) and law.may_follow == ("the joint angles", "time")
     found = SimpleNamespace(curves=joint_curves([law]), time_curve=None)
-    assert "These views do not tell whether joint 5 follows the joint angles or time." in course_texts(found, "mm")
+    assert "These views do not tell whether joint 5 follows the joint angles or time." in curve_sentences(found, "mm")
 
 
 def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_its_sigma(cell):
@@ -177,10 +179,10 @@ def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_
     yields = Polynomial.fit(load, (load / np.abs(load).max()) ** 3, 5)
     off = np.zeros_like(plan.joints)
     off[:, 1] = 1e-3 * yields(load)
-    laws = joint_laws(with_joints_off(cell, off).arm_right)
-    (course,) = joint_curves([next(law for law in laws if law.joint == 2 and law.follows == ITS_LOAD)])
+    laws = joint_laws(with_joints_off(cell, off).without_arm)
+    (course,) = joint_curves([next(law for law in laws if law.joint == 2 and law.follows == JOINT_LOAD)])
     assert course.covariate == "j2_torque_nm"
     true = 1e-3 * yields(course.at) - off[:, 1].mean()
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)
     assert np.corrcoef(course.error, true)[0, 1] > 0.9
-    assert re.search(r" under -?\d+ N m, and by .* under -?\d+ N m, beside", curve_text(course))
+    assert re.search(r" under -?\d+ N m, and by .* under -?\d+ N m, beside", joint_curve_sentence(course))

@@ -17,7 +17,7 @@ USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, s
 def ranked(name, beside=None, adjusted=1e-6):
     of = SimpleNamespace(name=name, empirical=False)
     seen = {"observable": True, "values": (), "form": SimpleNamespace(free=()), "log_bayes_factor": 12.0}
-    score = SimpleNamespace(name=name, beside=beside, candidate=of, **seen)
+    score = SimpleNamespace(name=name, base_model=beside, candidate=of, **seen)
     return Ranked(score, adjusted, log_posterior=9.0, posterior=0.9)
 
 
@@ -41,7 +41,7 @@ def upheld(monkeypatch, selection, *, together, refused):
 
     monkeypatch.setattr(conclusion, "_together", lambda *asked: together)
     monkeypatch.setattr(conclusion, "scanner_first", scanner_first)
-    return conclusion.upheld(None, (), selection, conclusion.on_views_left_out(None, selection))
+    return conclusion.check_verdict(None, (), selection, conclusion.cross_validate_named(None, selection))
 
 
 def test_what_looks_like_an_error_of_the_scanner_may_be_a_second_effect(monkeypatch):

@@ -37,7 +37,7 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     free = columns - A @ np.linalg.lstsq(A, columns, rcond=None)[0]
     plausible = MixedModel(np.zeros((1, n)), A[None], components[:, None])
     unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
-    degrees_of_freedom = satterthwaite(plausible, unit).of(free[None])
+    degrees_of_freedom = satterthwaite(plausible, unit).degrees_of_freedom(free[None])
     least = least_noncentrality(free * 2.0, 1.0, tests, degrees_of_freedom)
     theta = np.ones(p) * np.sqrt(least) / np.linalg.norm(free.sum(axis=1))
     shown = 0

@@ -49,7 +49,7 @@ def test_a_scanner_of_bad_axes_or_focus_gets_no_name(measured, seen):
 
 def test_a_good_scanner_is_not_accused(measured):
     found = said_of(measured)
-    assert not found.of_field and not found.within
+    assert not found.follows_field and not found.overlap_misfit
 
 
 def test_a_seam_in_the_field_is_not_adequate(measured):
@@ -60,7 +60,7 @@ def test_a_seam_in_the_field_is_not_adequate(measured):
         return points + 0.3 * np.sign(points[:, :1]) * ray
 
     found = said_of(measured, seen)
-    assert found.verdict == "unknown_effect" and 0.06 < found.within < 0.6
+    assert found.verdict == "unknown_effect" and 0.06 < found.overlap_misfit < 0.6
     assert "remain however each view is moved" in found.sentence
 
 

@@ -5,10 +5,10 @@ import numpy as np
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.diagnosis.selection.exchange import likelier_beyond
-from stitch.diagnosis.selection.ranking import certain, ranked_one
-from stitch.diagnosis.selection.verdict import _notes
-from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate, unseen_beyond
+from stitch.diagnosis.selection.exchange import find_exchange
+from stitch.diagnosis.selection.ranking import is_certain, rank_one
+from stitch.diagnosis.selection.verdict import _rejection_notes
+from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate, untested_ends_reason
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -18,8 +18,8 @@ from stitch.statistics.folds import JointEnd
 def stands(session, name):
     """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
     linear = linear_model_of(state_of(run(session)))
-    own = ranked_one(linear, candidate_of(linear, EFFECTS[name]), tests=1)
-    return certain(own), extrapolate(linear, own.score)
+    own = rank_one(linear, candidate_of(linear, EFFECTS[name]), tests=1)
+    return is_certain(own), extrapolate(linear, own.score)
 
 
 def test_a_gear_error_of_a_joint_that_was_driven_everywhere_helps_at_left_out_ends_too():
@@ -56,9 +56,9 @@ def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
     end = JointEnd(1, upper=True, views=np.arange(3))
     for share, unseen in ((0.95, False), (0.985, True), (1.0, True), (1.015, True), (1.5, False)):
         assert Extrapolation(share, 0.1, end, 1.2, 0.1, 0.5).unseen == unseen
-    told = unseen_beyond(["backlash", "mount_warmup", "settling"])
+    told = untested_ends_reason(["backlash", "mount_warmup", "settling"])
     assert told.startswith("backlash, mount_warmup and settling would help") and "less than 2% together" in told
-    assert _notes({"backlash": told, "settling": told, "mount_drift": "mount_drift does not"}) == (
+    assert _rejection_notes({"backlash": told, "settling": told, "mount_drift": "mount_drift does not"}) == (
         told,
         "mount_drift does not",
     )
@@ -68,8 +68,8 @@ def exchanged(session, name, rivals):
     """What takes the place of an effect that was found alone, if anything."""
     linear = linear_model_of(state_of(run(session)))
     every = {n: candidate_of(linear, EFFECTS[n]) for n in (name, *rivals)}
-    own = ranked_one(linear, every[name], tests=1)
-    return likelier_beyond(linear, list(every.values()), [own], {name: extrapolate(linear, own.score)})
+    own = rank_one(linear, every[name], tests=1)
+    return find_exchange(linear, list(every.values()), [own], {name: extrapolate(linear, own.score)})
 
 
 def test_an_imitation_gives_way_to_what_is_likelier_to_hold_beyond():
@@ -80,7 +80,7 @@ def test_an_imitation_gives_way_to_what_is_likelier_to_hold_beyond():
         imitation, found = stands(session, "gear_eccentricity")[1], exchanged(session, "gear_eccentricity", rivals)
         assert (found is not None) == imitation.errs_somewhere
         seen += found is not None
-        assert found is None or (found.name, found.instead.name) == ("gear_eccentricity", "joint_offset")
+        assert found is None or (found.name, found.replacement.name) == ("gear_eccentricity", "joint_offset")
     assert seen
 
 

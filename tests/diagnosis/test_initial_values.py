@@ -20,4 +20,4 @@ def test_a_slip_that_the_run_is_told_of_is_found_where_it_was():
     found = run(session_of(measured), effects=["part_slip"])
     (term,) = found.terms
     (place,) = (p for p in term.parameters if p.name == "v")
-    assert place.value == true and str(place.told) == session_of(measured).names[int(true)]
+    assert place.value == true and str(place.formatted) == session_of(measured).names[int(true)]

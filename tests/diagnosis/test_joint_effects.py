@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
-from stitch.diagnosis.selection.backward_elimination import eliminated_effect
+from stitch.diagnosis.selection.backward_elimination import find_effect_to_drop
 from stitch.pipeline import diagnose, run
 from stitch.revision import add
 from stitch.runs.state import state_of
@@ -37,9 +37,9 @@ def test_offsets_and_gravity_together_are_found_by_their_names(few_effects):
 def test_an_effect_that_another_made_idle_is_dropped():
     session, *_ = labelled_cell(12, views=100, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), targets=TARGETS[:2])
     state = state_of(run(session, effects=["gear_eccentricity", "joint_offset"]))
-    name, reason = eliminated_effect(state, {"gear_eccentricity", "joint_offset"})
+    name, reason = find_effect_to_drop(state, {"gear_eccentricity", "joint_offset"})
     assert name == "gear_eccentricity", reason
-    assert eliminated_effect(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
+    assert find_effect_to_drop(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
 
 
 def test_an_honest_cell_is_adequate():

@@ -12,15 +12,15 @@ from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unknown.clear_joints import clear_laws
+from stitch.diagnosis.unknown.clear_joints import significant_laws
 from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_by
-from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_of_kinds
+from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
 from stitch.effects.contract import EFFECTS
-from stitch.observations.joint_processes import ALL_ANGLES, ITS_LOAD, OWN_ANGLE, WITH_TIME
+from stitch.observations.joint_processes import ALL_ANGLES, JOINT_LOAD, OWN_ANGLE, WITH_TIME
 from stitch.statistics.variance_prior import MAY_BE_ABSENT, NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -49,7 +49,7 @@ def said_of(cell, T_base_flange):
     """Verdict and linear model where the flange truly is there."""
     linear = cell.seen(T_base_flange)
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
-    return concluded(linear, candidates, ScatterLimit(*IMPLAUSIBLE)), linear
+    return decide(linear, candidates, ScatterLimit(*IMPLAUSIBLE)), linear
 
 
 def test_an_offset_of_one_joint_is_named(cell):
@@ -80,7 +80,7 @@ def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law
     assert np.flatnonzero(np.abs(off).sum(axis=0)) + 1 == joint
     found, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
     assert found.verdict == "unknown_effect" and not found.named
-    assert unnamed_errors(linear)[0].words == f"follow the joints, joint {joint} above all"
+    assert find_repeating_errors(linear)[0].words == f"follow the joints, joint {joint} above all"
 
 
 def test_friction_is_neither_play_nor_settling(cell):
@@ -115,10 +115,10 @@ def test_only_joints_that_are_bent_have_a_law_of_their_load(cell):
     torque = cell.measurement.views.torques.values
     assert np.ptp(torque[:, [0, 5]], axis=0).max() < 1e-9 and np.ptp(torque[:, 1:5], axis=0).min() > 1
     _, linear = said_of(cell, cell.measured.T_base_flange)
-    law = linear.pose_errors.of_one_joint[ITS_LOAD]
+    law = linear.pose_errors.joint_processes[JOINT_LOAD]
     assert law.joints == (1, 2, 3, 4)
     for process in range(4):
-        np.testing.assert_allclose(np.diag(law.alike_of(process)), 1)
+        np.testing.assert_allclose(np.diag(law.kernel_of(process)), 1)
 
 
 def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(cell):
@@ -127,7 +127,7 @@ def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(ce
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
     _, linear = said_of(cell, kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
     base = linear.without(["joint_offset"])
-    found = {kind: laws_by(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, ITS_LOAD)}
+    found = {kind: laws_of_kinds(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
     best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
     assert best[WITH_TIME] > max(own for kind, own in best.items() if kind != WITH_TIME)
 
@@ -139,14 +139,14 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
     law, errors = joint_laws(linear)[0], linear.pose_errors
     free = null_space(linear.mixed.A[0].T).T
-    R, usual = free @ linear.observation.channel.reduction, errors.scales[errors.names.index("smooth")]
+    R, usual = free @ linear.observation.reduced_poses.reduction, errors.scales[errors.names.index("smooth")]
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
-    own = R @ law.errors.of(law.process) @ R.T
+    own = R @ law.errors.twist_covariance(law.process) @ R.T
     with_it = replace(
         errors.prior,
         scales=np.append(errors.scales, usual),
         shapes=np.append(errors.prior.shapes, MAY_BE_ABSENT),
-        kin=np.append(errors.of_arm, True),
+        common_factor=np.append(errors.arm_components, True),
     )
 
     def likely(variances, components, further):
@@ -172,7 +172,7 @@ def test_joints_that_scatter_are_scatter(cell):
     for _ in range(8):
         off = 3e-5 * rng.standard_normal(q.shape)
         found, linear = said_of(cell, kinematics.flange(arm, q + off))
-        assert found.verdict == "adequate" and not clear_laws(linear)
+        assert found.verdict == "adequate" and not significant_laws(linear)
         shown = frames.log(frames.inverse(kinematics.flange(arm, q)) @ kinematics.flange(arm, q + off))
         sizes.append(np.sqrt(linear.flange_scatter(linear.null)) / shown.reshape(-1, 2, 3).std(axis=(0, 2)))
     # Beside them the flange scatters for itself: what is shown is more, not less.
@@ -191,7 +191,7 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
     off = np.zeros_like(q)
     off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
-    course = joint_curves(clear_laws(linear))[0]
+    course = joint_curves(significant_laws(linear))[0]
     true = 4e-4 * np.sin(2 * np.radians(course.at)) - off[:, 2].mean()
     assert (course.joint, course.covariate) == (3, "j4_deg") and course.share > 0.9
     assert np.all(np.abs(course.error - true) < 3 * course.sigma)
@@ -208,7 +208,7 @@ def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])
     _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
-    (course,) = joint_curves(clear_laws(linear))
+    (course,) = joint_curves(significant_laws(linear))
     true = 4e-4 * np.sin(7 * np.radians(course.at)) - off[:, 4].mean()
     assert (course.joint, course.covariate) == (5, "j5_deg")
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)

@@ -9,7 +9,7 @@ from data_synth.fixtures.labelled_arm import Growth, labelled_cell
 from stitch.diagnosis.design import next_view
 from stitch.diagnosis.design.candidate_views import candidate_measurement
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 
 
@@ -18,7 +18,7 @@ def test_views_not_taken_yet_come_after_those_that_were():
     session, *_ = labelled_cell(2, views=9, grown=Growth(0.0, 0.0))
     speeds = {f"j{i + 1}_velocity_deg_s": 5.0 for i in range(6)}
     session = replace(session, views=tuple(replace(v, covariates=v.covariates | speeds) for v in session.views))
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     later = candidate_measurement(measurement, measurement.views.joints[:3] + 0.1).views
     warmth = [v.covariates["part_temperature_c"] for v in session.views]
     np.testing.assert_allclose(later.since_first("part_temperature_c"), warmth[-1] - warmth[0])

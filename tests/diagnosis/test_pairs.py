@@ -6,9 +6,9 @@ import pytest
 from data_synth import kinematics
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.selection.pairs import both_missing
-from stitch.diagnosis.selection.ranking import certain, ranked_all
-from stitch.diagnosis.selection.upheld import hold_together
+from stitch.diagnosis.selection.pairs import find_missing_pair
+from stitch.diagnosis.selection.ranking import is_certain, rank_all
+from stitch.diagnosis.selection.upheld import pair_is_validated
 from stitch.effects.contract import EFFECTS
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -29,16 +29,16 @@ def best_of(cell, play, drift):
     drifts = frames.exp(np.arange(views.count)[:, None] * drift * np.array([0, 0, 0, 0, 1.0, 0]))
     linear = cell.seen(drifts @ kinematics.flange(measured.plan.arm, measured.plan.joints + off))
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
-    best = ranked_all(linear, candidates)[0][0]
-    assert certain(best)
+    best = rank_all(linear, candidates)[0][0]
+    assert is_certain(best)
     return linear, candidates, best
 
 
 def test_two_effects_are_found_beside_each_other_and_hold(cell):
     linear, candidates, best = best_of(cell, play=4e-4, drift=0.03)
-    pair = both_missing(linear, candidates, best)
+    pair = find_missing_pair(linear, candidates, best)
     assert pair is not None and {r.name for r in pair} == {"backlash", "mount_drift"}
-    assert hold_together(linear, pair)
+    assert pair_is_validated(linear, pair)
     score = next(r.score for r in pair if r.name == "backlash")
     found = dict(zip((p.name for p in score.form.free), score.values, strict=True))
     # q* = q − b·approach
@@ -47,4 +47,4 @@ def test_two_effects_are_found_beside_each_other_and_hold(cell):
 
 @pytest.mark.parametrize(("play", "drift"), [(6e-4, 0.0), (0.0, 0.05)])
 def test_beside_one_effect_there_is_no_other(cell, play, drift):
-    assert both_missing(*best_of(cell, play=play, drift=drift)) is None
+    assert find_missing_pair(*best_of(cell, play=play, drift=drift)) is None

@@ -20,7 +20,7 @@ def named(gain: float) -> Selection:
 
 def held(monkeypatch: pytest.MonkeyPatch, selection: Selection, shown: FieldError | None) -> Selection:
     monkeypatch.setattr(scanner_first, "scanner_error", lambda linear, beside=(): shown)
-    return scanner_first.scanner_first(None, selection)[0]
+    return scanner_first.check_scanner_errors(None, selection)[0]
 
 
 def error(gain: float, over_noise: bool = True) -> FieldError:

@@ -8,7 +8,7 @@ import pytest
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.sentences import odds_text, sentence_of
+from stitch.diagnosis.sentences import diagnosis_sentence, odds_text
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
@@ -27,9 +27,9 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "smooth": None,
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
-    told = sentence_of(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
+    told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
     assert "20 µm and 0.02 mrad" in told and told.endswith("; a note.")
-    silent = sentence_of(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
+    silent = diagnosis_sentence(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
     assert "13.2 µm" in silent and "mrad" not in silent and "repeatability" not in silent
     assert silent.endswith("; a note.")
 
@@ -49,10 +49,10 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
         noise_floor=0.0110,
         rotation=0.0,
         translation=0.0,
-        over_nothing=np.log(odds),
+        log_odds_over_nothing=np.log(odds),
     )
     found.certain = Diagnosis.certain.fget(found)
-    return sentence_of(found, "mm", None)
+    return diagnosis_sentence(found, "mm", None)
 
 
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
@@ -80,10 +80,10 @@ def test_so_may_a_group(odds, said):
 
 def test_of_a_group_one_is_enough():
     """Odds add up: two at 10 to 1 each are 20 to 1 that one is there."""
-    each = SimpleNamespace(over_nothing=np.log(10.0))
+    each = SimpleNamespace(log_odds_over_nothing=np.log(10.0))
     group = Selection("cannot_tell", (each, each), (), ())
-    assert group.over_nothing == pytest.approx(np.log(20.0))
-    assert Selection("adequate", (), (), ()).over_nothing == np.inf
+    assert group.log_odds_over_nothing == pytest.approx(np.log(20.0))
+    assert Selection("adequate", (), (), ()).log_odds_over_nothing == np.inf
 
 
 def test_odds_are_told_as_far_as_anybody_can_vouch_for_them():

@@ -2,7 +2,11 @@
 
 import pytest
 
-from stitch.diagnosis.smooth_sentences import beside_adequate, beside_poses, smooth_errors
+from stitch.diagnosis.smooth_sentences import (
+    scanner_clause_before_poses,
+    scanner_clause_if_adequate,
+    scanner_error_sentence,
+)
 from stitch.observations.surfaces.field_error import FieldError
 
 SAME = FieldError(0.02, 0.0, 9.0, over_noise=False)
@@ -10,7 +14,7 @@ BOTH = FieldError(0.02, 0.01, 9.0, over_noise=True, with_time=True)
 OWN = FieldError(0.0, 0.03, 9.0, over_noise=True, by_view=True)
 
 
-@pytest.mark.parametrize("said", [beside_adequate, beside_poses, smooth_errors])
+@pytest.mark.parametrize("said", [scanner_clause_if_adequate, scanner_clause_before_poses, scanner_error_sentence])
 def test_the_clearer_kind_is_said_with_its_size(said):
     assert "20 µm" in said(SAME, "mm") and "the same in every view" in said(SAME, "mm")
     assert "by itself" not in said(SAME, "mm")
@@ -20,6 +24,6 @@ def test_the_clearer_kind_is_said_with_its_size(said):
 
 
 def test_nothing_is_said_of_usual_scans():
-    assert beside_adequate(None, "mm") == beside_poses(None, "mm") == ""
+    assert scanner_clause_if_adequate(None, "mm") == scanner_clause_before_poses(None, "mm") == ""
     # Named by the views' poses alone: without a size.
-    assert "rms" not in smooth_errors(None, "mm")
+    assert "rms" not in scanner_error_sentence(None, "mm")

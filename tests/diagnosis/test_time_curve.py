@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from stitch.diagnosis.course_sentences import time_curve_text
+from stitch.diagnosis.course_sentences import time_curve_sentence
 from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
-from stitch.diagnosis.unknown.time_laws import clear_time_law
+from stitch.diagnosis.unknown.time_laws import significant_time_law
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18
@@ -24,7 +24,7 @@ def shown(cell, course, direction):
     err, (·, 6)."""
     errors = course[:, None] * direction
     linear = cell.seen(cell.measured.T_base_flange @ frames.exp(errors))
-    law = clear_time_law(linear)
+    law = significant_time_law(linear)
     assert law is not None
     curve = time_curve(law)
     at_views = slice(None, None, (len(curve.steps) - 1) // (VIEWS - 1))
@@ -43,7 +43,7 @@ def test_a_swing_is_drawn_as_it_was(cell, period):
     curve, off = shown(cell, np.sin(2 * np.pi * in_steps(cell) / period + 1.0), DIRECTION)
     assert np.sqrt(np.mean(off**2)) < 2.0
     for of in (slice(3), slice(3, 6)):
-        _, most, sigma = curve.most(of)
+        _, most, sigma = curve.largest(of)
         assert abs(most - np.linalg.norm(DIRECTION[of])) < 4 * sigma
 
 
@@ -51,13 +51,15 @@ def test_a_stretch_is_drawn_where_it_was(cell):
     time = in_steps(cell)
     curve, off = shown(cell, np.exp(-0.5 * ((time - time[9]) / 1.5) ** 2), 2 * DIRECTION)
     assert np.sqrt(np.mean(off**2)) < 2.0
-    assert curve.steps[curve.most(slice(3, 6))[0]] == pytest.approx(time[9], abs=1.0)
+    assert curve.steps[curve.largest(slice(3, 6))[0]] == pytest.approx(time[9], abs=1.0)
 
 
 def test_it_reads_with_its_sizes_and_places():
     error, sigma = np.zeros((3, 6)), np.full((3, 6), 1e-5)
     error[1, :3], error[2, 3:], sigma[:, 3:] = (0, 3e-4, 4e-4), (0.06, -0.08, 0), 0.01
     curve = TimeCurve(np.array([2.0, 4.0, 6.0]), 90.0, error, sigma)
-    assert "0.1 ± 0.01 mm 6 min into the session and turned by 0.5 ± 0.01 mrad 3 min" in time_curve_text(curve, "mm")
+    assert "0.1 ± 0.01 mm 6 min into the session and turned by 0.5 ± 0.01 mrad 3 min" in time_curve_sentence(
+        curve, "mm"
+    )
     by_number = TimeCurve(curve.steps, 0.0, error, sigma)
-    assert "mm at view 4 and turned by 0.5 ± 0.01 mrad at view 2" in time_curve_text(by_number, "mm")
+    assert "mm at view 4 and turned by 0.5 ± 0.01 mrad at view 2" in time_curve_sentence(by_number, "mm")

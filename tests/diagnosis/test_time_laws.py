@@ -11,14 +11,14 @@ from scipy.stats import multivariate_normal
 from data_synth.ordinary_arm import with_memory
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unknown.time_laws import clear_time_law, likeliest_time_law
+from stitch.diagnosis.unknown.time_laws import likeliest_time_law, significant_time_law
 from stitch.diagnosis.unknown.time_processes import time_processes
-from stitch.diagnosis.unknown.unnamed_errors import unnamed_errors
+from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
 from stitch.effects.contract import EFFECTS
-from stitch.observations.flange_errors import WANDERING
+from stitch.observations.flange_errors import DRIFT_MEMORY
 from stitch.statistics.variance_prior import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -42,7 +42,7 @@ def linear_of(cell, errors):
 
 def verdict_of(linear):
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
-    return concluded(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
+    return decide(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
 
 
 @pytest.mark.parametrize("period", [4.0, 5.5, 8.0])
@@ -51,7 +51,7 @@ def test_a_flange_that_swings_is_said_to_with_its_period(cell, period):
     linear = linear_of(cell, swing[:, None] * DIRECTION)
     found = verdict_of(linear)
     assert found.verdict == "unknown_effect" and not found.named
-    words = unnamed_errors(linear)[0].words
+    words = find_repeating_errors(linear)[0].words
     assert words.startswith("swing to and fro about every ")
     said = float(words.split()[6])
     # Two frequencies that fit half a swing more or less into the session are next to each other.
@@ -63,7 +63,7 @@ def test_a_stretch_of_views_that_stands_off_is_said_to(cell):
     linear = linear_of(cell, 2 * stretch[:, None] * DIRECTION)
     found = verdict_of(linear)
     assert found.verdict == "unknown_effect" and not found.named
-    words = unnamed_errors(linear)[0].words
+    words = find_repeating_errors(linear)[0].words
     assert words.startswith("are off for a stretch of 3.5 views") and words.endswith(("v009", "v010", "v011"))
 
 
@@ -72,22 +72,22 @@ def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
     stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 3.5) ** 2)
     linear = linear_of(cell, 1.6 * stretch[:, None] * DIRECTION)
     assert likeliest_time_law(linear).log_bayes_factor < ODDS
-    law = clear_time_law(linear)
+    law = significant_time_law(linear)
     assert law.course.words.startswith("are off for a stretch")
-    assert not set(WANDERING) & set(law.base.pose_errors.names)
+    assert not set(DRIFT_MEMORY) & set(law.base.pose_errors.names)
     found = verdict_of(linear)
-    assert found.verdict == "unknown_effect" and unnamed_errors(linear)[0].curve is not None
+    assert found.verdict == "unknown_effect" and find_repeating_errors(linear)[0].curve is not None
 
 
 def test_no_course_is_told_where_poses_wander(cell):
     for seed in range(4):
         wander = with_memory(VIEWS, 0.9, np.random.default_rng(seed)) * np.repeat([4e-5, 0.04], 3)
-        assert clear_time_law(linear_of(cell, wander)) is None
+        assert significant_time_law(linear_of(cell, wander)) is None
 
 
 def test_scatter_follows_no_course_of_time(cell):
     linear = linear_of(cell, np.zeros((VIEWS, 6)))
-    assert clear_time_law(linear) is None and verdict_of(linear).verdict == "adequate"
+    assert significant_time_law(linear) is None and verdict_of(linear).verdict == "adequate"
 
 
 def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):

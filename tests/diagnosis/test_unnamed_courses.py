@@ -8,7 +8,7 @@ from data_synth.fixtures.labelled_arm import TARGETS, flange, joints_of, labelle
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
-from stitch.diagnosis.unknown.unnamed_courses import least_wanted, unnamed_courses
+from stitch.diagnosis.unknown.unnamed_courses import least_log_bayes_factor, unnamed_courses
 from stitch.pipeline import diagnose, run
 
 VIEWS, SEED = 120, 31
@@ -34,10 +34,10 @@ def test_what_no_library_has_gets_no_name(which):
     found = diagnose(run(session))
     assert found.verdict == "unknown_effect", found.sentence
     if which == "memory":
-        assert [u.words for u in found.unnamed] == ["wander in time"]
+        assert [u.words for u in found.repeating_errors] == ["wander in time"]
     else:
         joint = 1 + int(np.abs(errors[0]).sum(axis=0).argmax())
-        assert [u.words for u in found.unnamed] == [f"follow the joints, joint {joint} above all"]
+        assert [u.words for u in found.repeating_errors] == [f"follow the joints, joint {joint} above all"]
 
 
 def test_joints_that_scatter_do_not_repeat():
@@ -57,7 +57,7 @@ def test_beside_a_law_scatter_is_what_the_arm_scatters():
     """20 µm are drawn, and the law does not take them for itself; of what it turns most is no scatter any more."""
     session, *_ = labelled_cell(SEED, views=VIEWS, errors=(law("coupling"), np.zeros((VIEWS, 6))))
     found = diagnose(run(session))
-    assert found.unnamed and found.translation == pytest.approx(0.02, rel=0.25), found.sentence
+    assert found.repeating_errors and found.translation == pytest.approx(0.02, rel=0.25), found.sentence
     assert found.rotation**2 < 0.5 * found.linear.null.variances[0]
 
 
@@ -69,10 +69,10 @@ def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle()
     found = diagnose(run(session))
     assert found.effects == ("joint_offset",), found.sentence
     scored = found.candidates[0].ranked.score
-    assert found.candidates[0].name == "joint_offset" and least_wanted(found.linear, scored) > 20
+    assert found.candidates[0].name == "joint_offset" and least_log_bayes_factor(found.linear, scored) > 20
     beside = found.linear.conditioned_on(scored.form.columns, scored.sizes)
     idle = next(c.ranked.score for c in found.candidates if c.name == "gear_harmonic")
-    assert least_wanted(beside, idle) < 3
+    assert least_log_bayes_factor(beside, idle) < 3
     # The law that is there is seen: a process explains it, with less scatter than the views seemed to have.
     likeliest = unnamed_courses(beside)[0]
     assert 0.5 * (beside.null.deviance - likeliest.fit.deviance) > 20

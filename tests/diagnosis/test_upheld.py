@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.upheld import validated
+from stitch.diagnosis.selection.upheld import validate_named
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 
@@ -17,7 +17,7 @@ ON_ONE_VIEW = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.
 def told(found: CrossValidation) -> tuple[str, tuple[str, ...]]:
     named = Ranked(SimpleNamespace(name="backlash"), adjusted=1e-3, log_posterior=5.0, posterior=0.99)
     selection = Selection("missing_effect", (named,), (named,), ())
-    upheld = validated(selection, {"backlash": found}, {"backlash": None})
+    upheld = validate_named(selection, {"backlash": found}, {"backlash": None})
     return upheld.verdict, upheld.notes
 
 

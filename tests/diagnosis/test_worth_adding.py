@@ -6,7 +6,7 @@ import pytest
 
 from stitch.diagnosis.selection import forward_selection
 from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.thresholds import WORTH
+from stitch.diagnosis.thresholds import MAX_REMAINING_SHARE
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 
 
@@ -45,7 +45,7 @@ def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, i
     monkeypatch.setattr(forward_selection, "cross_validate", cross_validated)
     monkeypatch.setattr(forward_selection, "ranked_one", again)
     monkeypatch.setattr(forward_selection, "certain", lambda r: True)
-    kept, why = forward_selection.worth_adding(None, [ranked(name) for name in left], 20)
+    kept, why = forward_selection.keep_worth_adding(None, [ranked(name) for name in left], 20)
     assert [r.name for r in kept] == named and list(why) == idle
     assert asked[0] == ("part_sag", [name for name in left if name != "part_sag"])  # beside all that are missing
     assert all("hardly helps on views left out" in text for text in why.values())
@@ -54,5 +54,8 @@ def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, i
 
 
 def test_a_hundredth_of_the_distances_is_worth_it_and_chance_is_not():
-    assert leaving(WORTH - 1e-6).idle("x") is None and leaving(WORTH + 1e-6).idle("x") is not None
-    assert leaving(0.9, sigma=0.2).idle("x") is not None
+    assert (
+        leaving(MAX_REMAINING_SHARE - 1e-6).rejection_reason("x") is None
+        and leaving(MAX_REMAINING_SHARE + 1e-6).rejection_reason("x") is not None
+    )
+    assert leaving(0.9, sigma=0.2).rejection_reason("x") is not None

@@ -8,9 +8,9 @@ from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.effects import EFFECTS
 from stitch.effects.in_session import parameters_in
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.model.forward import corrected, perturbed_frames
+from stitch.model.forward import corrected_capture, perturbed_frames
 from stitch.model.model import Model
 from stitch.model.term import term_of
 
@@ -20,7 +20,7 @@ _LEFT = 0.03
 
 def chain_for(measured):
     session = session_of(measured)
-    return measurement_of(session, capture(session))
+    return measurement_of(session, prepare_capture(session))
 
 
 def hidden(name, mount):
@@ -62,7 +62,7 @@ def test_undoing_a_scanner_effect_gives_the_true_points(name):
     measurement = chain_for(bent)
     effect = EFFECTS[name]
     values = np.array([bent.hidden[name][p.name] for p in parameters_in(measurement, effect)])
-    mended = corrected(measurement, Model(bent.T_mount, (term_of(measurement, effect).at(values),)))
+    mended = corrected_capture(measurement, Model(bent.T_mount, (term_of(measurement, effect).at(values),)))
     for scan, true, wrong in zip(mended.scans, plain.clouds, bent.clouds, strict=True):
         before = np.abs(wrong.points - true.points).max()
         assert np.abs(scan.points - true.points).max() <= _LEFT * before + 1e-9

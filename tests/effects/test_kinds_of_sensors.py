@@ -7,9 +7,9 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import lacking, require
+from stitch.effects.in_session import missing_need, require_available
 from stitch.errors import InputError
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 
 SENSOR = {name for name, e in EFFECTS.items() if e.place == "sensor" and e.tier == "physical"}
@@ -29,23 +29,23 @@ SENSOR = {name for name, e in EFFECTS.items() if e.place == "sensor" and e.tier 
 def test_a_tracker_has_no_lens_and_a_camera_sees_no_slant(kind, never):
     session, *_ = labelled_cell(2, views=4)
     session = replace(session, scanner=replace(session.scanner, kind=kind))
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     words = {"optics", "surfaces"}
-    assert {name for name in SENSOR if words & set(lacking(measurement, EFFECTS[name]))} == never
+    assert {name for name in SENSOR if words & set(missing_need(measurement, EFFECTS[name]))} == never
     if kind == "tracker":
         with pytest.raises(InputError, match=r"lens_distortion needs a sensor with optics .*\[scanner\]"):
-            require(measurement, EFFECTS["lens_distortion"])
+            require_available(measurement, EFFECTS["lens_distortion"])
 
 
 def test_what_shows_points_beside_and_behind_itself_has_no_lens():
     """If its kind is not stated: a tracker turns to every target, a lens has all of them ahead."""
     session, *_ = labelled_cell(2, views=40)
-    assert measurement_of(session, capture(session)).has_optics
+    assert measurement_of(session, prepare_capture(session)).has_optics
     middle = np.mean([view.sighting.points.mean(axis=0) for view in session.views], axis=0)
     around = [
         replace(view, sighting=replace(view.sighting, points=view.sighting.points - middle)) for view in session.views
     ]
     session = replace(session, views=tuple(around))
-    assert not measurement_of(session, capture(session)).has_optics
+    assert not measurement_of(session, prepare_capture(session)).has_optics
     session = replace(session, scanner=replace(session.scanner, kind="camera"))
-    assert measurement_of(session, capture(session)).has_optics
+    assert measurement_of(session, prepare_capture(session)).has_optics

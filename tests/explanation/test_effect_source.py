@@ -7,11 +7,11 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import lacking
+from stitch.effects.in_session import missing_need
 from stitch.effects.user_file import load
 from stitch.explanation.dictionary import Ingredient, coefficient
 from stitch.explanation.effect_source import effect_source, formula_text
-from stitch.explanation.quantities import quantities
+from stitch.explanation.quantities import view_quantities
 from stitch.measurement.views import no_torques, views_of
 from tests.explanation.test_explain import evidence
 
@@ -34,7 +34,7 @@ def loaded(source, tmp_path):
 
 @pytest.mark.parametrize(("unit", "size"), [("m", SHIFT), ("mm", 1e3 * SHIFT)])
 def test_a_displacement_is_told_in_mm_whatever_the_session_is_in(unit, size, tmp_path):
-    payload = next(q for q in quantities(measured_views()) if q.text == "payload_kg")
+    payload = next(q for q in view_quantities(measured_views()) if q.text == "payload_kg")
     own = [Ingredient("part", axis, payload) for axis in (0, 3)]
     values = [coefficient(i, x, unit) for i, x in zip(own, (3e-4, size), strict=True)]
     text = formula_text(own, values)
@@ -46,7 +46,7 @@ def test_a_displacement_is_told_in_mm_whatever_the_session_is_in(unit, size, tmp
 
 def test_quantities_read_no_more_of_the_views_than_they_say():
     whole, seen = measured_views(), set()
-    for quantity in quantities(whole):
+    for quantity in view_quantities(whole):
         own, has = quantity.needs, set(quantity.needs)
         bare = replace(
             whole,
@@ -64,10 +64,10 @@ def test_quantities_read_no_more_of_the_views_than_they_say():
 
 @pytest.mark.parametrize(("place", "written"), [("part", '("payload_kg",)'), ("robot", '("joints", "payload_kg")')])
 def test_a_file_that_reads_a_column_is_not_asked_where_there_is_none(place, written, tmp_path):
-    found = {q.text: q for q in quantities(measured_views())}
+    found = {q.text: q for q in view_quantities(measured_views())}
     followed = found["payload_kg"] if place == "part" else found["sin q2"].times(found["payload_kg"])
     source = effect_source("explained", [Ingredient(place, 1, followed)], [1e-4], "Found.")
     assert f"needs={written}," in source
     effect = loaded(source, tmp_path)
-    assert lacking(evidence(1, views=8).measurement, effect) == ("payload_kg",)
-    assert not lacking(evidence(1, views=8, payload=np.linspace(1, 4, 8)).measurement, effect)
+    assert missing_need(evidence(1, views=8).measurement, effect) == ("payload_kg",)
+    assert not missing_need(evidence(1, views=8, payload=np.linspace(1, 4, 8)).measurement, effect)

@@ -9,11 +9,11 @@ from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import dictionary
+from stitch.explanation.dictionary import build_dictionary
 from stitch.explanation.explain import explain
-from stitch.explanation.quantities import quantities
-from stitch.explanation.search import search
-from stitch.explanation.shapes import behind
+from stitch.explanation.quantities import view_quantities
+from stitch.explanation.search import search_sums
+from stitch.explanation.shapes import backlash_lag
 from stitch.measurement.views import views_of
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -43,7 +43,7 @@ def test_a_coupling_of_two_joints_is_found_with_its_size():
 def test_all_views_say_which_formula_it_is(seed):
     """Fourteen views: some of them may suggest a relative of the law, which then stood the test, and that is said."""
     linear = evidence(seed, coupling, views=14)
-    told = search(linear, dictionary(linear, quantities(linear.measurement.views)))[0]
+    told = search_sums(linear, build_dictionary(linear, view_quantities(linear.measurement.views)))[0]
     assert told.holds and told.instead_of
     found = explain(linear)
     assert "sin q3·sin 2q2" in found.formula
@@ -57,10 +57,10 @@ def test_all_views_say_which_formula_it_is(seed):
 def test_a_play_that_moved_a_little_is_the_same_and_another_wave_or_joint_is_not():
     session, *_ = labelled_cell(3, views=12)
     views = views_of(session)
-    play = behind(views, 4, 0.30)
-    assert play.nearly(behind(views, 4, 0.31)) and not play.nearly(behind(views, 4, 0.9))
-    assert not play.nearly(behind(views, 3, 0.30))
-    waves = {q.text: q for q in quantities(views)}
+    play = backlash_lag(views, 4, 0.30)
+    assert play.nearly(backlash_lag(views, 4, 0.31)) and not play.nearly(backlash_lag(views, 4, 0.9))
+    assert not play.nearly(backlash_lag(views, 3, 0.30))
+    waves = {q.text: q for q in view_quantities(views)}
     assert waves["sin 7q2"].nearly(waves["sin 7q2"]) and not waves["sin 7q2"].nearly(waves["sin 8q2"])
 
 
@@ -72,7 +72,7 @@ def test_scatter_alone_gets_no_formula(seed):
 def test_codes_of_quantities_give_their_values():
     session, *_ = labelled_cell(3, views=12, payload=np.linspace(1, 4, 12))
     views = views_of(session)
-    for quantity in quantities(views):
+    for quantity in view_quantities(views):
         np.testing.assert_allclose(
             eval(quantity.code, {"np": np, "views": views}),
             quantity.values,
@@ -85,7 +85,7 @@ def test_codes_of_quantities_give_their_values():
 def test_columns_are_what_the_displacement_does():
     """One ingredient put into the joints of the simulated arm moves the targets as its column says."""
     linear = evidence(4, views=20)
-    terms = dictionary(linear, quantities(linear.measurement.views))
+    terms = build_dictionary(linear, view_quantities(linear.measurement.views))
     own = next(i for i in terms.ingredients if i.what == "q*3" and i.quantity.text == "sin q3·sin 2q2")
     column, scale = terms.columns([own])[:, 0], np.abs(own.quantity.values).max()
     rows = linear.observation.rows.residual.ravel()

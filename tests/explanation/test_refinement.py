@@ -7,12 +7,12 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import Ingredient, dictionary
+from stitch.explanation.dictionary import Ingredient, build_dictionary
 from stitch.explanation.explain import explain
-from stitch.explanation.half import Half
-from stitch.explanation.quantities import quantities
+from stitch.explanation.half import HalfModel
+from stitch.explanation.quantities import view_quantities
 from stitch.explanation.quantity import Nonlinear
-from stitch.explanation.refinement import refined, rounded
+from stitch.explanation.refinement import refine_parameters, round_parameters
 from stitch.explanation.shapes import bump_of_joint
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -45,22 +45,22 @@ def test_columns_view_by_view_are_the_columns_of_the_whole(of, labelled):
         linear = blade.seen(blade.measured.T_base_flange)
     else:
         linear = labelled
-    terms = dictionary(linear, quantities(linear.measurement.views))
+    terms = build_dictionary(linear, view_quantities(linear.measurement.views))
     some = terms.ingredients[:: len(terms.ingredients) // 40]
-    half = Half(linear.scatter_only, terms, halves(linear)[0])
-    expected = half.seen(terms.columns(some))
+    half = HalfModel(linear.scatter_only, terms, halves(linear)[0])
+    expected = half.residual_columns(terms.columns(some))
     np.testing.assert_allclose(half.columns(some), expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_bump_is_moved_to_its_place_and_width(labelled):
     """Begun as far off as the places and widths that are tried can be."""
     views = labelled.measurement.views
-    terms = dictionary(labelled, quantities(views))
+    terms = build_dictionary(labelled, view_quantities(views))
     begun = Ingredient("robot", 2, bump_of_joint(views, 2, MIDDLE + 0.07, 0.2))
-    (found,) = refined([begun], Half(labelled.scatter_only, terms, halves(labelled)[0]))
+    (found,) = refine_parameters([begun], HalfModel(labelled.scatter_only, terms, halves(labelled)[0]))
     middle, width = (p.value for p in found.quantity.nonlinear)
     assert middle == pytest.approx(MIDDLE, abs=0.02) and width == pytest.approx(WIDTH, rel=0.15)
-    (told,) = rounded([found])
+    (told,) = round_parameters([found])
     assert [p.value for p in told.quantity.nonlinear] == [float(f"{x:.4g}") for x in (middle, width)]
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import dictionary
+from stitch.explanation.dictionary import build_dictionary
 from stitch.explanation.explain import explain
-from stitch.explanation.quantities import quantities
+from stitch.explanation.quantities import view_quantities
 from stitch.explanation.quantity import Quantity
-from stitch.explanation.shapes import beside_line, saw_of_joint
+from stitch.explanation.shapes import nonlinear_torque, saw_of_joint
 from stitch.measurement.views import views_of
 from stitch.pipeline import run
 from stitch.runs.state import state_of
@@ -43,9 +43,9 @@ def test_a_saw_jumps_where_it_says_and_belongs_to_its_own_joint():
     assert saw_of_joint(views, 1, 0.2, 0.05 + 3 * 0.2).text == saw.text
     slope = np.diff(saw.values) - np.diff(views.joints[:, 1]) / 0.2
     np.testing.assert_allclose(slope, np.round(slope), atol=1e-9)  # whole teeth are jumped over
-    assert {q.joint for q in quantities(views) if q.kind == "teeth"} <= set(range(6))
+    assert {q.joint for q in view_quantities(views) if q.kind == "teeth"} <= set(range(6))
     linear = linear_model_of(state_of(run(labelled_cell(3, views=12)[0])))
-    of_teeth = [i for i in dictionary(linear, quantities(views)).ingredients if i.quantity.kind == "teeth"]
+    of_teeth = [i for i in build_dictionary(linear, view_quantities(views)).ingredients if i.quantity.kind == "teeth"]
     assert of_teeth and all(i.index == i.quantity.joint for i in of_teeth)
 
 
@@ -67,4 +67,4 @@ def test_of_few_torques_or_hardly_different_ones_nothing_is_left_but_rounding(to
 
 
 def cube_of(torque):
-    return beside_line(Quantity("τ", "torque", "N m", "torque", 2, torque), lambda x: x**3, "x³", "x**3")
+    return nonlinear_torque(Quantity("τ", "torque", "N m", "torque", 2, torque), lambda x: x**3, "x³", "x**3")

@@ -23,8 +23,8 @@ from stitch.effects import EFFECTS
 from stitch.errors import InputError, NoResultError
 from stitch.export.arm_model import ArmModel
 from stitch.export.compensated_program import compensated_program
-from stitch.export.compensation import compensated
-from stitch.export.program_copy import moved_texts
+from stitch.export.compensation import compensate_targets
+from stitch.export.program_copy import compensated_texts
 from stitch.measurement.torques import torques_of
 from stitch.model.term import Term
 from stitch.reading.dh_rows import robot_from_dh
@@ -115,7 +115,7 @@ def test_arms_of_six_and_seven_joints_and_stretched_wrists(name):
     p = drawn("gear_eccentricity", own, joints, seed=1, amplitude=3.0)
     parameters = EFFECTS["gear_eccentricity"].parameters(own.joints, (), "mm")
     term = Term(EFFECTS["gear_eccentricity"], parameters).at(np.array([p.get(q.name, 0.0) for q in parameters]))
-    found = compensated(ArmModel("cell", robot, (term,), "mm", joints), joints, np.eye(4))
+    found = compensate_targets(ArmModel("cell", robot, (term,), "mm", joints), joints, np.eye(4))
     meant = kinematics.flange(own, joints)
     before, after = (true_flanges("gear_eccentricity", p, own, q) - meant for q in (joints, found.joints))
     assert np.abs(before[:, :3, 3]).max() > 0.05 and np.abs(after[:, :3, 3]).max() < 1e-6
@@ -149,7 +149,7 @@ def test_without_an_error_of_the_arm_every_byte_stays(name, text, tmp_path):
     file.write_bytes(text.replace("\n", "\r\n").encode() + "; Größe \n".encode("latin-1"))
     program = read_program(file, *[ZERO[{".ls": "fanuc", ".mod": "abb"}.get(file.suffix, "kuka")]] * 2)
     still = np.tile(np.eye(4), (len(program.points), 1, 1))
-    texts = moved_texts(program, still, np.zeros((len(program.points), 6)))
+    texts = compensated_texts(program, still, np.zeros((len(program.points), 6)))
     assert program_bytes(texts[file]) == file.read_bytes()
 
 
@@ -167,7 +167,7 @@ def test_targets_moved_there_and_back_are_equal_to_the_last_printed_digit(name, 
         read = read_program(file, *zeros)
         count = len(read.points)
         before = file.read_text()
-        file.write_text(moved_texts(read, np.tile(T, (count, 1, 1)), np.tile(q, (count, 1)))[file])
+        file.write_text(compensated_texts(read, np.tile(T, (count, 1, 1)), np.tile(q, (count, 1)))[file])
         assert file.read_text() != before
     cells = [re.split(r"[,\n]", table.text) for table in (first, import_file(file))]
     numbers = [[float(c) for c in own if re.fullmatch(r"-?[\d.e-]+", c)] for own in cells]
@@ -182,7 +182,7 @@ def test_a_motion_program_of_a_kuka_moves_the_points_of_its_data_list(tmp_path):
     read = read_program(tmp_path / "a.src", ZERO["kuka"], ZERO["kuka"])
     assert [point.name for point in read.points] == ["XHOME", "XP1", "line6", "line7"]
     still = np.tile(np.eye(4), (4, 1, 1))
-    texts = moved_texts(read, still, np.full((4, 6), np.radians(0.25)))
+    texts = compensated_texts(read, still, np.full((4, 6), np.radians(0.25)))
     assert (
         "XHOME={A1 0.25000,A2 -89.75000" in texts[tmp_path / "a.dat"]
         and "X 1025.0,Y -12.5" in texts[tmp_path / "a.dat"]

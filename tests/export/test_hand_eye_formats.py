@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.export.hand_eye import hand_eye_of
-from stitch.export.hand_eye_formats import FORMATS
+from stitch.export.hand_eye import hand_eye_of_run
+from stitch.export.hand_eye_formats import HAND_EYE_FORMATS
 
 NUMBER = r"(-?\d+\.\d+)"
 COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 0.02, 0.05, 0.04]) ** 2
@@ -56,7 +56,7 @@ READERS = {
 def test_controllers_frames_by_scipys_conventions(controller, T, unit, tmp_path):
     own = T.copy()
     own[:3, 3] /= {"mm": 1, "m": 1000}[unit]
-    text = FORMATS[controller](hand_eye_of(bare_run(tmp_path / "r", own, COVARIANCE, length_unit=unit)))
+    text = HAND_EYE_FORMATS[controller](hand_eye_of_run(bare_run(tmp_path / "r", own, COVARIANCE, length_unit=unit)))
     read = READERS[controller](numbers(text))
     assert read[:3, 3] == pytest.approx(T[:3, 3], abs=1e-5)  # nine digits of a metre
     assert read[:3, :3] == pytest.approx(T[:3, :3], abs=1e-8)
@@ -84,7 +84,7 @@ def yaml_by_opencv(text):
 
 def test_ros_2_launch_file_in_yaml(tmp_path):
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE, mount="eye_to_hand")
-    document = yaml_by_opencv(FORMATS["ros"](hand_eye_of(run, child="camera")))
+    document = yaml_by_opencv(HAND_EYE_FORMATS["ros"](hand_eye_of_run(run, child="camera")))
     node = document.getNode("launch").at(0).getNode("node")
     told = [node.getNode(key).string() for key in ("pkg", "exec", "name")]
     assert told == ["tf2_ros", "static_transform_publisher", "base_link_to_camera"]
@@ -106,7 +106,7 @@ def test_ros_1_launch_file_by_its_ending(tmp_path, stitch_command):
 @pytest.mark.parametrize("T", POSES)
 def test_urdf_link_and_joint(T, tmp_path):
     run = bare_run(tmp_path / "r", T, COVARIANCE)
-    root = ElementTree.fromstring(FORMATS["urdf"](hand_eye_of(run, parent="tool0")))
+    root = ElementTree.fromstring(HAND_EYE_FORMATS["urdf"](hand_eye_of_run(run, parent="tool0")))
     joint = root.find("joint")
     assert joint.get("type") == "fixed" and joint.find("parent").get("link") == "tool0"
     assert [link.get("name") for link in root.iter("link")] == ["scanner"]
@@ -117,7 +117,7 @@ def test_urdf_link_and_joint(T, tmp_path):
 def test_urdf_takes_its_place_in_a_robot(tmp_path):
     yourdfpy = pytest.importorskip("yourdfpy")
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
-    inner = FORMATS["urdf"](hand_eye_of(run)).split("<robot")[1].split(">", 1)[1].rsplit("</robot>", 1)[0]
+    inner = HAND_EYE_FORMATS["urdf"](hand_eye_of_run(run)).split("<robot")[1].split(">", 1)[1].rsplit("</robot>", 1)[0]
     (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="flange"/>{inner}</robot>')
     T = yourdfpy.URDF.load(str(tmp_path / "r.urdf")).get_transform("scanner", "flange")
     same(*T[:3, 3], Rotation.from_matrix(T[:3, :3]))
@@ -125,7 +125,7 @@ def test_urdf_takes_its_place_in_a_robot(tmp_path):
 
 def test_zivids_matrix(tmp_path):
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
-    document = yaml_by_opencv(FORMATS["zivid"](hand_eye_of(run)))
+    document = yaml_by_opencv(HAND_EYE_FORMATS["zivid"](hand_eye_of_run(run)))
     rows = document.getNode("FloatMatrix").getNode("Data")
     read = [[rows.at(i).at(k).real() for k in range(4)] for i in range(4)]
     assert np.array(read) == pytest.approx(ANYWHERE, abs=1e-12)
@@ -135,7 +135,7 @@ def test_zivids_matrix(tmp_path):
 @pytest.mark.parametrize("controller", READERS)
 def test_expanded_uncertainty_is_that_of_drawn_hand_eyes(controller, tmp_path):
     """20,000 hand-eyes drawn from the covariance, read by scipy alone: two of their standard deviations."""
-    text = FORMATS[controller](hand_eye_of(bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)))
+    text = HAND_EYE_FORMATS[controller](hand_eye_of_run(bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)))
     line = next(line for line in text.splitlines() if "U (k = 2)" in line)
     stated = np.array([float(x) for x in re.findall(r" ([\d.e-]+)(?: (?:mm|m|rad|°))?(?:,|$)", line.split(":")[1])])
     xi = np.random.default_rng(0).multivariate_normal(np.zeros(6), COVARIANCE, 20_000)
@@ -159,8 +159,8 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
         unobservable=["rotation about z"],
         effects={"mount_drift": {"rx": (1e-4, "rad/h")}},
     )
-    for write in FORMATS.values():
-        text = write(hand_eye_of(run))
+    for write in HAND_EYE_FORMATS.values():
+        text = write(hand_eye_of_run(run))
         assert "Not observable from these motions, left at the coarse value: rotation about z" in text
         assert "mount_drift" in text and "flange" in text
 
@@ -178,9 +178,9 @@ def test_an_uncertainty_says_of_which_model_it_is(verdict, said, tmp_path):
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
     if verdict:
         (run / "diagnosis.json").write_text(json.dumps({"verdict": verdict}))
-    for write in FORMATS.values():
-        assert "U of the hand-eye holds for a complete model" in write(hand_eye_of(run))
-        assert said in write(hand_eye_of(run))
+    for write in HAND_EYE_FORMATS.values():
+        assert "U of the hand-eye holds for a complete model" in write(hand_eye_of_run(run))
+        assert said in write(hand_eye_of_run(run))
 
 
 def test_what_an_unseen_effect_could_do_leaves_with_the_numbers(tmp_path):
@@ -189,8 +189,8 @@ def test_what_an_unseen_effect_could_do_leaves_with_the_numbers(tmp_path):
     sizes = {"range_scale": 0.269, "part_growth": None, "joint_offset": 0.02}
     candidates = [{"effect": name, "hand_eye_if_missed": size} for name, size in sizes.items()]
     (run / "diagnosis.json").write_text(json.dumps({"verdict": "adequate", "candidates": candidates}))
-    for write in FORMATS.values():
-        assert "could displace it, at the part, by as much as 269 µm (range_scale)" in write(hand_eye_of(run))
+    for write in HAND_EYE_FORMATS.values():
+        assert "could displace it, at the part, by as much as 269 µm (range_scale)" in write(hand_eye_of_run(run))
 
 
 @pytest.mark.parametrize(
@@ -215,14 +215,14 @@ def test_bad_requests_write_nothing(arguments, message, tmp_path, monkeypatch, c
 
 def test_no_run_is_one_line(tmp_path):
     with pytest.raises(InputError, match=r"nowhere: no such run folder"):
-        hand_eye_of(tmp_path / "nowhere")
+        hand_eye_of_run(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"result.json: not found"):
-        hand_eye_of(tmp_path)
+        hand_eye_of_run(tmp_path)
     (tmp_path / "rig").mkdir()
     inner = bare_run(tmp_path / "rig" / "monday", ANYWHERE, COVARIANCE)
     (tmp_path / "rig" / "model.toml").write_bytes((inner / "model.toml").read_bytes())
     with pytest.raises(InputError, match=r"rig: holds the runs of several sessions \(monday\); name one of them"):
-        hand_eye_of(tmp_path / "rig")
+        hand_eye_of_run(tmp_path / "rig")
 
 
 def same(x, y, z, rotation, T=ANYWHERE):

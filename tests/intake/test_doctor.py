@@ -50,7 +50,7 @@ def test_order_direction_unit_and_mount_are_told_by_four_small_scans(still_cells
     write_session(tmp_path / "cell", still_cells["eye_in_hand"], "cell")
     folder = raw_folder(tmp_path / "cell", tmp_path / "raw", Convention("zxz", inverse=True, unit="m"))
     first, read, true, T = as_read(tmp_path / "cell", folder)
-    assert read.mount == "eye_in_hand" and first.decided.told
+    assert read.mount == "eye_in_hand" and first.choice.determined
     assert np.abs(T - true).max() < 1e3 * DIGITS
     assert "# mount: eye_in_hand, the scanner sits at the flange; the poses are T_flange_base" in (
         (folder / "session.toml").read_text(encoding="utf-8")
@@ -84,7 +84,7 @@ def test_scans_that_lie_in_one_frame_already_are_refused(tmp_path):
 def test_order_direction_unit_and_mount_of_a_simulated_cell(cells, tmp_path, mount, convention):
     folder = raw_folder(cells(mount), tmp_path / "raw", convention)
     first, read, true, T = as_read(cells(mount), folder)
-    assert read.mount == mount and first.decided.told
+    assert read.mount == mount and first.choice.determined
     assert frames.angle_between(T, true).max() < DIGITS
     assert np.abs(T - true)[:, :3, 3].max() < 1e3 * DIGITS
 
@@ -107,8 +107,8 @@ def test_what_scans_cannot_tell_is_said(still_cells, tmp_path):
     rng = np.random.default_rng(0)
     np.savetxt(table, np.hstack([rng.uniform(-1, 1, (4, 3)), rng.uniform(300, 600, (4, 3))]), delimiter=",")
     first = first_session(folder, StatedFolder())
-    assert not first.decided.told
-    assert {g.what for g in first.guesses if not g.told} >= {"rotation", "mount"}
+    assert not first.choice.determined
+    assert {g.what for g in first.guesses if not g.determined} >= {"rotation", "mount"}
 
 
 @pytest.mark.slow

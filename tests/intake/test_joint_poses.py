@@ -49,7 +49,7 @@ def test_the_scans_tell_the_unit_of_joint_angles_and_the_mount(cell, tmp_path):
     first = first_session(raw, StatedFolder())
     write_draft(tmp_path / "made", first)
     made = load_session(tmp_path / "made")
-    assert made.mount == "eye_in_hand" and first.decided.told
+    assert made.mount == "eye_in_hand" and first.choice.determined
     for a, b in zip(made.views, session.views, strict=True):
         assert np.allclose(a.joints, b.joints, atol=1e-8) and np.abs(a.T_base_flange - b.T_base_flange).max() < 1e-3
     assert [view.time_s for view in made.views] == [0, 1, 2, 3]

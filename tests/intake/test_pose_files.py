@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
-from stitch.intake.found_files import look_into
-from stitch.intake.layouts import layouts
+from stitch.intake.found_files import find_folder_files
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.readings import readings
 
@@ -93,7 +93,7 @@ def read(tmp_path, name, text):
 
 
 def only(raw, **stated):
-    (layout,) = layouts(raw)
+    (layout,) = possible_layouts(raw)
     (reading,) = readings(layout, **stated)
     return reading
 
@@ -110,7 +110,7 @@ def test_one_file_for_each_pose_in_the_order_of_their_numbers(tmp_path):
     (tmp_path / "scan.xyz").write_text("0 0 1\n", encoding="utf-8")
     for i in (1, 2, 10):
         (tmp_path / "poses" / f"robot_pose_{i}.yaml").write_text(ZIVID.replace("569.5", str(i)), encoding="utf-8")
-    raw = read_raw_poses(look_into(tmp_path, tmp_path / "poses").poses)
+    raw = read_raw_poses(find_folder_files(tmp_path, tmp_path / "poses").poses)
     assert only(raw).T[:, 0, 3].tolist() == [1, 2, 10]
     assert [labels[0] for labels in raw.labels] == ["robot_pose_1", "robot_pose_2", "robot_pose_10"]
 
@@ -125,7 +125,7 @@ def test_ros_transforms(tmp_path):
 def test_messages_of_ros_keep_their_time(tmp_path):
     stamped = "header:\n  stamp:\n    sec: {}\n    nanosec: {}\n  frame_id: base\npose:\n" + POSE_OF_ROS
     raw = read(tmp_path, "poses.yaml", "---\n".join(stamped.format(1718099007 + i, 250000000) for i in range(2)))
-    (layout,) = layouts(raw)
+    (layout,) = possible_layouts(raw)
     assert layout.rest["time_s"].tolist() == [1718099007.25, 1718099008.25]
     assert only(raw).T[0, :3, 3].tolist() == [0.5, -0.25, 0.75]
 
@@ -135,7 +135,7 @@ def test_times_since_1970_stand_before_poses_without_a_header(tmp_path):
     rows = "1305031453.3741 0.5 -0.25 0.75 0 0.6 0 0.8\n1305031453.3842 0.5 -0.25 0.5 0 0.6 0 0.8\n"
     for head in ("", "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"):
         raw = read(tmp_path, "groundtruth.txt", head + rows)
-        (layout,) = layouts(raw)
+        (layout,) = possible_layouts(raw)
         assert [next(iter(layout.rest.values()))[1]] == [1305031453.3842]
         assert layout.position[0].tolist() == [0.5, -0.25, 0.75] and layout.rotation[0].tolist() == [0, 0.6, 0, 0.8]
 
@@ -154,14 +154,14 @@ def test_a_column_called_p_keeps_its_name(tmp_path):
 
 
 def test_reghec_says_by_its_sizes_that_angles_come_first_in_radians(tmp_path):
-    (layout,) = layouts(read(tmp_path, "RobotPoses.dat", REGHEC))
+    (layout,) = possible_layouts(read(tmp_path, "RobotPoses.dat", REGHEC))
     assert layout.position[0].tolist() == [111.227938, -331.951396, 317.520474]
     assert {r.angle_unit for r in readings(layout)} == {"rad", "deg"}
 
 
 def test_mech_mind_quaternion_may_be_of_either_order_until_somebody_says(tmp_path):
     raw = read(tmp_path, "poses.json", MECH_MIND)
-    (layout,) = layouts(raw)
+    (layout,) = possible_layouts(raw)
     assert [r.rotation for r in readings(layout)] == ["quaternion-xyzw", "quaternion-wxyz"]
     assert np.allclose(only(raw, rotation="quaternion-wxyz").T[0, :3, 0], [0.28, 0, -0.96])
 
@@ -192,7 +192,7 @@ def test_three_by_four_and_rotations_apart(tmp_path):
     np.savetxt(tmp_path / "kitti.txt", np.concatenate([R, t[:, :, None]], axis=2).reshape(2, 12))
     assert np.allclose(only(read_raw_poses([tmp_path / "kitti.txt"])).T[:, :3, 3], t)
     np.savetxt(tmp_path / "apart.txt", np.hstack([R.reshape(2, 9), t]))
-    (layout,) = layouts(read_raw_poses([tmp_path / "apart.txt"]))
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "apart.txt"]))
     by_rows, by_columns = readings(layout)
     assert np.allclose(by_rows.T[:, :3, :3], R) and np.allclose(by_columns.T[:, :3, :3], R.transpose(0, 2, 1))
 
@@ -217,7 +217,7 @@ def test_names_of_columns_tell_what_they_can(tmp_path, header):
     elif "q1" in header:
         row = [1, 0, 0, 0, 0.1, 0.2, 0.3]
     text = header + "\n" + "\n".join(separator.join(map(str, row)) for _ in range(3))
-    (layout,) = layouts(read(tmp_path, "t.csv", text))
+    (layout,) = possible_layouts(read(tmp_path, "t.csv", text))
     assert (layout.convention, layout.length_unit, layout.angle_unit) == HEADERS[header]
     if header[0] == "q" or "qw" in header:
         assert np.allclose(readings(layout)[0].T[:, :3, :3], np.eye(3))
@@ -243,4 +243,4 @@ def test_names_of_columns_tell_what_they_can(tmp_path, header):
 )
 def test_what_holds_no_poses_is_refused(tmp_path, name, text, told):
     with pytest.raises(InputError, match=told):
-        layouts(read(tmp_path, name, text))
+        possible_layouts(read(tmp_path, name, text))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.robot_programs import program
-from stitch.intake.found_files import look_into
+from stitch.intake.found_files import find_folder_files
 from stitch.intake.program_poses import is_program, program_poses
 from stitch.intake.raw_poses import read_raw_poses
 
@@ -26,9 +26,9 @@ def folder(tmp_path):
 
 
 def test_the_program_is_read_and_not_its_points_beside_it(folder):
-    assert is_program(folder / "work.dat") and look_into(folder).poses == (folder / "work.dat",)
+    assert is_program(folder / "work.dat") and find_folder_files(folder).poses == (folder / "work.dat",)
     (folder / "work.src").write_text(MOTIONS)
-    assert look_into(folder).poses == (folder / "work.src",)
+    assert find_folder_files(folder).poses == (folder / "work.src",)
     for file in ("work.dat", "work.src"):
         raw = program_poses(folder / file)
         places = raw.numbers[:, [raw.header.index(axis) for axis in "xyz"]]
@@ -60,4 +60,4 @@ def test_what_the_camera_wrote_beside_the_poses_is_no_table_of_poses(tmp_path):
     (tmp_path / "remarks.txt").write_text("3 scans, gripper new, 22.5 degrees in the hall\n")
     rows = "".join(f"{800 + i} 20 700 0.1 0.2 {0.3 * i}\n" for i in range(3))
     (tmp_path / "run7.txt").write_text(rows)
-    assert look_into(tmp_path).poses == (tmp_path / "run7.txt",)
+    assert find_folder_files(tmp_path).poses == (tmp_path / "run7.txt",)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.layouts import Layout
-from stitch.intake.readings import conventions, readings
+from stitch.intake.layouts import ColumnLayout
+from stitch.intake.readings import readings, rotation_conventions
 
 
 def turn(axis, angle):
@@ -19,14 +19,14 @@ def turn(axis, angle):
 
 
 ANGLES = np.array([[0.3, -0.8, 1.9], [-2.0, 0.4, 0.7]])
-EULER = [word for word in conventions() if word.endswith(("intrinsic", "extrinsic"))]
+EULER = [word for word in rotation_conventions() if word.endswith(("intrinsic", "extrinsic"))]
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])
 @pytest.mark.parametrize("word", EULER)
 def test_orders_of_euler_angles(word, unit):
     written = np.degrees(ANGLES) if unit == "deg" else ANGLES
-    (reading,) = readings(Layout(np.zeros((2, 3)), written, None, ""), word, unit)
+    (reading,) = readings(ColumnLayout(np.zeros((2, 3)), written, None, ""), word, unit)
     order, how = word.split("-")
     for T, angles in zip(reading.T, ANGLES, strict=True):
         first, second, third = (turn(axis, angle) for axis, angle in zip(order, angles, strict=True))
@@ -39,15 +39,15 @@ def test_there_are_twelve_orders_on_either_side():
 
 
 def test_turns_in_another_order_than_the_columns_stand():
-    (reading,) = readings(Layout(np.zeros((2, 3)), ANGLES, None, ""), "yxz-by-axis", "rad")
+    (reading,) = readings(ColumnLayout(np.zeros((2, 3)), ANGLES, None, ""), "yxz-by-axis", "rad")
     x, y, z = ANGLES[0]
     assert np.allclose(reading.T[0, :3, :3], turn("y", y) @ turn("x", x) @ turn("z", z))
 
 
 def test_degrees_where_numbers_exceed_a_turn_in_radians():
-    assert {r.angle_unit for r in readings(Layout(np.zeros((2, 3)), ANGLES * 30, None, ""))} == {"deg"}
+    assert {r.angle_unit for r in readings(ColumnLayout(np.zeros((2, 3)), ANGLES * 30, None, ""))} == {"deg"}
 
 
 def test_a_convention_that_the_columns_cannot_have_is_refused():
     with pytest.raises(InputError, match="--rotation quaternion-xyzw"):
-        readings(Layout(np.zeros((2, 3)), ANGLES, None, ""), "quaternion-xyzw")
+        readings(ColumnLayout(np.zeros((2, 3)), ANGLES, None, ""), "quaternion-xyzw")

@@ -11,8 +11,8 @@ from stitch.intake.clock_times import DAY_FIRST, MONTH_FIRST, clock_times
 from stitch.intake.cloud_pairs import pairings
 from stitch.intake.covariates import covariate_columns
 from stitch.intake.first_session import first_session
-from stitch.intake.found_files import look_into
-from stitch.intake.layouts import layouts
+from stitch.intake.found_files import find_folder_files
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.session_draft import write_draft
 from stitch.intake.stated import StatedFolder
@@ -29,7 +29,7 @@ def test_letters_and_words_of_another_country(tmp_path, encoding):
     file = tmp_path / "Posen.csv"
     file.write_bytes("\r\n".join([HEADER, *ROWS]).encode(encoding))
     raw = read_raw_poses([file])
-    (layout,) = layouts(raw)
+    (layout,) = possible_layouts(raw)
     assert layout.position.tolist() == [[0.5, -0.25, 1], [0.5, -0.25, 2]] and layout.length_unit == "m"
     assert layout.rotation.tolist() == [[90, 0, 0], [0, 45, 0]] and layout.angle_unit == "deg"
     assert [texts[0] for texts in raw.labels] == ["Süd", "Nord"]
@@ -45,7 +45,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
 def test_angles_are_no_position_though_their_columns_come_first(tmp_path):
     header = "Giro X [grad],Giro Y [grad],Giro Z [grad],X [mm],Y [mm],Z [mm]"
     (tmp_path / "t.csv").write_text(f"{header}\n1,2,3,400,500,600\n1,2,4,400,500,601\n", encoding="utf-8")
-    (layout,) = layouts(read_raw_poses([tmp_path / "t.csv"]))
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
     assert layout.position[0].tolist() == [400, 500, 600] and layout.rotation[0].tolist() == [1, 2, 3]
     # Gradians or, in German, degrees: left to the scans.
     assert layout.angle_unit is None
@@ -103,7 +103,7 @@ def test_a_column_that_numbers_the_clouds_pairs_them_and_is_no_covariate(tmp_pat
     assert pairing.rows == (2, 0, 1) and pairing.by_name
     rows = "".join(f"{i};1;2;{i};0;0;{i};{20 + i}\n" for i in (2, 1, 3))
     (tmp_path / "t.csv").write_text(f"Nr;x;y;z;rx;ry;rz;air\n{rows}", encoding="utf-8")
-    (layout,) = layouts(read_raw_poses([tmp_path / "t.csv"]))
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
     assert covariate_columns(layout, [0, 1, 2]) == {"air": ["22", "21", "23"]}
 
 
@@ -114,7 +114,7 @@ def test_time_and_temperature_beside_a_pose_in_yaml_are_kept(tmp_path):
         files.append(tmp_path / f"p{i}.yaml")
         files[-1].write_text(f"stamp: 2026-03-01T09:0{i}:00\nair: 2{i}.5\n{pose}", encoding="utf-8")
     raw = read_raw_poses(files)
-    (layout,) = layouts(raw)
+    (layout,) = possible_layouts(raw)
     assert layout.position[1].tolist() == [1, 2, 2]
     assert covariate_columns(layout, [0, 1], raw.time_s) == {"time_s": ["0", "60"], "air": ["21.5", "22.5"]}
 
@@ -124,7 +124,7 @@ def test_files_of_poses_that_are_too_many_are_counted(tmp_path):
         (tmp_path / f"pose{i}.yaml").write_text("a: 1\n", encoding="utf-8")
         (tmp_path / f"scan{i % 3}.ply").write_bytes(b"ply\n")
     with pytest.raises(InputError, match="3 clouds but 9 files that may hold a pose each, pose0"):
-        look_into(tmp_path)
+        find_folder_files(tmp_path)
 
 
 def test_inverted_poses_of_scans_named_by_no_order(still_cells, tmp_path):
@@ -146,7 +146,7 @@ def test_inverted_poses_of_scans_named_by_no_order(still_cells, tmp_path):
     first = first_session(folder, StatedFolder())
     write_draft(folder, first)
     read = load_session(folder)
-    assert first.decided.told and [v.name[-1] for v in read.views] == list("dbca")
+    assert first.choice.determined and [v.name[-1] for v in read.views] == list("dbca")
     assert [v.time_s for v in read.views] == [0, 60, 120, 180]
     T = np.array([v.T_base_flange for v in read.views])
     assert np.abs(T[:, :3, :3] - true[:, :3, :3]).max() < 1e-6
@@ -167,5 +167,5 @@ def test_inverted_poses_of_scans_named_by_no_order(still_cells, tmp_path):
 def test_seconds_of_counts_in_whatever_a_controller_counts(tmp_path, name, times):
     rows = "".join(f"{t!r},{i},0,500,0,0,0,1\n" for i, t in enumerate(times))
     (tmp_path / "t.csv").write_text(f"{name},x,y,z,qx,qy,qz,qw\n{rows}", encoding="utf-8")
-    (layout,) = layouts(read_raw_poses([tmp_path / "t.csv"]))
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
     assert [float(t) for t in covariate_columns(layout, [0, 1])["time_s"]] == pytest.approx([0, 1.5], abs=1e-5)

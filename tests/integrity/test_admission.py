@@ -10,9 +10,9 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
 from stitch.errors import InputError, NoResultError
-from stitch.integrity.admission import Admission
-from stitch.integrity.admitted_fit import admitted_fit
-from stitch.measurement.capture import capture
+from stitch.integrity.admission import ViewScreening
+from stitch.integrity.admitted_fit import fit_screened_views
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.cloud import Cloud
 from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.measurement import measurement_of
@@ -20,7 +20,7 @@ from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.pipeline import run
 from stitch.revision import add
-from stitch.stages.fitted import Fitted
+from stitch.stages.fitted import FittedRig
 from stitch.stages.outlier_removal import FittedSession
 
 
@@ -159,7 +159,7 @@ def test_labelled_points_with_exchanged_coordinates_are_refused():
 
 def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
     session, T_mount, _ = labelled_cell(0, views=12)
-    measurement = measurement_of(session, capture(session))
-    fitted = Fitted(Model(T_mount), [FittedSession(measurement, None, ())], [measurement.capture])
-    found = admitted_fit([session], [measurement], lambda sessions, measurements: fitted)
-    assert found.admissions == [Admission()] and found.sessions == [session]
+    measurement = measurement_of(session, prepare_capture(session))
+    fitted = FittedRig(Model(T_mount), [FittedSession(measurement, None, ())], [measurement.capture])
+    found = fit_screened_views([session], [measurement], lambda sessions, measurements: fitted)
+    assert found.screenings == [ViewScreening()] and found.sessions == [session]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.integrity.amounts import off_by
+from stitch.integrity.amounts import displacement_text
 
 
 @pytest.mark.parametrize(
@@ -17,4 +17,4 @@ from stitch.integrity.amounts import off_by
     ],
 )
 def test_a_size_is_told_as_far_as_it_is_held(best, least, said):
-    assert off_by(best, least, "mm") == said
+    assert displacement_text(best, least, "mm") == said

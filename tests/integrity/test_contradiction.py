@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch import frames
-from stitch.integrity.contradiction import contradicting
-from stitch.measurement.scan import prepare_view
+from stitch.integrity.contradiction import find_contradicting_views
+from stitch.measurement.scan import prepare_scan
 
 POSES = np.tile(np.eye(4), (3, 1, 1))
 TOLERANCE, SIZE = 0.1, 100.0
@@ -13,11 +13,11 @@ TOLERANCE, SIZE = 0.1, 100.0
 def plate(x=(-40.0, 40.0), raised=0.0, of=lambda x, y: x > 0):
     """Points every 2 mm of a plate 300 mm before the scanner, some of them nearer."""
     x, y = (c.ravel() for c in np.meshgrid(np.arange(*x, 2.0), np.arange(-40.0, 40.0, 2.0)))
-    return prepare_view("plate", np.c_[x, y, 300.0 - raised * of(x, y)])
+    return prepare_scan("plate", np.c_[x, y, 300.0 - raised * of(x, y)])
 
 
 def asked(scan):
-    return contradicting([plate(), scan, plate()], POSES, TOLERANCE, SIZE)
+    return find_contradicting_views([plate(), scan, plate()], POSES, TOLERANCE, SIZE)
 
 
 def test_plates_in_one_place_do_not_contradict():
@@ -38,5 +38,5 @@ def test_a_few_points_that_others_show_tell_nothing():
 def test_groups_that_stand_apart_do_not_contradict_each_other():
     poses = POSES.copy()
     poses[2] = frames.exp(np.array([0, 0, 0, 0, 0, 3.0]))
-    assert contradicting([plate()] * 3, poses, TOLERANCE, SIZE) == (2,)
-    assert contradicting([plate()] * 3, poses, TOLERANCE, SIZE, groups=[(0, 1), (2,)]) == ()
+    assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE) == (2,)
+    assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE, groups=[(0, 1), (2,)]) == ()

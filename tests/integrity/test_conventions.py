@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
-from stitch.integrity.conventions import explained, likeliest, verdict
+from stitch.integrity.conventions import likeliest_hypotheses, proven_hypotheses, rank_hypotheses
 from stitch.integrity.hypotheses import hypotheses
 from stitch.integrity.relative_scans import RelativeScans
 from stitch.integrity.targets import check_targets
@@ -38,14 +38,14 @@ def cell():
 
 def test_right_poses_need_no_other_convention(cell):
     session, T_mount = cell
-    assert verdict(explained(session, motions(session, T_mount))) == ()
+    assert proven_hypotheses(rank_hypotheses(session, motions(session, T_mount))) == ()
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_scans_name_the_mistake(cell, mistake):
     session, T_mount = cell
     spoil, kinds = MISTAKES[mistake]
-    found = verdict(explained(spoil(session), motions(session, T_mount)))
+    found = proven_hypotheses(rank_hypotheses(spoil(session), motions(session, T_mount)))
     assert found and found[0].hypothesis.kind in kinds
 
 
@@ -69,10 +69,10 @@ def test_y_and_z_exchanged_in_labelled_points(cell):
 
 def test_a_carried_sensor_is_judged_alike():
     session, T_mount = cell_of("eye_in_hand")
-    assert verdict(explained(session, motions(session, T_mount))) == ()
+    assert proven_hypotheses(rank_hypotheses(session, motions(session, T_mount))) == ()
     assert check_targets(session) == []
     spoil, kinds = MISTAKES["mount"]
-    assert verdict(explained(spoil(session), motions(session, T_mount)))[0].hypothesis.kind in kinds
+    assert proven_hypotheses(rank_hypotheses(spoil(session), motions(session, T_mount)))[0].hypothesis.kind in kinds
 
 
 def slid(some, share, seed=5):
@@ -88,8 +88,8 @@ def slid(some, share, seed=5):
 def test_half_of_the_motions_are_no_proof_and_tell_the_likeliest(cell, mistake):
     session, T_mount = cell
     spoil, kinds = MISTAKES[mistake]
-    found = explained(spoil(session), slid(motions(session, T_mount), 0.5))
-    assert verdict(found) == () and likeliest(found)[0].hypothesis.kind in kinds
+    found = rank_hypotheses(spoil(session), slid(motions(session, T_mount), 0.5))
+    assert proven_hypotheses(found) == () and likeliest_hypotheses(found)[0].hypothesis.kind in kinds
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
@@ -97,13 +97,13 @@ def test_right_poses_have_no_likelier_ones(cell, share):
     """Whether half of the motions agree with them, or none."""
     session, T_mount = cell
     for seed in range(5):
-        assert likeliest(explained(session, slid(motions(session, T_mount, seed), share, seed))) == ()
+        assert likeliest_hypotheses(rank_hypotheses(session, slid(motions(session, T_mount, seed), share, seed))) == ()
 
 
 def test_few_motions_say_nothing(cell):
     session, T_mount = cell
     some = motions(session, T_mount)
-    assert explained(session, RelativeScans(some.pairs[:3], some.T[:3])) == []
+    assert rank_hypotheses(session, RelativeScans(some.pairs[:3], some.T[:3])) == []
 
 
 def test_undoing_every_order_of_euler_angles_is_among_the_hypotheses():

@@ -9,10 +9,10 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.in_the_way import in_the_way
-from stitch.measurement.capture import capture, part_size
+from stitch.integrity.in_the_way import find_occluder
+from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.cloud import Cloud
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 from stitch.pipeline import run
 
 VIEWS, SIDE, COUNT = 10, 8.0, 300
@@ -37,8 +37,8 @@ def with_squares(measured, shown_by):
 
 
 def found_in(measured, session):
-    own = capture(session)
-    return in_the_way(own.scans, measured.T_reference_scanner, part_size([own]))
+    own = prepare_capture(session)
+    return find_occluder(own.scans, measured.T_reference_scanner, part_size([own]))
 
 
 def test_nothing_is_in_the_way_of_a_good_session(measured):
@@ -64,8 +64,8 @@ def test_what_stands_beside_all_looks_is_looked_through_by_none(edge, in_the_way
     # Its rays pass the wall's end by less than the wall's points lie apart.
     x, y = np.meshgrid(np.linspace(0.2, 1.0, 5), np.linspace(-20.0, 20.0, 60))
     strip = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 500.0)]) * 0.9
-    scans = [prepare_view("wall", wall), prepare_view("strip", np.concatenate([strip, wall[:3000]]))]
-    found = in_the_way(scans, np.tile(np.eye(4), (2, 1, 1)), 100.0)
+    scans = [prepare_scan("wall", wall), prepare_scan("strip", np.concatenate([strip, wall[:3000]]))]
+    found = find_occluder(scans, np.tile(np.eye(4), (2, 1, 1)), 100.0)
     assert (found is not None and found.views == (1,)) == in_the_way_of_it
 
 

@@ -9,7 +9,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.measurement.labelled_points import Sighting
-from stitch.observations.targets.mislabelled import mislabelled
+from stitch.observations.targets.mislabelled import find_mislabelled
 from stitch.pipeline import run
 from tests.integrity.targets import PLACES, VIEWS, sightings
 
@@ -26,7 +26,7 @@ def renamed(own, order):
 @pytest.mark.parametrize("order", [(1, 2, 3, 4, 0), (1, 0, 2, 3, 4), (4, 3, 2, 1, 0)])
 @pytest.mark.parametrize("views", [5, VIEWS])
 def test_names_that_are_mixed_up_are_put_right(order, views):
-    (found,) = mislabelled(renamed(sightings(np.tile(PLACES, (views, 1, 1))), order))
+    (found,) = find_mislabelled(renamed(sightings(np.tile(PLACES, (views, 1, 1))), order))
     assert found.view == OFF
     right = {f"ball{name + 1}": f"ball{k + 1}" for k, name in enumerate(order) if name != k}
     assert dict(found.names) == right
@@ -35,7 +35,7 @@ def test_names_that_are_mixed_up_are_put_right(order, views):
 def test_names_that_several_orders_explain_are_not_put_right():
     """Four corners of a square: turned round they are as far apart as before."""
     square = np.array([[0, 0, 0], [100, 0, 0], [100, 100, 0], [0, 100.0, 0]])
-    (found,) = mislabelled(renamed(sightings(np.tile(square, (VIEWS, 1, 1))), (1, 0, 2, 3)))
+    (found,) = find_mislabelled(renamed(sightings(np.tile(square, (VIEWS, 1, 1))), (1, 0, 2, 3)))
     assert found.view == OFF and found.names == ()
 
 
@@ -47,7 +47,7 @@ def test_right_names_are_left_alone(seed):
     places *= np.linspace(1, 1.002, VIEWS)[:, None, None]
     places[int(rng.integers(VIEWS)), int(rng.integers(5))] += 5 * rng.normal(size=3)
     unseen = [(v, int(rng.integers(5))) for v in range(VIEWS)]
-    assert mislabelled(sightings(places, seed, unseen)) == ()
+    assert find_mislabelled(sightings(places, seed, unseen)) == ()
 
 
 def many(count, mixed_up):
@@ -65,15 +65,15 @@ def many(count, mixed_up):
 @pytest.mark.parametrize("count", [30, 150])
 def test_of_many_targets_those_of_a_view_are_put_right_too(count):
     sighted, order = many(count, True)
-    (found,) = mislabelled(sighted)
+    (found,) = find_mislabelled(sighted)
     assert found.view == OFF
     assert dict(found.names) == {f"ball{name + 1}": f"ball{k + 1}" for k, name in enumerate(order) if name != k}
-    assert f"and {len(found.names) - 24} more" in found.said("v003") or len(found.names) <= 24
+    assert f"and {len(found.names) - 24} more" in found.message("v003") or len(found.names) <= 24
 
 
 @pytest.mark.parametrize("count", [30, 150])
 def test_right_names_of_many_targets_are_left_alone(count):
-    assert mislabelled(many(count, False)[0]) == ()
+    assert find_mislabelled(many(count, False)[0]) == ()
 
 
 def with_corners(measured, order):

@@ -12,7 +12,7 @@ from stitch.errors import NoResultError
 from stitch.pipeline import diagnose, run
 from stitch.revision import change
 from stitch.runs.state import state_of
-from stitch.writing.plain_finding import next_step, plain_finding
+from stitch.writing.plain_finding import plain_finding, suggested_command
 from stitch.writing.result_document import model_of
 
 
@@ -74,7 +74,7 @@ def test_a_diagnosis_says_first_what_is_doubted(cell):
     assert plain_finding(found, "mm").startswith(
         "The hand-eye of the other run does not hold here. What is found beside"
     )
-    assert next_step(found, "RUN").startswith("Next: put right what is doubted")
+    assert suggested_command(found, "RUN").startswith("Next: put right what is doubted")
     # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
     assert not diagnose(change(state_of(moved), ["joint_offset"])).doubts
 

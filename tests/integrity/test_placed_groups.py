@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch import frames
-from stitch.integrity.linkage import Link, of_links
-from stitch.integrity.placed_groups import placed_groups
+from stitch.integrity.linkage import Link, linkage_of_links
+from stitch.integrity.placed_groups import place_groups
 
 SLIP = np.array([0.004, -0.003, 0.005, 2.0, -2.0, 1.0])
 
@@ -16,8 +16,8 @@ def test_a_group_moves_back_as_one(blade_capture):
     apart = poses.copy()
     apart[half:] = frames.exp(SLIP) @ poses[half:]
     chains = [range(half), range(half, views)]
-    linked = of_links(views, [Link(v, v + 1, 100, 1.0) for chain in chains for v in chain[:-1]])
-    placed = placed_groups(capture, apart, linked, (0.1, 0.7))
+    linked = linkage_of_links(views, [Link(v, v + 1, 100, 1.0) for chain in chains for v in chain[:-1]])
+    placed = place_groups(capture, apart, linked, (0.1, 0.7))
     moved, kept = (placed, set(range(views)) - set(placed))
     assert set(moved) in (set(chains[0]), set(chains[1]))
     # One common motion brings them back to the others, which stay where they are.

@@ -8,9 +8,9 @@ import pytest
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
 from stitch.integrity.placing import lies_in_a_line
-from stitch.integrity.relative_scans import relative_scans
-from stitch.integrity.snooping import snoop
-from stitch.measurement.scan import prepare_view
+from stitch.integrity.relative_scans import register_scan_pairs
+from stitch.integrity.snooping import snoop_views
+from stitch.measurement.scan import prepare_scan
 
 GATE, OFF = 2.5, 6
 
@@ -27,7 +27,7 @@ def with_mounts(own, change):
 
 def test_a_good_session_loses_no_view(cell):
     measured, own = cell
-    found = snoop(own, measured.T_mount, GATE)
+    found = snoop_views(own, measured.T_mount, GATE)
     assert found.left_out == () and len(found.disconnected) == 1
     # 20 µm and 20 µrad were put in.
     assert 0.01 < found.translation < 0.04 and 1e-5 < found.rotation < 4e-5
@@ -42,7 +42,7 @@ def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
         T[OFF] = frames.exp(twist) @ T[OFF]
         return T
 
-    found = snoop(with_mounts(own, change), measured.T_mount, GATE)
+    found = snoop_views(with_mounts(own, change), measured.T_mount, GATE)
     assert found.left_out == (OFF,)
     assert found.misplaced[0].distance == pytest.approx(shift, abs=0.15)
 
@@ -50,9 +50,9 @@ def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
 def test_a_scan_of_something_else_belongs_nowhere(cell):
     measured, own = cell
     xy = np.random.default_rng(0).uniform(-40, 40, (2000, 2))
-    waves = prepare_view("waves", np.column_stack([xy, 420 + 9 * np.sin(xy[:, 0] / 7)]))
+    waves = prepare_scan("waves", np.column_stack([xy, 420 + 9 * np.sin(xy[:, 0] / 7)]))
     scans = (*own.scans[:OFF], waves, *own.scans[OFF + 1 :])
-    found = snoop(replace(own, scans=scans), measured.T_mount, GATE)
+    found = snoop_views(replace(own, scans=scans), measured.T_mount, GATE)
     assert [(m.view, m.kind) for m in found.misplaced] == [(OFF, "foreign")]
 
 
@@ -64,14 +64,14 @@ def test_a_scan_of_a_line_on_the_surface_holds_no_pose(cell):
     along = scan.points[scan.usable][:400] - scan.points[scan.usable][:400].mean(axis=0)
     direction = np.linalg.svd(along, full_matrices=False)[2][0]
     line = scan.points.mean(axis=0) + np.linspace(-5, 5, 400)[:, None] * direction
-    assert lies_in_a_line(prepare_view("line", line)) and not lies_in_a_line(scan)
-    scans = (*own.scans[:OFF], prepare_view("line", line), *own.scans[OFF + 1 :])
-    assert snoop(replace(own, scans=scans), measured.T_mount, GATE).left_out == (OFF,)
+    assert lies_in_a_line(prepare_scan("line", line)) and not lies_in_a_line(scan)
+    scans = (*own.scans[:OFF], prepare_scan("line", line), *own.scans[OFF + 1 :])
+    assert snoop_views(replace(own, scans=scans), measured.T_mount, GATE).left_out == (OFF,)
 
 
 def test_motions_between_scans_are_those_of_the_cell(cell):
     measured, own = cell
-    found = relative_scans(own)
+    found = register_scan_pairs(own)
     poses = measured.T_reference_scanner
     true = np.array([frames.inverse(poses[v]) @ poses[w] for v, w in found.pairs])
     off = frames.angle_between(true, found.T)

@@ -11,10 +11,10 @@ from stitch import frames
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.standing_still import standing_still
-from stitch.measurement.capture import capture, part_size
+from stitch.integrity.standing_still import find_static_background
+from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.cloud import Cloud
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 from stitch.pipeline import run
 
 TOLERANCE = 0.1
@@ -60,8 +60,8 @@ def test_a_wall_behind_the_part_is_said_first_with_the_box_that_leaves_it_out(me
     said = run_verdict(found, model_history(found))
     assert "of what the scans show stands still before the scanner whatever the arm did" in said
     assert "in the stitched cloud at 12 places. State within = [[" in said
-    scans, poses = capture(session), found.model.T_mount
-    still = standing_still(scans.scans, scans.poses(poses), TOLERANCE, part_size([scans]))
+    scans, poses = prepare_capture(session), found.model.T_mount
+    still = find_static_background(scans.scans, scans.poses(poses), TOLERANCE, part_size([scans]))
     shown = np.mean(np.abs(np.concatenate([view.cloud.points for view in session.views])[:, 2] - depth) < 0.2)
     assert still.share == pytest.approx(shown, abs=0.05)
     assert still.box[:, 2] == pytest.approx([depth, depth], abs=0.2)
@@ -71,13 +71,13 @@ def test_a_wall_behind_the_part_is_said_first_with_the_box_that_leaves_it_out(me
 
 
 def test_without_a_wall_nothing_stands_still(measured):
-    own = capture(session_of(measured))
-    assert standing_still(own.scans, own.poses(measured.T_mount), TOLERANCE, part_size([own])) is None
+    own = prepare_capture(session_of(measured))
+    assert find_static_background(own.scans, own.poses(measured.T_mount), TOLERANCE, part_size([own])) is None
 
 
 def scans_of(shape):
     rng = np.random.default_rng(0)
-    return [prepare_view(str(v), shape + [0, 0, 300] + 0.02 * rng.standard_normal(shape.shape)) for v in range(12)]
+    return [prepare_scan(str(v), shape + [0, 0, 300] + 0.02 * rng.standard_normal(shape.shape)) for v in range(12)]
 
 
 @pytest.mark.parametrize("overlap", [0.3, 0.05])
@@ -85,11 +85,11 @@ def test_a_plate_that_slides_along_itself_does_not_stand_still(overlap):
     step = 80 * (1 - overlap)
     poses = np.array([frames.make(np.eye(3), [step * i, step * j, 0]) for i in range(4) for j in range(3)])
     flat = np.column_stack([GRID, np.zeros(len(GRID))])
-    assert standing_still(scans_of(flat), poses, TOLERANCE, 300.0) is None
+    assert find_static_background(scans_of(flat), poses, TOLERANCE, 300.0) is None
 
 
 def test_a_disc_that_turns_about_its_axis_does_not_stand_still():
     radius = np.linalg.norm(GRID, axis=1)
     disc = np.column_stack([GRID, 3 * np.cos(radius / 5)])[radius < 38]
     turned = frames.exp(np.array([[0, 0, 0.5 * v, 0, 0, 0] for v in range(12)]))
-    assert standing_still(scans_of(disc), turned, TOLERANCE, 80.0) is None
+    assert find_static_background(scans_of(disc), turned, TOLERANCE, 80.0) is None

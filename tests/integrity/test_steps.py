@@ -18,7 +18,7 @@ from stitch.integrity.steps import find_steps
 from stitch.integrity.view_model import ViewModel
 from stitch.measurement.cloud import Cloud
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
 from stitch.pipeline import run
 
 VIEWS, SIGMA, MEMORY = 18, 0.02, 20.0
@@ -56,7 +56,9 @@ def test_a_common_displacement_is_found_where_it_begins_with_its_size(start):
 
 def test_part_and_scanner_that_look_alike_are_not_told_apart():
     (found,) = steps(stepped(direct(5), 9))
-    assert not found.told and "these views do not tell which" in found.said([f"v{k}" for k in range(VIEWS)], "mm")
+    assert not found.distinguishable and "these views do not tell which" in found.describe(
+        [f"v{k}" for k in range(VIEWS)], "mm"
+    )
 
 
 def test_what_is_moved_there_and_back_is_two_steps():
@@ -73,7 +75,7 @@ def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
     model = stepped(direct(8), VIEWS - 1, times=100.0)
     singles = find_blunders(replace(model, errors=None))
     assert [b.view for b in singles.blunders] == [VIEWS - 1]
-    assert find_steps(model, None, (singles.further, 1), 0.01) == ()
+    assert find_steps(model, None, (singles.mean_columns, 1), 0.01) == ()
 
 
 def off(model, view, times=100.0):
@@ -104,8 +106,8 @@ def test_where_every_view_stands_free_no_step_is_sought():
 def test_what_a_view_is_off_by_beside_a_step_is_its_own():
     model = off(stepped(direct(12), 9), 4, times=50.0)
     tests = PoseTests([], [], find_blunders(replace(model, errors=None), [4], steps(model)), steps(model))
-    tests = replace(tests, homeless=[4])
-    freed = FreePoses(np.empty((VIEWS, 4, 4)), model.z.reshape(VIEWS, 6), None)
+    tests = replace(tests, unplaced=[4])
+    freed = UnconstrainedPoses(np.empty((VIEWS, 4, 4)), model.z.reshape(VIEWS, 6), None)
     expected = frames.log(expected_poses(replace(model, errors=None), np.tile(np.eye(4), (VIEWS, 1, 1)), freed, tests))
     own = freed.twists - expected
     np.testing.assert_allclose(own[4], 50 * STEP, atol=0.1)

@@ -6,7 +6,7 @@ import numpy as np
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.target_faults import said_of_targets
+from stitch.integrity.target_faults import target_warnings
 from stitch.measurement.sightings import sightings_of
 
 VIEWS, START = 16, 9
@@ -35,7 +35,7 @@ def test_a_target_that_moved_is_said_with_the_views_from_there_on():
     moved = changed(session, change)
     found = deep_check(moved)
     assert [(p.kind, p.views) for p in found] == [("displaced", tuple(session.names[START:]))]
-    assert said_of_targets(moved, sightings_of(moved)) == (found[0].fix,)
+    assert target_warnings(moved, sightings_of(moved)) == (found[0].fix,)
 
 
 def test_names_that_are_mixed_up_are_said_with_their_view():

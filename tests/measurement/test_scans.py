@@ -8,11 +8,11 @@ import pytest
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import lacking
+from stitch.effects.in_session import missing_need
 from stitch.errors import InputError
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.measurement.scan import prepare_view
+from stitch.measurement.scan import prepare_scan
 from stitch.measurement.session import Scanner
 
 
@@ -22,7 +22,7 @@ def test_normals_and_noise_of_a_sphere():
     direction = rng.normal(size=(20000, 3)) * [1, 1, 0.3] - [0, 0, 2]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     points = np.array([0, 0, 400.0]) + direction * (40 + 0.03 * rng.standard_normal(len(direction)))[:, None]
-    scan = prepare_view("s", points)
+    scan = prepare_scan("s", points)
     inner = scan.usable
     assert inner.mean() > 0.5
     assert np.median(np.einsum("ij,ij->i", scan.normals, direction)[inner]) > 0.995
@@ -38,8 +38,8 @@ def test_an_origin_amid_what_is_measured_is_not_where_the_scanner_looks_from():
     scanner = Scanner(None, None, 420.0, axis)
     assert np.array_equal(scanner.eye(points), [0, 0, -420]) and not scanner.eye(points + 400 * axis).any()
     assert not replace(scanner, standoff=None).eye(points).any()
-    amid = prepare_view("p", points, eye=scanner.eye(points))
-    ahead = prepare_view("p", points + 420 * axis)
+    amid = prepare_scan("p", points, eye=scanner.eye(points))
+    ahead = prepare_scan("p", points + 420 * axis)
     assert (amid.normals[:, 2] < 0).all() and np.allclose(amid.normals, ahead.normals, atol=1e-6)
     assert np.allclose(amid.confidence, ahead.confidence) and np.array_equal(amid.usable, ahead.usable)
 
@@ -49,11 +49,11 @@ def test_a_thinned_scan_keeps_the_surface_of_all_points(blade_capture):
     measured, capture = blade_capture
     whole = capture.scans[0]
     index = np.arange(0, len(whole.points), 3)
-    scan = prepare_view("v", whole.points, index)
+    scan = prepare_scan("v", whole.points, index)
     assert np.array_equal(scan.points, whole.points[index])
     assert np.array_equal(scan.normals, whole.normals[index]) and np.array_equal(scan.usable, whole.usable[index])
     assert scan.spacing > whole.spacing and scan.area.sum() == pytest.approx(whole.area.sum(), rel=0.02)
-    assert np.array_equal(prepare_view("v", whole.points, np.arange(len(whole.points))).normals, whole.normals)
+    assert np.array_equal(prepare_scan("v", whole.points, np.arange(len(whole.points))).normals, whole.normals)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
@@ -65,7 +65,7 @@ def test_an_intensity_that_is_not_finite_counts_as_none(blade_capture, wrong):
     session.views[1].cloud.scalars["intensity"] = np.full(len(session.views[1].cloud.points), 0.5)
     session.views[1].cloud.scalars["intensity"][3] = wrong
     measurement = measurement_of(session, capture)
-    assert not measurement.has_intensity and lacking(measurement, EFFECTS["intensity_bias"]) == ("intensity",)
+    assert not measurement.has_intensity and missing_need(measurement, EFFECTS["intensity_bias"]) == ("intensity",)
 
 
 def test_profiles_show_no_surface(recwarn):
@@ -75,5 +75,5 @@ def test_profiles_show_no_surface(recwarn):
     profile = np.column_stack([along, np.zeros(400), 300 - 0.01 * along**2])
     clouds = [replace(c, points=profile, intensity=np.ones(400), incidence=np.ones(400)) for c in measured.clouds]
     with pytest.raises(InputError, match="every cloud is one profile.*to fix.*stitch calibrate sphere"):
-        capture(session_of(replace(measured, clouds=clouds)))
+        prepare_capture(session_of(replace(measured, clouds=clouds)))
     assert not recwarn

@@ -8,11 +8,11 @@ import pytest
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import lacking, parameters_in
-from stitch.measurement.capture import capture
+from stitch.effects.in_session import missing_need, parameters_in
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import perturbed_frames
-from stitch.model.jacobian import twists
+from stitch.model.jacobian import pose_derivatives
 from stitch.model.model import Model
 from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term, term_of
@@ -20,7 +20,7 @@ from stitch.model.term import Term, term_of
 
 def chain_for(measured):
     session = session_of(measured)
-    return measurement_of(session, capture(session))
+    return measurement_of(session, prepare_capture(session))
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.place in ("robot", "links", "mount", "part")])
@@ -28,14 +28,14 @@ def test_twists_are_the_derivative_of_the_poses(still_cells, name):
     """Central differences of half the size about the same place, by another route: a point carried along."""
     measurement = chain_for(still_cells["eye_to_hand"])
     effect = EFFECTS[name]
-    if lacking(measurement, effect):
-        pytest.skip(f"needs {lacking(measurement, effect)}")
+    if missing_need(measurement, effect):
+        pytest.skip(f"needs {missing_need(measurement, effect)}")
     parameters = parameters_in(measurement, effect)
     # A twist that is zero hides its time constant: begin where it is not.
     values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
     T = still_cells["eye_to_hand"].T_mount
     centre = np.array([5.0, -3.0, 80.0])
-    (slopes,) = twists(measurement, Model(T), [term_of(measurement, effect).at(values)], centre)
+    (slopes,) = pose_derivatives(measurement, Model(T), [term_of(measurement, effect).at(values)], centre)
     point = np.array([10.0, 20.0, 120.0])
     for i, parameter in enumerate(parameters):
         if parameter.discrete:
@@ -65,7 +65,7 @@ def test_point_slopes_are_minus_what_nature_does(still_cells, name):
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
     zero = Term(effect, parameters_in(measurement, effect))
-    slopes = PointSlopes.of(measurement, Model(np.eye(4)), [zero]).at(2, pose, index)
+    slopes = PointSlopes.about_model(measurement, Model(np.eye(4)), [zero]).at(2, pose, index)
     view = measurement.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
     points = measurement.capture.scans[2].points[index]

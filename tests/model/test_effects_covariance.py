@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stitch.effects import EFFECTS
-from stitch.model.bound import in_unit
+from stitch.model.bound import convert_unit
 from stitch.model.effects_covariance import EffectsCovariance, covariance_of_fit, kept_root
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import Term
@@ -68,4 +68,4 @@ def test_lengths_of_the_matrix_follow_the_unit():
     names = tuple(f"link_geometry.{p.name}" for p in (lengths, angles))
     file = ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), {"link_geometry": {p.name: p for p in rows}})
     file = replace(file, effects_covariance=EffectsCovariance(names, np.array([[4.0, 0.2], [0.2, 1.0]])))
-    np.testing.assert_allclose(in_unit(file, "m").effects_covariance.matrix, [[4e-6, 2e-4], [2e-4, 1.0]])
+    np.testing.assert_allclose(convert_unit(file, "m").effects_covariance.matrix, [[4e-6, 2e-4], [2e-4, 1.0]])

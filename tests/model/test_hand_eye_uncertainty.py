@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.model.hand_eye_uncertainty import expanded, printed_covariance
+from stitch.model.hand_eye_uncertainty import expanded_uncertainty, printed_covariance
 
 
 @pytest.mark.parametrize("angle", [1e-5, 0.8, 3.1])
@@ -21,11 +21,11 @@ def test_what_is_printed_scatters_as_printed(angle):
     expected = printed_covariance(T, half @ half.T)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(printed / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.015)
-    np.testing.assert_allclose(expanded(T, half @ half.T), 2 * scale)
+    np.testing.assert_allclose(expanded_uncertainty(T, half @ half.T), 2 * scale)
 
 
 def test_axes_of_the_scanner_are_not_those_of_the_mount():
     """Sure along the scanner's z alone; the scanner looks along the base's x: there the sigma must stand."""
     T = frames.make(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
     covariance = np.diag([0.0, 0, 0, 0.123**2, 0.05**2, 0.0126**2])
-    np.testing.assert_allclose(expanded(T, covariance)[3:], 2 * np.array([0.0126, 0.05, 0.123]))
+    np.testing.assert_allclose(expanded_uncertainty(T, covariance)[3:], 2 * np.array([0.0126, 0.05, 0.123]))

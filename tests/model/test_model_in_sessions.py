@@ -9,10 +9,10 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.effects.in_session import parameters_in
 from stitch.errors import InputError
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import unit_torques
-from stitch.model.bound import bound
+from stitch.model.bound import bind_to_session
 from stitch.model.model_toml import ModelFile
 from stitch.model.term import term_of
 from stitch.pipeline import run_rig
@@ -40,7 +40,7 @@ def wrist_only(session):
 def placed_session(still_cells):
     """A session with its scans made ready once; what tests change of it the scans do not know."""
     session = session_of(still_cells["eye_to_hand"])
-    return session, capture(session)
+    return session, prepare_capture(session)
 
 
 def fitted(measurement, name):
@@ -57,7 +57,7 @@ def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(pla
     session, own = placed_session
     full, wrist = (measurement_of(s, own) for s in (massless(session), wrist_only(massless(session))))
     model, values, sigmas = fitted(full, "joint_compliance")
-    (term,) = bound(model, wrist).terms
+    (term,) = bind_to_session(model, wrist).terms
     np.testing.assert_array_equal(term.values, values)
     np.testing.assert_array_equal(term.sigmas, sigmas)
     assert {f.unit for f in model.effects["joint_compliance"].values()} == {"kg rad/(N m)"}
@@ -73,16 +73,16 @@ def test_what_a_model_knows_is_never_dropped_or_read_in_another_unit(placed_sess
     with_masses, bare = (measurement_of(s, own) for s in (session, massless(session)))
     for there, here in ((with_masses, bare), (bare, with_masses)):
         with pytest.raises(InputError, match="the model's joint_compliance has c.*link masses") as error:
-            bound(fitted(there, "joint_compliance")[0], here)
+            bind_to_session(fitted(there, "joint_compliance")[0], here)
         assert "\n" not in str(error.value)
     for name, column in (("part_growth", "part_temperature_c"), ("robot_thermal_growth", "robot_temperature_c")):
         warm, timed = with_masses, measurement_of(without(session, column), own)
         assert all(p.unit.endswith("/°C") for p in parameters_in(warm, EFFECTS[name]))
         assert all(p.unit.endswith("/h") for p in parameters_in(timed, EFFECTS[name]))
         for there, here in ((warm, timed), (timed, warm)):
-            bound(fitted(there, name)[0], there)
+            bind_to_session(fitted(there, name)[0], there)
             with pytest.raises(InputError, match=f"{name}.g is in '1/(h|°C)'.*{column}"):
-                bound(fitted(there, name)[0], here)
+                bind_to_session(fitted(there, name)[0], here)
 
 
 def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_session):

@@ -13,13 +13,13 @@ from stitch import pipeline
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.errors_by_view import CHANGING, by_view, part_of_view
+from stitch.observations.surfaces.errors_by_view import PER_VIEW, part_of_view, view_error_likelihood
 from stitch.observations.surfaces.field_error import field_error
 from stitch.observations.surfaces.gram import gram
 from stitch.observations.surfaces.match import Match
-from stitch.observations.surfaces.moved_views import as_displacements
-from stitch.observations.surfaces.shown_errors import ShownErrors
-from stitch.observations.surfaces.smooth_errors import COARSE, smooth_sums
+from stitch.observations.surfaces.moved_views import displacement_factors
+from stitch.observations.surfaces.shown_errors import SmoothErrorLikelihood
+from stitch.observations.surfaces.smooth_errors import COARSE, sum_smooth_errors
 from stitch.runs.state import state_of
 
 VIEWS = 12
@@ -63,9 +63,9 @@ def sound() -> LinearModel:
 
 def test_what_either_view_does_adds_up(sound: LinearModel):
     """Sums for either view of a pair its own, added up, are those for both together."""
-    apart, _ = smooth_sums(sound.measurement, sound.observation.freed, apart=True)
-    together, _ = smooth_sums(sound.measurement, sound.observation.freed)
-    coarse = apart.together(COARSE).of(slice(COARSE + 1))
+    apart, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained, per_view=True)
+    together, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained)
+    coarse = apart.merge_sides(COARSE).select(slice(COARSE + 1))
     for name in ("vector", "residual", "square"):
         wanted = getattr(together, name)
         np.testing.assert_allclose(getattr(coarse, name), wanted, atol=1e-9 * np.abs(wanted).max())
@@ -74,7 +74,7 @@ def test_what_either_view_does_adds_up(sound: LinearModel):
 def test_the_likelihood_has_the_slopes_that_it_says():
     rng = np.random.default_rng(0)
     told = tuple(rng.standard_normal((9, k)) for k in (3, 1, 6))
-    shown = ShownErrors(rng.standard_normal(9), told, rng.uniform(0.5, 2.0, 9))
+    shown = SmoothErrorLikelihood(rng.standard_normal(9), told, rng.uniform(0.5, 2.0, 9))
     value, slope = (lambda x, i=i: shown._deviance(x)[i] for i in (0, 1))
     for point in rng.uniform(-2, 1, (5, 3)):
         assert check_grad(value, slope, point) < 1e-5 * max(1.0, np.linalg.norm(slope(point)))
@@ -88,7 +88,7 @@ def test_sizes_are_those_with_which_errors_were_drawn():
     for _ in range(40):
         errors = sum(s * t @ rng.standard_normal(t.shape[1]) for s, t in zip(true, told, strict=True))
         seen = errors + 0.5 * rng.standard_normal(150)
-        found.append(np.log(ShownErrors(seen, told, np.full(150, 0.25)).likeliest([10.0] * 3)[0] / true))
+        found.append(np.log(SmoothErrorLikelihood(seen, told, np.full(150, 0.25)).ml_shares([10.0] * 3)[0] / true))
     # Likelihood underestimates variances of n numbers by about 1/n of themselves.
     mean, error = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))
     assert np.all(np.abs(mean) < 3 * error + 1 / np.array([20, 20, 90]))
@@ -101,7 +101,7 @@ def test_parts_of_a_session_follow_each_other():
 
 
 def test_a_sound_scanner_errs_in_no_view_of_its_own(sound: LinearModel):
-    found = field_error(sound.measurement, sound.model, sound.observation.freed, 0.01)
+    found = field_error(sound.measurement, sound.model, sound.observation.unconstrained, 0.01)
     assert not found.unusual
 
 
@@ -109,16 +109,16 @@ def test_a_sound_scanner_errs_in_no_view_of_its_own(sound: LinearModel):
 def test_every_view_by_itself(law: Law, with_time: bool):
     """Neither is laid on the scanner's field; what grows with the session is told from what does not."""
     linear = linear_of(law)
-    found = field_error(linear.measurement, linear.model, linear.observation.freed, 0.01)
+    found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
     assert found.by_view and found.over_noise
     assert found.with_time == with_time
     # Poses follow what they can: less is left, and never more than was put in.
-    assert found.changing < 0.2
+    assert found.rms_by_view < 0.2
 
 
 def test_the_same_in_every_view_is_no_view_of_its_own():
     linear = linear_of(alike)
-    found = field_error(linear.measurement, linear.model, linear.observation.freed, 0.01)
+    found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
     assert found.rms > 0 and not found.by_view
 
 
@@ -126,11 +126,11 @@ def test_estimates_are_those_of_weighted_least_squares():
     """The likeliest errors of a cause: ridge regression in closed form."""
     rng = np.random.default_rng(2)
     told = (rng.standard_normal((12, 4)), rng.standard_normal((12, 2)))
-    shown = ShownErrors(rng.standard_normal(12), told, rng.uniform(0.5, 2.0, 12))
+    shown = SmoothErrorLikelihood(rng.standard_normal(12), told, rng.uniform(0.5, 2.0, 12))
     shares = np.array([0.7, 1.3])
     A = np.hstack([s * t for s, t in zip(shares, told, strict=True)])
     W = np.diag(1 / shown.scatter)
-    wanted = np.linalg.solve(A.T @ W @ A + np.eye(6), A.T @ W @ shown.seen)
+    wanted = np.linalg.solve(A.T @ W @ A + np.eye(6), A.T @ W @ shown.data)
     np.testing.assert_allclose(shown.estimate(0, shares), wanted[:4])
     np.testing.assert_allclose(shown.estimate(1, shares), wanted[4:])
 
@@ -140,9 +140,9 @@ def test_estimates_are_those_of_weighted_least_squares():
 def test_where_the_iteration_ended_makes_no_error_of_the_scanner(sound: LinearModel, name: str | None, short: float):
     """Views that stand some micrometres off the place where they agree best show nothing, beside whatever may be there:
     poses follow most of what a scale does, so that a small step they still owe looks like hundreds of nats."""
-    freed, rng = sound.observation.freed, np.random.default_rng(0)
+    freed, rng = sound.observation.unconstrained, np.random.default_rng(0)
     g = freed.overlaps.gram
-    twists = short * rng.standard_normal((g.views, 6)) / as_displacements(g)
+    twists = short * rng.standard_normal((g.views, 6)) / displacement_factors(g)
 
     def moved(m: Match) -> Match:
         B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)
@@ -158,10 +158,10 @@ def test_where_the_iteration_ended_makes_no_error_of_the_scanner(sound: LinearMo
 
 def test_what_is_beside_may_have_any_size(sound: LinearModel):
     """Errors that parameters beside them explain wholly are not seen."""
-    freed = sound.observation.freed
-    sums, noise = smooth_sums(sound.measurement, freed, apart=True)
+    freed = sound.observation.unconstrained
+    sums, noise = sum_smooth_errors(sound.measurement, freed, per_view=True)
     # The error over incidence once more, as something beside.
-    doubled = sums.of(np.append(np.arange(sums.residual.shape[1]), 2 * COARSE))
-    shown = by_view(doubled, freed, noise, beside=1)
-    strength = [float(np.linalg.norm(told)) for told in shown.told]
-    assert strength[1] < 1e-6 * strength[CHANGING]
+    doubled = sums.select(np.append(np.arange(sums.residual.shape[1]), 2 * COARSE))
+    shown = view_error_likelihood(doubled, freed, noise, nuisance=1)
+    strength = [float(np.linalg.norm(told)) for told in shown.design]
+    assert strength[1] < 1e-6 * strength[PER_VIEW]

@@ -12,7 +12,7 @@ from data_synth.fixtures.quiet_scenes import clean, simulated
 from stitch import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.surfaces.field_error import FieldError, field_error
-from stitch.observations.surfaces.field_map import FieldMap, kept_share
+from stitch.observations.surfaces.field_map import FieldMap, robust_pass_share
 from stitch.runs.state import state_of
 
 # mm along the ray at places (N,) of the field, −1 … 1 both ways.
@@ -69,8 +69,8 @@ def found(change: Callable[[np.ndarray], np.ndarray], backwards: bool = False) -
         tool = replace(tool, T_mount=tool.T_mount @ turn, optical_axis=-tool.optical_axis)
         session = replace(session, views=views, scanner=tool)
     linear = linear_model_of(state_of(pipeline.run(session)))
-    freed = linear.observation.freed
-    return field_error(linear.measurement, linear.model, freed, 0.01), kept_share(freed.overlaps)
+    freed = linear.observation.unconstrained
+    return field_error(linear.measurement, linear.model, freed, 0.01), robust_pass_share(freed.overlaps)
 
 
 def less_unseen(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

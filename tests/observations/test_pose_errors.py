@@ -17,8 +17,8 @@ from stitch.diagnosis.variance_budget import variance_budget
 from stitch.effects import EFFECTS
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
-from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.free_poses import unconstrained_poses
 from stitch.observations.surfaces.hand_eye import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
 
@@ -31,12 +31,12 @@ def cell():
     measured = measured_blade(4, views=VIEWS, pixels=70)
     capture = captured(measured)
     measurement = measurement_of(session_of(measured), capture)
-    return measured, measurement, free_poses(capture, capture.poses(measured.T_mount), 1.0)
+    return measured, measurement, unconstrained_poses(capture, capture.poses(measured.T_mount), 1.0)
 
 
 def prior_of(cell):
     measured, measurement, freed = cell
-    return pose_errors([measurement], Model(measured.T_mount), [freed.overlaps.gram.centre])
+    return prior_pose_errors([measurement], Model(measured.T_mount), [freed.overlaps.gram.centre])
 
 
 def moved(cell, T_base_flange) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_joints_that_scatter_turn_and_move_the_flange_as_another_kinematics_says
     turned = [frames.log(flange @ kinematics.flange(arm, q + 1e-6 * joint)) / 1e-6 for joint in np.eye(6)]
     squares = (size * np.array(turned)) ** 2
     by_hand = squares.sum(axis=0).mean(axis=0).reshape(2, 3).mean(axis=1)
-    np.testing.assert_allclose(prior.by_joints, by_hand, rtol=1e-4)
+    np.testing.assert_allclose(prior.flange_per_joint, by_hand, rtol=1e-4)
 
 
 def test_an_effect_that_is_asked_for_by_name_is_no_error_of_its_own_kind(cell):
@@ -108,7 +108,7 @@ def test_an_arm_of_one_and_the_same_pose_repeats_what_it_does(cell):
         T_base_flange=T,
         views=replace(views, joints=joints, previous=joints, approach=0 * joints),
     )
-    prior = pose_errors([twice], Model(measured.T_mount), [freed.overlaps.gram.centre])
+    prior = prior_pose_errors([twice], Model(measured.T_mount), [freed.overlaps.gram.centre])
     assert prior.names[-2:] == ("stop rotation", "stop translation")
     difference = np.zeros((6, 6 * VIEWS))
     difference[:, :6], difference[:, 6:12] = np.eye(6), -np.eye(6)
@@ -145,8 +145,8 @@ def test_a_rig_at_equal_poses_knows_its_hand_eye_no_better_than_one_session(cell
     np.testing.assert_allclose(other.T_mount, T, atol=1e-12)
     capture = captured(other)
     sessions = [measurement, measurement_of(session_of(other), capture)]
-    both, captures = [freed, free_poses(capture, capture.poses(T), 1.0)], [measurement.capture, capture]
-    prior = pose_errors(sessions, Model(T), [f.overlaps.gram.centre for f in both])
+    both, captures = [freed, unconstrained_poses(capture, capture.poses(T), 1.0)], [measurement.capture, capture]
+    prior = prior_pose_errors(sessions, Model(T), [f.overlaps.gram.centre for f in both])
     falls, square = [], 0.0
     for seed in range(3):
         x = moved(cell, draw_arm(arm.joints, SIZE, np.random.default_rng(seed)).flange(arm, q))

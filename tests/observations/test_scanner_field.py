@@ -44,7 +44,7 @@ def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
     """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""
     measured = repeated(share, 0)
     linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
-    found = field_error(linear.measurement, linear.model, linear.observation.freed, 0.01)
+    found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
     assert (found.unusual, found.over_noise) == (unusual, over_noise)
     assert found.rms < 2 * share * load_scene("drill-plate").scanner.noise
     assert not unusual or found.rms > 0.3 * share * load_scene("drill-plate").scanner.noise
@@ -66,6 +66,6 @@ def test_what_incidence_shows_is_not_laid_on_the_field():
     scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
     measured = simulated(replace(scene, scanner=scanner), {}, 3, views=10)
     linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
-    shown, unit = (field_scatter(linear.measurement, linear.observation.freed, share) for share in (None, 1.0))
+    shown, unit = (field_scatter(linear.measurement, linear.observation.unconstrained, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
     assert np.max(shares[:-1]) < 0.2

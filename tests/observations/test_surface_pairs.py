@@ -8,27 +8,27 @@ from scipy.spatial import cKDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.observations.surfaces.free_poses import free_poses
+from stitch.observations.surfaces.free_poses import unconstrained_poses
 from stitch.observations.surfaces.gram import assemble, gram, pair_squares
-from stitch.observations.surfaces.hand_eye import scatter_of
-from stitch.observations.surfaces.match import match, sample
+from stitch.observations.surfaces.hand_eye import capture_repeatability
+from stitch.observations.surfaces.match import match_pairs, sample_points
 from stitch.observations.surfaces.overlapping_pairs import overlapping_pairs
-from stitch.observations.surfaces.overlaps import collect
-from stitch.observations.surfaces.pose_channel import jacobian
+from stitch.observations.surfaces.overlaps import collect_overlaps
+from stitch.observations.surfaces.pose_channel import hand_eye_jacobian
 
 
 @pytest.fixture(scope="module")
 def overlaps(blade_capture):
     measured, capture = blade_capture
     poses = capture.poses(measured.T_mount)
-    return collect(capture, poses, 2.0, [sample(s, 400) for s in capture.scans])
+    return collect_overlaps(capture, poses, 2.0, [sample_points(s, 400) for s in capture.scans])
 
 
 def test_partners_are_the_nearest_points_by_another_tree(blade_capture):
     measured, capture = blade_capture
     poses = capture.poses(measured.T_mount)
-    samples = [sample(s, 200) for s in capture.scans]
-    found = next(match(capture.scans, poses, [(0, 1)], 3.0, samples))
+    samples = [sample_points(s, 200) for s in capture.scans]
+    found = next(match_pairs(capture.scans, poses, [(0, 1)], 3.0, samples))
     p = frames.transform(poses[0], capture.scans[0].points)
     q = frames.transform(poses[1], capture.scans[1].points)
     from_v, from_w = np.isin(found.index_v, samples[0]), np.isin(found.index_w, samples[1])
@@ -42,8 +42,8 @@ def test_partners_are_the_nearest_points_by_another_tree(blade_capture):
 def test_points_take_turns_where_many_views_overlap(blade_capture, views, turns):
     """One scan so often: every point is its own partner, in 20 views or all the 25 others shared by two halves."""
     scan = blade_capture[1].scans[0]
-    picked, pairs = sample(scan, 300), list(combinations(range(views), 2))
-    found = list(match([scan] * views, np.tile(np.eye(4), (views, 1, 1)), pairs, 0.5, [picked] * views))
+    picked, pairs = sample_points(scan, 300), list(combinations(range(views), 2))
+    found = list(match_pairs([scan] * views, np.tile(np.eye(4), (views, 1, 1)), pairs, 0.5, [picked] * views))
     of_first = [m.index_v for m in found if m.v == 0]
     assert len(of_first) == views - 1 and set(np.concatenate(of_first)) == set(picked)
     # Both search directions.
@@ -60,15 +60,15 @@ def test_views_that_face_away_do_not_overlap(blade_capture):
 def test_pairs_serve_again_until_something_has_moved(blade_capture, overlaps):
     """Little motion: all correspondences as if pairs had been looked for; far away, or with another gate: they are."""
     measured, capture = blade_capture
-    samples = [sample(s, 400) for s in capture.scans]
+    samples = [sample_points(s, 400) for s in capture.scans]
     near = capture.poses(measured.T_mount) @ frames.make(np.eye(3), np.array([0.0, 0.1, 0.0]))
-    again, anew = (collect(capture, near, 2.0, samples, before) for before in (overlaps, None))
+    again, anew = (collect_overlaps(capture, near, 2.0, samples, before) for before in (overlaps, None))
     assert again.probed[0] is overlaps.probed[0] and anew.probed[0] is not overlaps.probed[0]
     assert again.pairs == anew.pairs and np.array_equal(again.gram.matrix, anew.gram.matrix)
     apart = near.copy()
     apart[2, :3, 3] += 1e4
-    assert all(2 not in pair for pair in collect(capture, apart, 2.0, samples, overlaps).pairs)
-    assert collect(capture, near, 4.0, samples, overlaps).probed[1] == 4.0
+    assert all(2 not in pair for pair in collect_overlaps(capture, apart, 2.0, samples, overlaps).pairs)
+    assert collect_overlaps(capture, near, 4.0, samples, overlaps).probed[1] == 4.0
 
 
 def test_pair_equations_against_finite_differences(blade_capture, overlaps):
@@ -92,7 +92,7 @@ def test_pair_equations_against_finite_differences(blade_capture, overlaps):
 def test_hand_eye_jacobian_against_finite_differences(blade_capture):
     measured, capture = blade_capture
     centre, step = np.array([10.0, -5, 30]), 1e-6
-    J = jacobian(capture.poses(measured.T_mount), centre).reshape(-1, 6, 6)
+    J = hand_eye_jacobian(capture.poses(measured.T_mount), centre).reshape(-1, 6, 6)
     to_centre = frames.make(np.eye(3), -centre)
     for i in range(6):
         moved = capture.poses(measured.T_mount @ frames.exp(step * np.eye(6)[i]))
@@ -127,7 +127,7 @@ def test_repeatability_is_recovered():
     for seed in range(6):
         measured, capture = captured_blade(seed, views=12, repeatability=(60e-6, 0.04), pixels=100)
         poses = capture.poses(measured.T_mount)
-        scatter = scatter_of(capture, free_poses(capture, poses, 1.5), measured.T_mount)
+        scatter = capture_repeatability(capture, unconstrained_poses(capture, poses, 1.5), measured.T_mount)
         found.append((scatter.rotation, scatter.translation))
     rotation, translation = np.sqrt(np.mean(np.square(found), axis=0))
     assert rotation == pytest.approx(60e-6, rel=0.35)

@@ -10,15 +10,15 @@ from data_synth.fixtures.drilled_plate import VIEWS, measured_plate
 from data_synth.fixtures.in_memory import labelled_session_of
 from stitch import frames
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.sightings import Sightings
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.term import term_of
-from stitch.observations.surfaces.free_poses import answer, free_poses
+from stitch.observations.surfaces.free_poses import solve_views, unconstrained_poses
 from stitch.observations.surfaces.gram import Gram, assemble
-from stitch.observations.surfaces.target_pairs import joined, target_pairs
+from stitch.observations.surfaces.target_pairs import append_targets, target_pairs
 from stitch.observations.surfaces.view_responses import view_responses
 
 
@@ -73,7 +73,7 @@ def test_pairs_are_the_dense_least_squares_with_the_places_eliminated(seed):
     A, e = dense(sightings, poses, centre)
     N, b = A.T @ A, A.T @ e
     inverse = np.linalg.inv(N[n:, n:])
-    H, vector = assemble(joined(no_surface(len(poses), centre), target_pairs(sightings, poses), 1.0))
+    H, vector = assemble(append_targets(no_surface(len(poses), centre), target_pairs(sightings, poses), 1.0))
     scale = np.abs(H).max()
     np.testing.assert_allclose(H / scale, (N[:n, :n] - N[:n, n:] @ inverse @ N[n:, :n]) / scale, atol=1e-12)
     np.testing.assert_allclose(vector, b[:n] - N[:n, n:] @ inverse @ b[n:], atol=1e-9 * np.abs(b).max())
@@ -88,8 +88,8 @@ def test_surfaces_of_huge_variance_leave_the_answer_of_the_targets():
     rng = np.random.default_rng(0)
     lean = rng.normal(size=(1, 6, 6))
     surfaces = replace(g, matrix=lean @ lean.transpose(0, 2, 1), vector=1e4 * rng.normal(size=(1, 6)))
-    g = joined(surfaces, target_pairs(sightings, poses), 1.0)
-    step = -answer(g, g.vector[..., None])[:, 0]
+    g = append_targets(surfaces, target_pairs(sightings, poses), 1.0)
+    step = -solve_views(g, g.vector[..., None])[:, 0]
     left = A[:, : 6 * len(poses)] @ step + e
     # The common motion is free: what is left of the targets is compared, their places settled anew.
     left -= A[:, 6 * len(poses) :] @ np.linalg.lstsq(A[:, 6 * len(poses) :], left, rcond=None)[0]
@@ -98,18 +98,18 @@ def test_surfaces_of_huge_variance_leave_the_answer_of_the_targets():
 
 def test_sums_of_targets_are_the_slopes_of_what_sets_them_apart():
     session = labelled_session_of(measured_plate(0))
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     T_mount = measured_plate(0).T_mount
     own = measurement.capture
-    freed = free_poses(own, own.poses(T_mount), 2.0)
+    freed = unconstrained_poses(own, own.poses(T_mount), 2.0)
     term = term_of(measurement, EFFECTS["range_scale"])
     sums, g = view_responses(measurement, Model(T_mount), [term], freed)[0].points, freed.overlaps.gram
     step = 0.01 * term.parameters[0].typical
     pulls, squares = [], []
     for sign in (1, -1):
-        moved = corrected(measurement, Model(T_mount, (term.at([sign * step]),)))
+        moved = corrected_capture(measurement, Model(T_mount, (term.at([sign * step]),)))
         pairs = target_pairs(moved.sightings, freed.poses)
-        both = joined(no_surface(VIEWS, g.centre, g.variance), pairs, 1.0)
+        both = append_targets(no_surface(VIEWS, g.centre, g.variance), pairs, 1.0)
         pulls.append(both.vector[both.labelled])
         squares.append(both.square[both.labelled])
     # Σ w e² changes by 2 Σ w g e.

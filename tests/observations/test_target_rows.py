@@ -8,17 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import lacking
-from stitch.measurement.capture import capture
+from stitch.effects.in_session import missing_need
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.model.forward import corrected, shift_targets
+from stitch.model.forward import corrected_capture, target_correction
 from stitch.model.model import Model
 from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import term_of
-from stitch.observations.targets.closed_form import closed_form
+from stitch.observations.targets.closed_form import closed_form_hand_eye
 from stitch.observations.targets.effect_rows import effect_rows
 from stitch.observations.targets.landmarks import initial_landmarks
-from stitch.observations.targets.rows import rows_of
+from stitch.observations.targets.rows import target_rows
 
 
 def off(T, true):
@@ -31,7 +31,7 @@ def off(T, true):
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_closed_form_is_exact_without_errors(mount):
     session, T_mount, *_ = labelled_cell(mount=mount, scatter=(0, 0), noise=1e-12)
-    angle, distance = off(closed_form(capture(session)), T_mount)
+    angle, distance = off(closed_form_hand_eye(prepare_capture(session)), T_mount)
     assert angle < 1e-9 and distance < 1e-6
 
 
@@ -39,26 +39,26 @@ def test_closed_form_of_a_probe_is_exact_without_errors():
     session, T_mount, *_ = labelled_cell(scatter=(0, 0), noise=1e-12, probe=True)
     views = [replace(v, sighting=replace(v.sighting, rotation=np.linalg.inv(T_mount)[:3, :3] @ v.T_base_flange[:3, :3]))
              for v in session.views]  # fmt: skip
-    angle, distance = off(closed_form(capture(replace(session, views=tuple(views)))), T_mount)
+    angle, distance = off(closed_form_hand_eye(prepare_capture(replace(session, views=tuple(views)))), T_mount)
     assert angle < 1e-9 and distance < 1e-6
 
 
 def test_rows_are_the_slopes_of_what_is_left():
     session, T_mount, *_ = labelled_cell(1, views=6, scatter=(0, 0), noise=1e-9)
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     for name in ("joint_offset", "link_geometry", "joint_compliance", "range_scale", "fixture_drift"):
         effect = EFFECTS[name]
-        if lacking(measurement, effect):
+        if missing_need(measurement, effect):
             continue
         zero, plain = term_of(measurement, effect), Model(T_mount)
         landmarks = initial_landmarks(measurement.capture, T_mount)
-        rows = rows_of(measurement.capture, T_mount, landmarks)
+        rows = target_rows(measurement.capture, T_mount, landmarks)
         (slopes,) = effect_rows(rows, measurement, plain, [zero])
         for i, parameter in enumerate(zero.parameters):
             step = 0.01 * parameter.typical
             stepped = [zero.at(s * step * np.eye(len(zero.values))[i]) for s in (1, -1)]
-            captures = [corrected(measurement, plain.with_term(term)) for term in stepped]
-            both = [rows_of(own, T_mount, landmarks).residual for own in captures]
+            captures = [corrected_capture(measurement, plain.with_term(term)) for term in stepped]
+            both = [target_rows(own, T_mount, landmarks).residual for own in captures]
             numeric = (both[0] - both[1]) / (2 * step)
             scale = max(np.abs(numeric).max(), 1e-12)
             np.testing.assert_allclose(
@@ -69,9 +69,9 @@ def test_rows_are_the_slopes_of_what_is_left():
 def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
     # The last joint's offset must not borrow from what is left, however large that is.
     session, T_mount, *_ = labelled_cell(1, views=12, scatter=(1e-3, 1.0))
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     term = term_of(measurement, EFFECTS["joint_offset"])
-    rows = rows_of(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
+    rows = target_rows(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
     column = effect_rows(rows, measurement, Model(T_mount), [term])[0][..., 5].ravel()
     landmarks = rows.landmarks.reshape(rows.residual.size, -1)
     left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
@@ -80,10 +80,10 @@ def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
 
 def test_slopes_of_shifts_are_linear_in_small_steps():
     session, T_mount, *_ = labelled_cell(1, views=4)
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     term = term_of(measurement, EFFECTS["range_scale"])
     poses = measurement.capture.poses(T_mount)
-    moved = shift_targets(measurement, [term.at([1e-4])], poses)
+    moved = target_correction(measurement, [term.at([1e-4])], poses)
     np.testing.assert_allclose(
-        moved, 1e-4 * PointSlopes.of(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
+        moved, 1e-4 * PointSlopes.about_model(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
     )

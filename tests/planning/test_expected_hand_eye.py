@@ -15,9 +15,9 @@ from stitch.errors import NoResultError
 from stitch.model.model import Model
 from stitch.planning.chances import ExpectedDiagnosis
 from stitch.planning.expected_hand_eye import expected_hand_eye
-from stitch.planning.expected_model import Cell, expected_model, seen
-from stitch.planning.expected_scan import Field
-from stitch.planning.planned_part import of_mesh
+from stitch.planning.expected_model import CellModel, expected_model, simulate_views
+from stitch.planning.expected_scan import FieldOfView
+from stitch.planning.planned_part import surface_of_mesh
 from stitch.planning.scatter import Scatter
 
 ROTATION, TRANSLATION = 5e-5, 0.03
@@ -29,10 +29,10 @@ def planned(request):
     """What a blade's cell measured, and its views as planned, with a scanner that has next to no noise."""
     measured = measured_blade(3, views=7, mount=request.param, pixels=8)
     reach = measured.scene.scanner.standoff
-    field = Field(np.array([0.3, 0.3]), 0.6 * reach, 1.4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
-    part = of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
-    cell = Cell(Model(measured.T_mount), part, field, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
-    found = seen(session_of(measured), cell)
+    field = FieldOfView(np.array([0.3, 0.3]), 0.6 * reach, 1.4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
+    cell = CellModel(Model(measured.T_mount), part, field, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    found = simulate_views(session_of(measured), cell)
     return measured, found, expected_model(found, cell)
 
 
@@ -97,8 +97,8 @@ def test_views_that_see_nothing_are_refused(planned):
     measured, _, linear = planned
     session = session_of(measured)
     reach = measured.scene.scanner.standoff
-    blind = Field(np.array([0.3, 0.3]), 3 * reach, 4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
-    part = of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
-    cell = Cell(Model(measured.T_mount), part, blind, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    blind = FieldOfView(np.array([0.3, 0.3]), 3 * reach, 4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
+    cell = CellModel(Model(measured.T_mount), part, blind, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
     with pytest.raises(NoResultError, match=r"view v000 would see next to nothing"):
-        seen(replace(session, name="blind"), cell)
+        simulate_views(replace(session, name="blind"), cell)

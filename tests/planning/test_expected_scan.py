@@ -6,16 +6,16 @@ import trimesh
 
 from data_synth.fixtures.ideal_scanner import facing
 from stitch.errors import InputError
-from stitch.planning.expected_scan import Field, expected_scan
-from stitch.planning.planned_part import block, of_mesh, surface_of_file
+from stitch.planning.expected_scan import FieldOfView, expected_scan
+from stitch.planning.planned_part import block_surface, surface_of_file, surface_of_mesh
 
-WIDE = Field(np.array([2.0, 2.0]), 1.0, 1e4, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
+WIDE = FieldOfView(np.array([2.0, 2.0]), 1.0, 1e4, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
 
 
 def test_of_a_sphere_it_sees_the_cap_that_faces_it():
     """A ray meets the sphere at 75° where sin φ = R sin 75° / D; the cap up to there is (1 − cos(75° − φ))/2 of it."""
     radius, distance, limit = 100.0, 400.0, np.radians(75.0)
-    sphere = of_mesh(trimesh.creation.icosphere(subdivisions=5, radius=radius))
+    sphere = surface_of_mesh(trimesh.creation.icosphere(subdivisions=5, radius=radius))
     seen = len(expected_scan(sphere, facing(distance), WIDE)) / len(sphere.points)
     cap = (1 - np.cos(limit - np.arcsin(radius * np.sin(limit) / distance))) / 2
     assert seen == pytest.approx(cap, abs=4 * np.sqrt(cap * (1 - cap) / len(sphere.points)))
@@ -26,7 +26,7 @@ def test_a_tower_hides_what_lies_behind_it():
     floor = trimesh.creation.box([300.0, 300.0, 1.0])
     tower = trimesh.creation.box([60.0, 60.0, 150.0])
     tower.apply_translation([0, 0, 75.0])
-    part = of_mesh(trimesh.util.concatenate([floor, tower]))
+    part = surface_of_mesh(trimesh.util.concatenate([floor, tower]))
     seen = part.points[expected_scan(part, facing(500.0), WIDE)]
     on_floor = np.abs(seen[seen[:, 2] < 1.0][:, :2]).max(axis=1)
     # Rays are as wide as two distances between points: 6 mm.
@@ -36,8 +36,8 @@ def test_a_tower_hides_what_lies_behind_it():
 
 
 def test_beyond_its_field_and_reach_it_sees_nothing():
-    part = block(200.0)
-    narrow = Field(np.array([0.1, 0.1]), 400.0, 600.0, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
+    part = block_surface(200.0)
+    narrow = FieldOfView(np.array([0.1, 0.1]), 400.0, 600.0, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
     seen = part.points[expected_scan(part, facing(500.0), narrow)]
     assert len(seen) and (np.abs(seen[:, :2]) <= 0.1 * (500.0 - seen[:, 2:])).all()
     assert not len(expected_scan(part, facing(800.0), narrow))

@@ -14,13 +14,13 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import concluded
+from stitch.diagnosis.conclusion import decide
 from stitch.diagnosis.plausible_scatter import scatter_limit
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.planning.cells import cell_of_session
-from stitch.planning.expected_model import seen
+from stitch.planning.expected_model import simulate_views
 from stitch.planning.further_views import with_views
-from stitch.planning.plan import Wanted, plan
+from stitch.planning.plan import PlanRequest, plan_further_views
 from stitch.reading.session_folder import load_session
 
 VIEWS = 6
@@ -137,7 +137,7 @@ def test_views_that_are_to_split_two_effects_do(planned, measured):
     session = load_session(planned / "s", scans=False)
     known = cell_of_session(session, planned / "blade.ply")
     rivals = ("joint_compliance", "gear_eccentricity")
-    found = plan(session, known, Wanted(halve=False, split=rivals, split_any=False, views=8))
+    found = plan_further_views(session, known, PlanRequest(halve=False, split=rivals, split_any=False, views=8))
     assert found.proposed
     further = with_views(session, [view.joints for view in found.proposed])
     named = [[_named(s, known.cell, measured, draw) for draw in range(3)] for s in (session, further)]
@@ -147,14 +147,14 @@ def test_views_that_are_to_split_two_effects_do(planned, measured):
 def _named(session, cell, measured, draw):
     """Whether a diagnosis names the compliance, where views are freed to where a bent, scattering arm truly was."""
     rng, arm = np.random.default_rng([7, draw]), measured.scene.arm
-    found = seen(session, cell)
+    found = simulate_views(session, cell)
     joints = np.array([view.joints for view in session.views])
     torque = kinematics.gravity_torques(arm, joints)
     compliance = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * 4e-4 / np.abs(torque[:, 1]).max()
     scatter = rng.standard_normal((len(joints), 6)) * np.repeat([2e-5, 0.02], 3)
     true = kinematics.flange(arm, joints + compliance * torque) @ frames.exp(scatter)
     poses = true @ cell.model.T_mount
-    freed = replace(found.freed, poses=poses).seen_from(found.freed.poses)
+    freed = replace(found.unconstrained, poses=poses).relative_to(found.unconstrained.poses)
     linear = surface_model(found.measurement, cell.model, found.measurement.capture, freed)
-    selection = concluded(linear, candidates_of(linear)[0], scatter_limit(session_of(measured)))
+    selection = decide(linear, candidates_of(linear)[0], scatter_limit(session_of(measured)))
     return selection.verdict == "missing_effect" and selection.named[0].name == "joint_compliance"

@@ -5,16 +5,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stitch.planning.choose_views import choose_views, in_order
+from stitch.planning.choose_views import choose_views, travel_order
 from stitch.planning.goals import HalvedHandEye
-from stitch.planning.view_search import Channel, noise_of, separations
+from stitch.planning.view_search import TwistChannel, noise_of, separations
 
 
 @pytest.fixture
 def channel():
     rng = np.random.default_rng(0)
     half = rng.standard_normal((60, 60))
-    return Channel(half @ half.T + np.eye(60), rng.standard_normal((60, 9)))
+    return TwistChannel(half @ half.T + np.eye(60), rng.standard_normal((60, 9)))
 
 
 def test_one_more_view_is_worth_what_the_whole_says(channel):
@@ -50,7 +50,7 @@ def test_the_chosen_views_are_the_best_there_are(channel):
     chosen = choose_views([goal], joints, present=3, most=2)
     best = min(float(goal.U(channel.normal([0, 1, 2, *pair]))) for pair in combinations(range(3, 10), 2))
     assert float(goal.U(channel.normal([0, 1, 2, *chosen]))) == pytest.approx(best, rel=0.02)
-    assert in_order(np.array([[0.0], [5.0], [1.0], [3.0]]), 0, [1, 2, 3]) == [2, 3, 1]
+    assert travel_order(np.array([[0.0], [5.0], [1.0], [3.0]]), 0, [1, 2, 3]) == [2, 3, 1]
 
 
 def test_no_view_is_chosen_that_is_not_needed(channel):

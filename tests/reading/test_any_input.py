@@ -13,8 +13,8 @@ from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 from stitch.reading.frames_csv import read_frames
 from stitch.reading.points_csv import read_points
-from stitch.reading.scanner_toml import scanner, within
-from stitch.reading.session_toml import cad, document, name_of, positive, robot
+from stitch.reading.scanner_toml import read_crop_box, read_scanner
+from stitch.reading.session_toml import cad_file, positive_number, read_robot, read_session_document, session_name
 from stitch.reading.views_csv import read_views
 from stitch.stored.run_documents import read_ledger, read_result
 
@@ -101,18 +101,18 @@ def test_descriptions_of_anything(tmp_path, text, value, key):
     file = tmp_path / "session.toml"
     file.write_text(f'format = "stitch-session/1"\n{text}', encoding="utf-8")
     with read_or_refused():
-        document(file)
+        read_session_document(file)
     tables = {key: value} if key == "name" else {key: value if isinstance(value, dict) else {}}
     inner = tables[key] if isinstance(tables[key], dict) else {}
     for read in (
-        lambda: name_of(file, {"name": value}),
-        lambda: scanner(file, inner | {"pose": value, "noise": value}),
-        lambda: within(file, inner | {"within": value}),
-        lambda: robot(file, {"joints": value, "gravity": value}, "mm"),
-        lambda: robot(file, {"joints": [{"a": value, "com": value}], "payload": value}, "mm"),
-        lambda: robot(file, {"urdf": value}, "mm"),
-        lambda: cad(file, {"cad": value, "cad_unit": value}),
-        lambda: positive(file, {"radius": value}, "sphere", "radius"),
+        lambda: session_name(file, {"name": value}),
+        lambda: read_scanner(file, inner | {"pose": value, "noise": value}),
+        lambda: read_crop_box(file, inner | {"within": value}),
+        lambda: read_robot(file, {"joints": value, "gravity": value}, "mm"),
+        lambda: read_robot(file, {"joints": [{"a": value, "com": value}], "payload": value}, "mm"),
+        lambda: read_robot(file, {"urdf": value}, "mm"),
+        lambda: cad_file(file, {"cad": value, "cad_unit": value}),
+        lambda: positive_number(file, {"radius": value}, "sphere", "radius"),
     ):
         with read_or_refused():
             read()

@@ -84,4 +84,4 @@ def test_a_folder_of_such_scans_needs_no_table(tmp_path):
     first = first_session(tmp_path, StatedFolder())
     files = next(guess for guess in first.guesses if guess.what == "files")
     assert "4 poses in their headers" in files.value and first.pairing.by_name
-    assert first.decided.best.way.length_unit == "m"
+    assert first.choice.best.interpretation.length_unit == "m"

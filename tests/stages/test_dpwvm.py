@@ -8,8 +8,8 @@ import pytest
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
 from stitch.observations.surfaces.gram import gram
-from stitch.observations.surfaces.match import Match, sample
-from stitch.observations.surfaces.overlaps import collect
+from stitch.observations.surfaces.match import Match, sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps
 from stitch.observations.surfaces.pose_channel import Repeatability
 from stitch.stages.dpwvm import (
     OffsetSums,
@@ -108,7 +108,7 @@ def cell():
 
 def test_weights_do_not_change_with_an_offset_nor_with_the_order_of_views(cell):
     capture, poses, _ = cell
-    matches = collect(capture, poses, 1.0, [sample(s, 1000) for s in capture.scans]).matches
+    matches = collect_overlaps(capture, poses, 1.0, [sample_points(s, 1000) for s in capture.scans]).matches
     weights = np.concatenate(dpwvm_weights(matches, capture, poses))
     raised = [replace(m, residual=m.residual + 0.3 * (m.v == 0)) for m in matches]
     turned = [m.turned() for m in matches]
@@ -190,7 +190,7 @@ def test_register_ends_where_neither_rms_nor_step_falls_and_says_so(cell):
 
 def test_progress_counts_iterations_without_a_fall(cell):
     capture, poses, _ = cell
-    g = collect(capture, poses, 1.0, [sample(s, 300) for s in capture.scans]).gram
+    g = collect_overlaps(capture, poses, 1.0, [sample_points(s, 300) for s in capture.scans]).gram
     progress, step = Progress(), np.ones((5, 6))
     assert progress.made(g, step, 1.0)
     assert not progress.made(g, step, 1.0)

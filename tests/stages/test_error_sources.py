@@ -8,11 +8,11 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from stitch import pipeline
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
-from stitch.observations.error_model import WHITE
-from stitch.observations.pose_errors import STOPS, pose_errors, usual_sizes
+from stitch.observations.error_model import WHITE_COMPONENTS
+from stitch.observations.pose_errors import STOP_COMPONENTS, prior_pose_errors, usual_sizes
 from stitch.stages.error_sources import SOURCES, unfitted
 
 
@@ -21,9 +21,9 @@ def test_every_component_has_words():
     session, T_mount, _ = labelled_cell(1, views=4)
     twice = (*session.views, replace(session.views[-1], name="again"))
     session = replace(session, robot=replace(session.robot, mass=np.ones(6)), views=twice)
-    prior = pose_errors([measurement_of(session, capture(session))], Model(T_mount), [np.zeros(3)])
-    assert set(STOPS) | set(usual_sizes()) <= set(prior.names)
-    assert {*WHITE, *prior.names} <= set(SOURCES)
+    prior = prior_pose_errors([measurement_of(session, prepare_capture(session))], Model(T_mount), [np.zeros(3)])
+    assert set(STOP_COMPONENTS) | set(usual_sizes()) <= set(prior.names)
+    assert {*WHITE_COMPONENTS, *prior.names} <= set(SOURCES)
     assert len(set(SOURCES.values())) == len(SOURCES) and not set(SOURCES) & set(SOURCES.values())
 
 

@@ -7,27 +7,27 @@ from scipy.spatial import KDTree
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.measurement.thinning import points_within, thinned
-from stitch.model.forward import corrected
+from stitch.measurement.thinning import points_within, thin_session
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.term import term_of
 from stitch.reading.session_folder import load_session
 from stitch.stages.fuse import fuse
-from stitch.stages.fuse_whole import Registered, fuse_every_point
+from stitch.stages.fuse_whole import RegisteredSession, fuse_every_point
 
 
 def registered(session, measured, effect=None):
     """The session at its true poses; with an effect of 0.3 of its plausible size in use."""
-    measurement = measurement_of(session, capture(session))
+    measurement = measurement_of(session, prepare_capture(session))
     terms = ()
     if effect is not None:
         term = term_of(measurement, EFFECTS[effect])
         terms = (term.at(0.3 * term.typical),)
     model = Model(measured.T_mount, terms)
-    own = corrected(measurement, model)
-    return Registered(session, measurement, model, own, own.poses(measured.T_mount))
+    own = corrected_capture(measurement, model)
+    return RegisteredSession(session, measurement, model, own, own.poses(measured.T_mount))
 
 
 @pytest.mark.parametrize("effect", [None, "field_curvature", "intensity_bias", "part_growth"])
@@ -37,7 +37,7 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     session = session_of(measured)
     whole = registered(session, measured, effect)
     # Standardised over the points in memory, and the model speaks of these: the same numbers on both sides.
-    light = registered(thinned(session, 1500)[0], measured, effect)
+    light = registered(thin_session(session, 1500)[0], measured, effect)
     assert all(len(scan.points) == 1500 for scan in light.own.scans)
     cell = float(np.median([scan.scanned_spacing for scan in light.own.scans]))
     expected = fuse(whole.own, whole.poses, cell)
@@ -53,7 +53,7 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
 
 def test_the_number_of_slabs_does_not_matter(blade_capture):
     measured, _ = blade_capture
-    light = registered(thinned(session_of(measured), 2000)[0], measured)
+    light = registered(thin_session(session_of(measured), 2000)[0], measured)
     one, many = (fuse_every_point(light, slab=slab) for slab in (10**9, 1500))
     for name in ("points", "normals", "residual", "count"):
         assert np.array_equal(getattr(one, name), getattr(many, name), equal_nan=True)

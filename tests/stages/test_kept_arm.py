@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
-from stitch.model.arm import kept_arm
+from stitch.model.arm import keep_arm_effects
 from stitch.pipeline import run
 from stitch.writing.result_document import model_of
 
@@ -21,7 +21,7 @@ OFFSET = np.array([0, 1e-3, -1.5e-3, 4e-4, 2e-3, 0])
 def arm_of(seed, views=40):
     """What a session with its own mount says about the arm."""
     session, *_ = labelled_cell(seed, views=views, offset=OFFSET)
-    return kept_arm(model_of(run(session, effects=["joint_offset"])))
+    return keep_arm_effects(model_of(run(session, effects=["joint_offset"])))
 
 
 def error_of(found, T_mount):

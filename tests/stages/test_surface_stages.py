@@ -15,10 +15,10 @@ from stitch.errors import NoResultError
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
-from stitch.observations.pose_errors import pose_errors
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.overlaps import collect
-from stitch.stages.coarse import coarse
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.overlaps import collect_overlaps
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse
 from stitch.stages.observability import unobservable
@@ -45,10 +45,10 @@ def test_hand_eye_error_is_what_the_covariance_predicts(mount):
         start, own = disturbed(measured.T_mount, seed), measurement_of(session_of(measured), capture)
 
         def erring(freed, T_mount, own=own):
-            return pose_errors([own], Model(T_mount), [f.overlaps.gram.centre for f in freed])
+            return prior_pose_errors([own], Model(T_mount), [f.overlaps.gram.centre for f in freed])
 
         gate = 0.35 * part_size([capture])
-        found = correct([capture], start, gate, erring=erring).hand_eye
+        found = correct([capture], start, gate, pose_error_prior=erring).hand_eye
         xi = frames.log(frames.inverse(measured.T_mount) @ found.T_mount)
         _, J = at_part(capture, found.T_mount)
         errors.append(np.sum((J @ xi) ** 2))
@@ -84,8 +84,11 @@ def test_register_reaches_the_noise_and_finds_the_pose_errors():
 def test_perfect_poses_leave_the_noise_that_was_put_in():
     measured, capture = captured_blade(2, repeatability=(0.0, 0.0))
     found = correct([capture], disturbed(measured.T_mount, 2, 0.5, 3.0), 10.0)
-    truth = collect(
-        capture, capture.poses(measured.T_mount), found.overlaps[0].gate, [sample(s, 3000) for s in capture.scans]
+    truth = collect_overlaps(
+        capture,
+        capture.poses(measured.T_mount),
+        found.overlaps[0].gate,
+        [sample_points(s, 3000) for s in capture.scans],
     )
     assert found.overlaps[0].gram.rms == pytest.approx(truth.gram.rms, rel=0.03)
 
@@ -106,7 +109,7 @@ def test_several_captures_share_one_hand_eye():
 @pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_a_hand_eye_is_found_from_nothing(mount):
     measured, capture = captured_blade(5, mount=mount, pixels=110)
-    found = coarse([capture])
+    found = find_coarse_hand_eye([capture])
     assert found.runner_up_ratio > 1.1
     fine = correct([capture], found.T_mount, found.gate).hand_eye
     xi = frames.log(frames.inverse(measured.T_mount) @ fine.T_mount)

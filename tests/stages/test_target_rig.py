@@ -12,13 +12,13 @@ from stitch import frames
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
-from stitch.model.forward import corrected
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.term import term_of
 from stitch.observations.targets.landmarks import initial_landmarks
 from stitch.pipeline import run, run_rig
 from stitch.runs.state import state_of
-from stitch.stages.fit_targets import Begun, _Targets
+from stitch.stages.fit_targets import TargetStart, _TargetProblem
 
 OFFSET = np.array([0, 1e-3, -0.7e-3, 0, 0.8e-3, 0])
 
@@ -115,9 +115,9 @@ def test_a_parameter_that_goes_to_zero_is_made_up_for_in_the_same_step():
     for value in (0.0, 1e-5):
         term = term_of(found.measurement, EFFECTS["joint_offset"])
         model = Model(found.model.T_mount, (term.at(np.array([0, value, 0, 0, 0, 0])),))
-        landmarks = initial_landmarks(corrected(found.measurement, model), model.T_mount)
-        begun = Begun(found.measurement, model, landmarks)
-        step = _Targets([begun]).linearise(model, None).solve(np.zeros(6, bool))
+        landmarks = initial_landmarks(corrected_capture(found.measurement, model), model.T_mount)
+        begun = TargetStart(found.measurement, model, landmarks)
+        step = _TargetProblem([begun]).linearise(model, None).solve(np.zeros(6, bool))
         assert not step.model.terms[0].values.any()
         ends.append(step.model.T_mount)
     moved_by_it = 1e-5 * 1000

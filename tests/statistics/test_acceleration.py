@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.acceleration import accelerated
+from stitch.statistics.acceleration import anderson_step
 
 
 def left_after(steps, undone, accelerate):
@@ -11,7 +11,7 @@ def left_after(steps, undone, accelerate):
     off, last = np.ones(len(undone)), None
     for _ in range(steps):
         asked = -(1 - undone) * off
-        taken = asked if last is None or not accelerate else accelerated(asked, *last)
+        taken = asked if last is None or not accelerate else anderson_step(asked, *last)
         last, off = (asked, taken), off + taken
     return float(np.abs(off).max())
 
@@ -33,4 +33,4 @@ def test_steps_that_turn_back_are_shortened_and_never_run_away():
 
 
 def test_no_step_at_all_stays_none():
-    assert np.array_equal(accelerated(np.zeros(3), np.zeros(3), np.zeros(3)), np.zeros(3))
+    assert np.array_equal(anderson_step(np.zeros(3), np.zeros(3), np.zeros(3)), np.zeros(3))

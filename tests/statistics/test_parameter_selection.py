@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from stitch.statistics.identifiability import independent
-from stitch.statistics.parameter_selection import Whitened, omitted_rms, supported
+from stitch.statistics.parameter_selection import WhitenedData, omitted_rms, select_supported
 
 
 @settings(max_examples=25, deadline=None)
@@ -30,7 +30,7 @@ def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
         rng = np.random.default_rng(seed)
         own, further = rng.standard_normal((60, 6)), rng.standard_normal((60, 9))
         z = further[:, 2] * 1.5 + own @ rng.standard_normal(6) + rng.standard_normal(60)
-        chosen = supported(Whitened(own, further, z), np.full(9, 0.5), groups, [0] * 6)
+        chosen = select_supported(WhitenedData(own, further, z), np.full(9, 0.5), groups, [0] * 6)
         assert chosen[2] and chosen[3]
         others += chosen.sum() > 2
     # 5 groups whose log evidence exceeds 2.5 by chance in some 0.4 % each.
@@ -45,22 +45,24 @@ def test_two_that_only_together_explain_are_found():
         own, shared, further = rng.standard_normal((60, 6)), rng.standard_normal(60), rng.standard_normal((60, 6))
         further[:, 1:3] = 5 * shared[:, None] + 0.4 * rng.standard_normal((60, 2))
         z = further[:, 1] - further[:, 2] + 0.3 * rng.standard_normal(60)
-        chosen = supported(Whitened(own / 0.3, further / 0.3, z / 0.3), np.ones(6), [[i] for i in range(6)], [0] * 6)
+        chosen = select_supported(
+            WhitenedData(own / 0.3, further / 0.3, z / 0.3), np.ones(6), [[i] for i in range(6)], [0] * 6
+        )
         missed += not (chosen[1] and chosen[2])
     assert not missed
 
 
 def test_an_effect_keeps_a_group_that_is_seen():
     rng = np.random.default_rng(1)
-    noise = Whitened(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), np.zeros(60))
+    noise = WhitenedData(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), np.zeros(60))
     noise.further[:, 0] = 0.0
-    assert not supported(noise, np.ones(3), [[0], [1], [2]], [0] * 3)[0]
+    assert not select_supported(noise, np.ones(3), [[0], [1], [2]], [0] * 3)[0]
 
 
 def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
     rng = np.random.default_rng(0)
-    noise = Whitened(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60))
-    chosen = supported(noise, np.full(3, 0.1), [[0], [1], [2]], [0, 0, 1])
+    noise = WhitenedData(rng.standard_normal((60, 6)), rng.standard_normal((60, 3)), rng.standard_normal(60))
+    chosen = select_supported(noise, np.full(3, 0.1), [[0], [1], [2]], [0, 0, 1])
     assert chosen[2] and chosen[:2].sum() == 1
 
 
@@ -77,7 +79,7 @@ def test_what_nobody_sees_is_believed_of_the_size_of_its_like():
         further[:, 5] = 0.0
         z = further @ amplitudes + rng.standard_normal(30)
         fitted = np.abs(amplitudes) * (np.arange(6) < 5) > 0.2
-        told.append(omitted_rms(Whitened(np.zeros((30, 0)), further, z), np.ones(6), fitted, np.zeros(6))[5] ** 2)
+        told.append(omitted_rms(WhitenedData(np.zeros((30, 0)), further, z), np.ones(6), fitted, np.zeros(6))[5] ** 2)
         true.append(amplitudes[5] ** 2)
     told, true = np.array(told), np.array(true)
     for some in (told < 0.2, (told > 0.2) & (told < 0.6), told > 0.6):
@@ -94,11 +96,14 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
         amplitude = size * rng.standard_normal() * rng.integers(0, 2)
         z = own @ rng.standard_normal(2) + further[:, 0] * amplitude + rng.standard_normal(12)
         told.append(
-            omitted_rms(Whitened(own, further, z), np.array([size]), np.zeros(1, bool), np.zeros(1))[0] ** 2 / size**2
+            omitted_rms(WhitenedData(own, further, z), np.array([size]), np.zeros(1, bool), np.zeros(1))[0] ** 2
+            / size**2
         )
         true.append(amplitude**2 / size**2)
     apart = np.array(told) - true
     assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
     # Beside a column that is fitted and says the same nothing is known of it but its size.
-    same = omitted_rms(Whitened(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]), np.arange(2))
+    same = omitted_rms(
+        WhitenedData(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]), np.arange(2)
+    )
     np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)

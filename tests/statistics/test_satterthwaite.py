@@ -26,4 +26,4 @@ def test_a_group_of_numbers_knows_its_own_variance(share, expected):
     white = np.zeros((1, sum(GROUPS), 1))
     white[0, :2, 0] = np.sqrt((1 - share) / 2) * np.array([1, -1])
     white[0, 30:32, 0] = np.sqrt(share / 2) * np.array([1, -1])
-    assert satterthwaite(evidence, null).of(white) == pytest.approx(expected, rel=1e-6)
+    assert satterthwaite(evidence, null).degrees_of_freedom(white) == pytest.approx(expected, rel=1e-6)

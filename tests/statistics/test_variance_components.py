@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
-from stitch.statistics.inverse import inverted
-from stitch.statistics.restricted_likelihood import MixedModel, deviance, problem_of
+from stitch.statistics.inverse import invert_covariance
+from stitch.statistics.restricted_likelihood import MixedModel, deviance, reml_problem
 from stitch.statistics.variance_components import at_variances, fit_variances
-from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
-from stitch.statistics.variance_scoring import scored
+from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+from stitch.statistics.variance_scoring import fisher_scoring
 
 
 def test_variances_are_found_again():
@@ -75,14 +75,14 @@ def test_scatter_that_no_number_has_is_none():
 def test_variances_beyond_all_numbers_are_as_unlikely_as_nothing_else():
     mixed = MixedModel(np.ones((1, 4)), np.zeros((1, 4, 0)), np.eye(4)[None, None])
     for log_variance in (800.0, np.nan):
-        value, slope = deviance(np.array([log_variance]), problem_of(mixed, None, None))
+        value, slope = deviance(np.array([log_variance]), reml_problem(mixed, None, None))
         assert value == 1e300 and not slope.any()
 
 
 def test_one_block_is_inverted_as_many_are():
     half = np.random.default_rng(4).normal(size=(2, 7, 7))
     V = half @ half.transpose(0, 2, 1) + np.eye(7)
-    both, alone = inverted(V), [inverted(V[:1]), inverted(V[1:])]
+    both, alone = invert_covariance(V), [invert_covariance(V[:1]), invert_covariance(V[1:])]
     assert sum(one.logdet for one in alone) == pytest.approx(both.logdet)
     assert both.logdet == pytest.approx(np.linalg.slogdet(V)[1].sum())
     for b, one in enumerate(alone):
@@ -91,10 +91,10 @@ def test_one_block_is_inverted_as_many_are():
         for own in (one.half[0], both.half[b]):
             assert np.allclose(own @ V[b] @ own.T, np.eye(7), atol=1e-12)
             assert not np.triu(own, 1).any()
-    assert inverted(-V[:1]).logdet == inverted(-V).logdet == np.inf
+    assert invert_covariance(-V[:1]).logdet == invert_covariance(-V).logdet == np.inf
 
 
-@pytest.mark.parametrize("shape", [None, MAY_BE_ABSENT, THERE])
+@pytest.mark.parametrize("shape", [None, MAY_BE_ABSENT, ALWAYS_PRESENT])
 def test_scoring_ends_where_a_search_ends(shape):
     """Sixty blocks go by scoring, to where a search with scipy ends; from far away it may leave that to the search.
 
@@ -112,10 +112,10 @@ def test_scoring_ends_where_a_search_ends(shape):
         further = FurtherPrior(np.array([0.3]), np.array([shape]), np.zeros(1, bool))
     V = np.einsum("c,cbij->bij", true, components)
     z = np.einsum("bij,bj->bi", np.linalg.cholesky(V), rng.normal(size=(blocks, m)))
-    problem = problem_of(MixedModel(z, np.ones((blocks, m, 1)), components, further=further), None, None)
+    problem = reml_problem(MixedModel(z, np.ones((blocks, m, 1)), components, further=further), None, None)
     for factor in (1.0, 30.0, 0.05):
         begin = np.log(true * [factor, 1 / factor, *np.ones(len(true) - 2)])
-        found = scored(problem, begin, 1e-3)
+        found = fisher_scoring(problem, begin, 1e-3)
         looked = minimize(
             lambda x: deviance(x, problem),
             begin,

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
-from stitch.statistics.variance_prior import MAY_BE_ABSENT, THERE, FurtherPrior
+from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 
 N, SCALE = 40, 0.5
 
@@ -37,7 +37,7 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
         weights = np.linalg.solve(V, ones)
         mean = float(weights @ mixed.z[0] / weights.sum())
         likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
-        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.further.kin[0] else np.zeros(1)
+        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.further.common_factor[0] else np.zeros(1)
         over = b - 2 * np.log(SCALE) - 2 * factors
         (shape,) = mixed.further.shapes
         further = logsumexp(0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)))
@@ -55,15 +55,15 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
         (0.0, True, MAY_BE_ABSENT),
         (0.5, True, MAY_BE_ABSENT),
         (2.0, True, MAY_BE_ABSENT),
-        (0.0, False, THERE),
-        (0.5, False, THERE),
+        (0.0, False, ALWAYS_PRESENT),
+        (0.5, False, ALWAYS_PRESENT),
     ],
 )
 def test_the_average_is_the_integral(size, kin, shape, monkeypatch):
     # 400 rounds know the mean of what spreads by as much as itself to a twentieth; of one size and a factor on it, of
     # which each follows the other, more are asked.
     monkeypatch.setattr("stitch.statistics.variance_posterior._ROUNDS", 2000 if kin else 400)
-    mixed = shared_errors(size, kin=kin, shape=shape)
+    mixed = shared_errors(size, common_factor=kin, shape=shape)
     found = mean_variances(mixed, fit_variances(mixed))
     assert found[2:] == pytest.approx(on_a_grid(mixed), rel=1 / 20, abs=0.01)
     assert (found[:2] == 0).all() or (found[:2] < 1e-100).all()

@@ -9,7 +9,7 @@ import pytest
 from stitch.errors import InputError
 from stitch.system import whole_folder
 from stitch.system.locks import only_writer
-from stitch.system.whole_folder import claimed, rewritten
+from stitch.system.whole_folder import claim_folder, rewrite_folder
 
 
 def ours(inside):
@@ -42,7 +42,7 @@ KEPT = {
 
 
 def rewrite(run):
-    with rewritten(run, ours) as scratch:
+    with rewrite_folder(run, ours) as scratch:
         (scratch / "model").write_text("new")
 
 
@@ -76,7 +76,7 @@ def test_what_is_new_is_on_the_disk_before_it_takes_its_place(run, monkeypatch):
 
 def test_a_block_that_fails_changes_nothing(run, tmp_path):
     before = contents(run)
-    with pytest.raises(OSError, match="disk full") as error, rewritten(run, ours) as scratch:
+    with pytest.raises(OSError, match="disk full") as error, rewrite_folder(run, ours) as scratch:
         (scratch / "model").write_text("new")
         raise OSError(28, "disk full", str(scratch / "model"))
     assert contents(run) == before and list(tmp_path.iterdir()) == [run]
@@ -101,7 +101,7 @@ def test_an_end_at_any_moment_of_a_change_in_place_is_made_good(run, monkeypatch
         rewrite(run)
         os._exit(0)
     os.waitpid(process, 0)
-    with claimed(run):
+    with claim_folder(run):
         pass
     assert contents(run) in (before, KEPT | {"model": "new"})
 

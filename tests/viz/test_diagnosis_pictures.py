@@ -16,7 +16,7 @@ from stitch.effects.contract import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.observations.surfaces.field_map import FieldMap
 from stitch.pipeline import diagnose, run
-from stitch.writing.run_contents import ours
+from stitch.writing.run_contents import is_run_file
 from tests.diagnosis.freed_blade import freed_blade
 from viz import captions
 from viz.budget_figure import budget
@@ -77,15 +77,15 @@ def test_zero_is_white_and_places_without_points_are_empty(field: FieldMap):
 
 def test_a_map_is_drawn_where_it_is_found_alone(found: Diagnosis, field: FieldMap):
     shown = FieldError(0.02, 0.0, 9.0, over_noise=True, map=field)
-    picture = _pictures(replace(found, smooth=shown), "mm")["field_map"]
+    picture = _pictures(replace(found, scanner_error=shown), "mm")["field_map"]
     assert picture.figure is not None and "23 µm rms" in picture.caption and "3 µm" in picture.caption
     for nothing in (None, replace(shown, map=None)):
-        assert _pictures(replace(found, smooth=nothing), "mm")["field_map"].figure is None
+        assert _pictures(replace(found, scanner_error=nothing), "mm")["field_map"].figure is None
 
 
 def test_every_picture_is_the_runs_own(found: Diagnosis, tmp_path):
     """Or a later run would not replace it."""
-    is_own = ours(tmp_path)
+    is_own = is_run_file(tmp_path)
     assert all(is_own((tmp_path / "pictures" / f"{name}.png").relative_to(tmp_path)) for name in _pictures(found, "mm"))
 
 

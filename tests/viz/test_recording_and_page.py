@@ -131,7 +131,7 @@ def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp
 def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
     found = diagnose(run(labelled_cell(3, views=30)[0]))
     angle, error = np.array([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
-    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), stood=angle)
+    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle)
     file = RecordingFile("stitch", tmp_path / "d.rrd")
     log_diagnosis(file.stream, replace(found, curves=(course,)), None, "mm")
     file.write()

@@ -10,7 +10,7 @@ import pytest
 from markupsafe import escape
 
 from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import judged, plain_verdict
+from stitch.comparison.plain_verdict import check_tolerance, plain_verdict
 from stitch.comparison.run_verdict import run_headline
 from stitch.writing.result_document import result_document
 from tests.in_browser import require_for_everybody
@@ -120,7 +120,7 @@ def test_the_light_follows_the_tolerance(recorded):
     ]
     assert reaches[1] < reaches[0]
     tolerances = (1.01 * reaches[0], np.mean(reaches), 0.99 * reaches[1])
-    assert [judged(history, t, "mm").light for t in tolerances] == ["good", "check", "bad"]
+    assert [check_tolerance(history, t, "mm").light for t in tolerances] == ["good", "check", "bad"]
 
 
 def contrast(one, other):

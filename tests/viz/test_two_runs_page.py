@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from stitch import frames
 from stitch.cli.main import main
 from stitch.comparison.model_history import model_history
-from stitch.comparison.two_runs import hand_eye_change, sentence, two_runs
+from stitch.comparison.two_runs import compare_runs, comparison_sentence, hand_eye_change
 from stitch.errors import InputError
 from tests.in_browser import WAYS, require_for_everybody, shown
 from viz.two_runs_page import write_two_runs
@@ -32,7 +32,7 @@ def pair(recorded):
 @pytest.fixture(scope="module")
 def file(pair, tmp_path_factory):
     path = tmp_path_factory.mktemp("two") / "two.html"
-    write_two_runs(two_runs(pair, ("before", "after <2>")), path, tolerance=0.1)
+    write_two_runs(compare_runs(pair, ("before", "after <2>")), path, tolerance=0.1)
     return path
 
 
@@ -72,24 +72,24 @@ def test_runs_whose_numbers_mean_other_things_are_refused(recorded):
     }
     for words, other in others.items():
         with pytest.raises(InputError, match=f"x and y cannot be compared: .*{words}.*to fix"):
-            two_runs((run, other), ("x", "y"))
+            compare_runs((run, other), ("x", "y"))
 
 
 def test_the_sentence_says_what_changed_and_whether_the_data_did(pair, tmp_path):
     a, b = pair
-    same = sentence(two_runs((a, a), ("a", "a")))
+    same = comparison_sentence(compare_runs((a, a), ("a", "a")))
     assert same.startswith("With the same effects in the model, the views of B disagree as far as those of A, by")
     assert same.endswith("both have the same hand-eye.")
     elsewhere = replace(b, session=replace(b.session, path=tmp_path))
-    both = two_runs((a, elsewhere), ("a", "b"))
+    both = compare_runs((a, elsewhere), ("a", "b"))
     assert not both.same_data
     before, after = (f"{1e3 * model_history(x).models[-1].field.mean_abs:.3g} µm" for x in (a, b))
-    assert f"on other data, the views of B disagree by {after} instead of {before}" in sentence(both)
+    assert f"on other data, the views of B disagree by {after} instead of {before}" in comparison_sentence(both)
     assert [row.name for row in facts(both) if row.differs] == ["data (SHA-256)"]
 
 
 def test_views_stand_by_how_much_they_changed(pair):
-    both = two_runs(pair, ("a", "b"))
+    both = compare_runs(pair, ("a", "b"))
     rows = view_change_rows(both)
     off = [model_history(run).models[-1].field.values for run in pair]
     names = [view.name for view in pair[0].session.views]

@@ -7,8 +7,8 @@ from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
 from stitch.watch.cell_assessment import cell_report
-from stitch.watch.cell_course import cell_course
-from stitch.watch.history import opened
+from stitch.watch.cell_course import cell_trend
+from stitch.watch.history import open_history
 from stitch.watch.sentences import headline
 
 
@@ -17,7 +17,7 @@ def month(tmp_path_factory):
     """Nine days of a cell: a knock on the sixth, compliance of joint 2 that grows by 3 % a day."""
     cell = cell_history(4, CellPlan(days=9, knock_day=6.0, growth=0.03))
     folder = tmp_path_factory.mktemp("plant") / "cell-7"
-    with opened(folder, new=True) as history:
+    with open_history(folder, new=True) as history:
         append_runs(history, list(records_of(cell)))
         yield cell, history
 
@@ -43,7 +43,7 @@ def test_knock_and_growth_are_named_with_their_beginning(month):
 
 def test_smoothed_values_lie_about_the_truth(month):
     cell, history = month
-    course = cell_course(history, cell_report(history))
+    course = cell_trend(history, cell_report(history))
     truth = cell.truth.copy()
     truth[:, :6] -= cell.found[0, :6]
     off = np.abs(course.smoothed - truth) / course.smoothed_sigmas
@@ -58,7 +58,7 @@ def test_the_order_in_which_runs_arrive_does_not_matter(month, tmp_path):
     shuffled = [records[k] for k in (*range(30), 35, 32, 39, 30, 31, 33, 34, 36, 37, 38)]
     answers = []
     for name, order in (("a", records), ("b", shuffled)):
-        with opened(tmp_path / name, new=True) as other:
+        with open_history(tmp_path / name, new=True) as other:
             append_runs(other, order[:30])
             for record in order[30:]:
                 assert append_runs(other, [record]) == 1

@@ -10,7 +10,7 @@ from data_synth.fixtures.cell_records import records_of
 from stitch.watch.append import append_runs
 from stitch.watch.cell_assessment import cell_report
 from stitch.watch.dfq import dfq_text
-from stitch.watch.history import opened
+from stitch.watch.history import open_history
 from stitch.watch.openmetrics import openmetrics
 
 
@@ -18,7 +18,7 @@ from stitch.watch.openmetrics import openmetrics
 def day(tmp_path_factory):
     """One day of a cell with its report."""
     cell = cell_history(0, CellPlan(days=1, knock_day=0.7))
-    with opened(tmp_path_factory.mktemp("plant") / 'hall "2"', new=True) as history:
+    with open_history(tmp_path_factory.mktemp("plant") / 'hall "2"', new=True) as history:
         append_runs(history, list(records_of(cell)))
         yield cell, history, cell_report(history)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.watch.regressors import believed, chosen_channels, regressors
+from stitch.watch.regressors import chosen_channels, regressor_prior_sigmas, regressors
 
 HOUR = 3600.0
 
@@ -14,7 +14,7 @@ def test_a_delayed_answer_to_an_uneven_day_is_spanned():
     air = swing * np.sin(omega * times)
     names = ["air_temperature_c"]
     X = np.column_stack([np.ones(len(times)), regressors(times, air[:, None], names)])
-    assert X.shape[1] == 1 + len(believed(names)) == 5
+    assert X.shape[1] == 1 + len(regressor_prior_sigmas(names)) == 5
     for delay in (0.5, 2.0, 6.0):
         phi = np.arctan(omega * delay * HOUR)
         behind = swing * np.cos(phi) * np.sin(omega * times - phi)

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from stitch.watch.control_charts import REFERENCES, WEIGHT, beyond, charted, limits, no_charts
+from stitch.watch.control_charts import (
+    CUSUM_REFERENCES,
+    EWMA_WEIGHT,
+    chart_limits,
+    empty_charts,
+    limit_shares,
+    updated_charts,
+)
 from stitch.watch.run_length import cusum_limit, cusum_run_length, ewma_limit, ewma_run_length
 
 
@@ -26,19 +33,19 @@ def test_ewma_run_lengths_are_the_published_ones(weight, factor, shift, publishe
 
 
 def test_limits_give_the_run_length_asked_for():
-    for k in REFERENCES:
+    for k in CUSUM_REFERENCES:
         assert cusum_run_length(k, cusum_limit(k, 1e6)) / 2 == pytest.approx(1e6, rel=1e-3)
-    assert ewma_run_length(WEIGHT, ewma_limit(WEIGHT, 1e6)) == pytest.approx(1e6, rel=1e-3)
+    assert ewma_run_length(EWMA_WEIGHT, ewma_limit(EWMA_WEIGHT, 1e6)) == pytest.approx(1e6, rel=1e-3)
 
 
 def test_a_silent_cell_alarms_no_more_often_than_stated():
     """1,000 parameters as 250 cells of four: until an alarm they run 300 sessions at least."""
     rng = np.random.default_rng(0)
-    limit, charts = limits(300.0, 4), no_charts(1000)
+    limit, charts = chart_limits(300.0, 4), empty_charts(1000)
     first = np.full(250, np.inf)
     for k in range(1, 900):
-        charts = charted(charts, rng.normal(size=1000))
-        hit = (beyond(charts, limit).max(axis=1) >= 1).reshape(250, 4).any(axis=1)
+        charts = updated_charts(charts, rng.normal(size=1000))
+        hit = (limit_shares(charts, limit).max(axis=1) >= 1).reshape(250, 4).any(axis=1)
         first = np.where(np.isinf(first) & hit, k, first)
     # The time until an alarm is about exponential: its mean by the share of all sessions that were run.
     mean = np.minimum(first, 899).sum() / np.isfinite(first).sum()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from stitch.watch.follow import Sessions, first_state, one_more
-from stitch.watch.smoother import smoothed
-from stitch.watch.state_bank import MEMBERS, empty_bank, predicted, updated, with_parameters
+from stitch.watch.follow import Sessions, first_state, next_state
+from stitch.watch.smoother import smoothed_states
+from stitch.watch.state_bank import MEMBERS, empty_bank, predicted_bank, updated_bank, with_parameters
 
 
 def random_sessions(seed: int, n: int, P: int = 2, steps: float = 0.05) -> Sessions:
@@ -16,14 +16,16 @@ def random_sessions(seed: int, n: int, P: int = 2, steps: float = 0.05) -> Sessi
     covariates = np.column_stack([np.sin(days * 2), rng.normal(size=n)])
     sigmas = rng.uniform(0.5, 2.0, (n, P))
     values = 3.0 + covariates @ rng.normal(size=(2, P)) + rng.choice([-1.0, 1.0], (n, P)) * sigmas
-    return Sessions(list(range(n)), days, values, sigmas, covariates, believed=np.full(2, np.inf), channels=["a", "b"])
+    return Sessions(
+        list(range(n)), days, values, sigmas, covariates, prior_sigmas=np.full(2, np.inf), channels=["a", "b"]
+    )
 
 
 def test_still_member_is_least_squares_on_all_sessions():
     s = random_sessions(0, 60)
     state = first_state(2)
     for k in range(60):
-        state = one_more(state, s, k)
+        state = next_state(state, s, k)
     A = np.column_stack([np.ones(60), s.covariates])
     for p in range(2):
         W = A / s.sigmas[:, p, None]
@@ -43,7 +45,7 @@ def test_innovations_are_standard_normal_whatever_share_of_the_sigmas_is_common(
     bank = with_parameters(empty_bank(2, MEMBERS[:1]), values[0], np.ones(P), members=MEMBERS[:1])
     told = []
     for k in range(n):
-        bank, u = updated(predicted(bank, 0.05), values[k], np.ones(P), covariates[k])
+        bank, u = updated_bank(predicted_bank(bank, 0.05), values[k], np.ones(P), covariates[k])
         told.append(u)
     late = np.array(told[20:]).ravel()
     assert np.isfinite(late).all()
@@ -61,10 +63,10 @@ def test_smoother_is_the_dense_posterior(member):
     state = first_state(2)
     last = state
     for k in range(n):
-        last = one_more(last, s, k)
+        last = next_state(last, s, k)
     likeliest = np.where(np.arange(len(MEMBERS)) == member, 0.0, -1e9)[None]
     last = type(last)(type(last.bank)(**(last.bank.arrays() | {"log_likelihood": likeliest})), last.charts, last.day)
-    found = smoothed(state, s, {}, last)
+    found = smoothed_states(state, s, {}, last)
     level, start, wander = np.array(only[0]) ** 2
     t = s.days - s.days[0]
     start += wander * s.days[0]  # what the slope has wandered before
@@ -97,11 +99,11 @@ def test_process_noise_is_found_by_likelihood():
             values,
             np.ones((n, P)),
             np.zeros((n, 0)),
-            believed=np.zeros(0),
+            prior_sigmas=np.zeros(0),
             channels=[],
         )
         state = first_state(0)
         for k in range(n):
-            state = one_more(state, s, k)
+            state = next_state(state, s, k)
         together = state.bank.log_likelihood[:, :4].sum(axis=0)
         assert abs(int(np.argmax(together)) - member) <= (0 if member > 1 else 1)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
 from stitch.watch.append import append_runs
-from stitch.watch.history import opened
+from stitch.watch.history import open_history
 from stitch.watch.mount_twist import mount_twist, twist_covariance
 from stitch.watch.read_record import read_record
 
@@ -142,12 +142,12 @@ def test_many_writers_lose_nothing(tmp_path):
     runs = [run_folder(tmp_path, f"s{k}") for k in range(12)]
 
     def append(run: Path) -> int:
-        with opened(tmp_path / "cell", new=True) as history:
+        with open_history(tmp_path / "cell", new=True) as history:
             return append_runs(history, [read_record(run)])
 
     with ThreadPoolExecutor(4) as pool:
         assert sum(pool.map(append, [*runs, *runs])) == 12
-    with opened(tmp_path / "cell") as history:
+    with open_history(tmp_path / "cell") as history:
         assert history.sql("SELECT count(*) FROM runs")[0][0] == 12
         assert history.sql("SELECT max(number) FROM states")[0][0] == 12
 

@@ -9,18 +9,18 @@ from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.observations.surfaces.field_map import FieldMap
 from stitch.writing.diagnosis_document import _field_map
-from stitch.writing.error_sources import error_sources
+from stitch.writing.error_sources import largest_error_sources
 
 SHARES = {"sensor noise": 0.1, "backlash": 0.885, "smooth, unnamed": 0.009, "scanner field": 0.006, "joint_offset": 0.0}
 BUDGET = tuple(BudgetLine(name, share, 0.02 * share**0.5, "mm") for name, share in SHARES.items())
 
 
 def test_small_sources_are_told_together_and_nothing_is_lost():
-    told = error_sources(BUDGET)
+    told = largest_error_sources(BUDGET)
     assert [line.source for line in told] == ["backlash", "sensor noise", "others"]
     assert sum(line.variance_share for line in told) == pytest.approx(1.0)
     assert sum(line.sigma**2 for line in told) == pytest.approx(0.02**2)
-    assert error_sources(()) == []
+    assert largest_error_sources(()) == []
 
 
 def test_the_terminal_tells_source_share_and_size():

@@ -12,16 +12,16 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation.cross_validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError
-from stitch.writing.plain_effects import in_words
-from stitch.writing.plain_finding import next_step, plain_finding
+from stitch.writing.plain_effects import effect_in_words
+from stitch.writing.plain_finding import plain_finding, suggested_command
 
 
 def test_every_effect_of_the_library_has_words():
     library = [effect.name for effect in EFFECTS.values() if effect.tier == "physical"]
-    said = [in_words(name) for name in library]
+    said = [effect_in_words(name) for name in library]
     assert len(said) > 20 and len(set(said)) == len(said)
     assert all(words.startswith(f"{name} (") for name, words in zip(library, said, strict=True))
-    assert in_words("of_my_own") == "of_my_own"
+    assert effect_in_words("of_my_own") == "of_my_own"
 
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
@@ -37,7 +37,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve)
         candidates=(),
         likelier_than_not=True,
     )
-    command = next_step(found, "RUN").rsplit(": ", 1)[1]
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
     assert ("explain" in command) == (verdict == "unknown_effect" and bool(curves or time_curve))
 
@@ -60,7 +60,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     )
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is added"))
-    command = next_step(found, "RUN").rsplit(": ", 1)[1]
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert refused(command) is None and ("--group" in command) == (share < 0.95)
     if share > 0.95:
         model = SimpleNamespace(effects=[])
@@ -70,7 +70,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 def test_no_model_is_built_on_a_doubtful_session(verdict):
     found = SimpleNamespace(verdict=verdict, curves=("of joint 3",), time_curve=None, doubts=("knocked",))
-    command = next_step(found, "RUN").rsplit(": ", 1)[1]
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command == "stitch review RUN" and refused(command) is None
 
 
@@ -80,7 +80,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
         found = SimpleNamespace(
-            verdict="adequate", effects=(), smooth=smooth, doubts=(), certain=True, likelier_than_not=True
+            verdict="adequate", effects=(), scanner_error=smooth, doubts=(), certain=True, likelier_than_not=True
         )
         assert said in plain_finding(found, "mm")
 
@@ -97,7 +97,11 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
     """20 to 1 over nothing, as over every other name."""
     candidate = SimpleNamespace(name="settling", cross_validation=None)
     found = SimpleNamespace(
-        verdict="missing_effect", effects=("settling",), candidates=(candidate,), doubts=(), over_nothing=np.log(odds)
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=(candidate,),
+        doubts=(),
+        log_odds_over_nothing=np.log(odds),
     )
     found.certain = Diagnosis.certain.fget(found)
     found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from stitch.errors import InputError
-from stitch.writing.run_contents import ours, require_free, sessions_in
+from stitch.writing.run_contents import is_run_file, require_free, sessions_in
 
 
 @pytest.fixture
@@ -66,7 +66,9 @@ def test_of_a_rig_the_runs_inside_are_its_own(place):
     (rig / "model.toml").touch()
     make_run(single / "a", place / "a")
     assert sessions_in(rig) == [str(place / "a"), str(place / "b")]
-    assert ours(rig)(Path("a/result.json")) and not ours(rig)(Path("a/notes.txt"))
-    assert not ours(single)(Path("a/result.json"))
-    is_own = {name: ours(single)(Path(name)) for name in ("result.json", "pictures/budget.png", "pictures/mine.png")}
+    assert is_run_file(rig)(Path("a/result.json")) and not is_run_file(rig)(Path("a/notes.txt"))
+    assert not is_run_file(single)(Path("a/result.json"))
+    is_own = {
+        name: is_run_file(single)(Path(name)) for name in ("result.json", "pictures/budget.png", "pictures/mine.png")
+    }
     assert is_own == {"result.json": True, "pictures/budget.png": True, "pictures/mine.png": False}

@@ -7,8 +7,8 @@ import numpy as np
 from stitch import frames
 from stitch.cells.base_to_base.contradiction import compare_distances
 from stitch.cells.base_to_base.stand import Stand
-from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult, describe
-from stitch.comparison.plain_verdict import Judged
+from stitch.cells.base_to_base.stand_solution import CONTRADICTION_SIGMAS, BaseResult, comparison_text
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.cells import stage
@@ -22,13 +22,15 @@ def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
     comparisons = compare_distances(stand) if result is None else result.comparisons
     caption = (
         "Distances that the stand and a robot's joints give independently; beyond "
-        f"{LIMIT:g} sigmas the command refuses to give a transform."
+        f"{CONTRADICTION_SIGMAS:g} sigmas the command refuses to give a transform."
     )
     pictures = [Picture("Do the readings contradict each other?", contradictions(comparisons), caption)]
-    tables = [Table("Distances", ("comparison",), [(describe(c, stand.length_unit),) for c in comparisons])]
+    tables = [Table("Distances", ("comparison",), [(comparison_text(c, stand.length_unit),) for c in comparisons])]
     verdict, notes = "The readings contradict each other; no transform is given.", []
     worst = max((c.sigmas for c in comparisons), default=0.0)
-    light = Judged("bad", f"Readings that should agree differ by {worst:.1f} sigmas; {LIMIT:g} are allowed.")
+    light = ToleranceVerdict(
+        "bad", f"Readings that should agree differ by {worst:.1f} sigmas; {CONTRADICTION_SIGMAS:g} are allowed."
+    )
     if result is not None:
         verdict = sentence(stand, result)
         light = _agreement(worst, len(comparisons))
@@ -39,10 +41,12 @@ def write_page(stand: Stand, result: BaseResult | None, path: Path) -> None:
     write(page, path)
 
 
-def _agreement(worst: float, count: int) -> Judged:
+def _agreement(worst: float, count: int) -> ToleranceVerdict:
     if not count:
-        return Judged("check", "No reading is there twice: nothing tests the transform.")
-    return Judged("good", f"What is read twice agrees: {worst:.1f} sigmas at most, {LIMIT:g} are allowed.")
+        return ToleranceVerdict("check", "No reading is there twice: nothing tests the transform.")
+    return ToleranceVerdict(
+        "good", f"What is read twice agrees: {worst:.1f} sigmas at most, {CONTRADICTION_SIGMAS:g} are allowed."
+    )
 
 
 def _about(stand: Stand) -> list[Row]:
@@ -101,7 +105,7 @@ def record(stand: Stand, result: BaseResult, path: Path) -> None:
     """Both bases, the rail, the rods and the touched points, frame of base 1."""
     T = result.fit.T_base1_base2
     size = 0.12 * float(np.linalg.norm(T[:3, 3]))
-    comparisons = "\n".join(f"- {describe(c, stand.length_unit)}." for c in result.comparisons)
+    comparisons = "\n".join(f"- {comparison_text(c, stand.length_unit)}." for c in result.comparisons)
     words = f"# Base to base\n\n{sentence(stand, result)}\n\n{comparisons}\n\n{_LEGEND}"
     pivots, cups = rods(stand, result)
     with stage.stage(path, "Base to base", words) as recording:

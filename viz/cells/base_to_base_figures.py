@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from stitch import frames
-from stitch.cells.base_to_base.contradiction import Comparison
+from stitch.cells.base_to_base.contradiction import DistanceComparison
 from stitch.cells.base_to_base.stand import Stand, rod_points
-from stitch.cells.base_to_base.stand_solution import LIMIT, BaseResult
+from stitch.cells.base_to_base.stand_solution import CONTRADICTION_SIGMAS, BaseResult
 from stitch.frames import Array
 from viz.colours import BLUE, GREEN, ORANGE
 from viz.drawing import above
@@ -87,15 +87,23 @@ def _ellipse(at: Array, covariance: Array) -> Ellipse:
     return Ellipse((float(at[0]), float(at[1])), width, height, angle=angle, facecolor=_TWO, alpha=0.2, lw=0)
 
 
-def contradictions(comparisons: Sequence[Comparison]) -> Figure:
+def contradictions(comparisons: Sequence[DistanceComparison]) -> Figure:
     """Every comparison's difference in sigmas."""
     shown = comparisons[:12][::-1]
     figure = Figure(figsize=(7, 0.9 + 0.32 * len(shown)), layout="constrained")
     ax = figure.subplots()
     sizes = [c.sigmas for c in shown]
-    ax.barh(["–".join(c.pair) for c in shown], sizes, color=[_ROD if s > LIMIT else _ONE for s in sizes], height=0.6)
-    ax.axvline(LIMIT, color=_ROD, ls="--", lw=1, label="refused beyond")
-    ax.set(xlabel="difference of stand and robot (sigmas)", xlim=(0, max(1.2 * LIMIT, 1.1 * max(sizes, default=0.0))))
+    ax.barh(
+        ["–".join(c.pair) for c in shown],
+        sizes,
+        color=[_ROD if s > CONTRADICTION_SIGMAS else _ONE for s in sizes],
+        height=0.6,
+    )
+    ax.axvline(CONTRADICTION_SIGMAS, color=_ROD, ls="--", lw=1, label="refused beyond")
+    ax.set(
+        xlabel="difference of stand and robot (sigmas)",
+        xlim=(0, max(1.2 * CONTRADICTION_SIGMAS, 1.1 * max(sizes, default=0.0))),
+    )
     above(ax)
     ax.spines[["top", "right"]].set_visible(False)
     return figure

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cells.drilling.drill_job import Job
-from stitch.cells.drilling.drill_sentences import found_effects, worth
-from stitch.cells.drilling.drill_solution import Drive, JobResult
+from stitch.cells.drilling.drill_job import DrillJob
+from stitch.cells.drilling.drill_sentences import correction_sentence, significant_effect_sentences
+from stitch.cells.drilling.drill_solution import DrillResult, Drive
 from stitch.frames import transform
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
@@ -14,7 +14,7 @@ from viz.cells.page import Page, Picture, Table, write
 from viz.identity import Row
 
 
-def write_page(job: Job, result: JobResult, path: Path) -> None:
+def write_page(job: DrillJob, result: DrillResult, path: Path) -> None:
     """Sentence, holes with error arrows before and after, plate, tables."""
     caption = (
         "Arrows: where a reference hole really is, seen from where its drive was expected to meet it, "
@@ -25,12 +25,12 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     if len(result.leave_one_out_errors):
         caption = "Each of the plate's holes mapped by a homography of the others: what camera and plate are worth."
         pictures.append(Picture("Hand-eye: one hole left out", plate(job, result), caption))
-    words = (worth(result, job.length_unit), job.file, _about(job))
-    notes = list(found_effects(result, job.length_unit))
+    words = (correction_sentence(result, job.length_unit), job.file, _about(job))
+    notes = list(significant_effect_sentences(result, job.length_unit))
     write(Page("Drilling", *words, pictures, _tables(job, result), notes=notes), path)
 
 
-def _about(job: Job) -> list[Row]:
+def _about(job: DrillJob) -> list[Row]:
     references = sum(hole.reference for hole in job.holes)
     groups = len({hole.group for hole in job.holes})
     rangers = f", {len(job.rangers)} range sensors" if job.rangers else ""
@@ -41,7 +41,7 @@ def _about(job: Job) -> list[Row]:
     ]
 
 
-def _tables(job: Job, result: JobResult) -> list[Table]:
+def _tables(job: DrillJob, result: DrillResult) -> list[Table]:
     unit = job.length_unit
     references = [
         (hole.name, name, f"{np.linalg.norm(error):.3f}", f"{np.linalg.norm(residual):.3f}")
@@ -61,7 +61,7 @@ def _drive_numbers(d: Drive) -> list[float]:
     return [*d.position, *np.degrees(d.angles), float(np.linalg.norm(d.position - d.hole.position))]
 
 
-def record(job: Job, result: JobResult, path: Path) -> None:
+def record(job: DrillJob, result: DrillResult, path: Path) -> None:
     """Nominal, measured and corrected holes in the base frame, error arrows before and after."""
     places = np.array([hole.position for hole in job.holes])
     size = float(np.ptp(places, axis=0).max())
@@ -82,10 +82,10 @@ def record(job: Job, result: JobResult, path: Path) -> None:
             stage.frame(recording, f"tool on {name}", placed.T_base_tool, size / 15)
 
 
-def _words(job: Job, result: JobResult) -> str:
-    notes = "\n".join(f"- {note}" for note in found_effects(result, job.length_unit))
+def _words(job: DrillJob, result: DrillResult) -> str:
+    notes = "\n".join(f"- {note}" for note in significant_effect_sentences(result, job.length_unit))
     return (
-        f"# Drilling\n\n{worth(result, job.length_unit)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as "
+        f"# Drilling\n\n{correction_sentence(result, job.length_unit)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as "
         "measured. Green: corrected drives. Red and green arrows: errors before and after, "
         f"{magnified(job, result):g} times larger."
     )

@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.drilling.drill_job import Hole, Job
-from stitch.cells.drilling.drill_solution import JobResult
+from stitch.cells.drilling.drill_job import DrillJob, Hole
+from stitch.cells.drilling.drill_solution import DrillResult
 from stitch.frames import Array, transform
 from viz.colours import BLUE, GREEN, ORANGE
 
@@ -15,7 +15,7 @@ _LONGEST = 0.25
 _ARROWS = {"angles": "xy", "scale_units": "xy", "scale": 1}  # as long as they are in the data's unit
 
 
-def holes(job: Job, result: JobResult) -> Figure:
+def holes(job: DrillJob, result: DrillResult) -> Figure:
     """The panel from above and from its side, before and after: reference holes with error arrows, holes to drill."""
     figure = Figure(figsize=(10.5, 4.6), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
@@ -36,7 +36,7 @@ def holes(job: Job, result: JobResult) -> Figure:
     return figure
 
 
-def magnified(job: Job, result: JobResult) -> float:
+def magnified(job: DrillJob, result: DrillResult) -> float:
     """How many times larger than the panel errors are drawn: a round number."""
     places = np.array([hole.position for hole in job.holes])
     largest = max(float(np.linalg.norm(c.errors, axis=1).max()) for c in result.groups.values())
@@ -45,14 +45,14 @@ def magnified(job: Job, result: JobResult) -> float:
     return float(max(step for step in (1, 2, 5) if step * power <= wanted) * power)
 
 
-def _panel_axes(job: Job) -> tuple[Array, Array]:
+def _panel_axes(job: DrillJob) -> tuple[Array, Array]:
     """Middle (3,) of the drawing's holes and axes (3, 3): along the panel, across it, out of it."""
     places = np.array([hole.position for hole in job.holes])
     middle = places.mean(axis=0)
     return middle, np.linalg.svd(places - middle, full_matrices=False)[2]
 
 
-def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Array, after: bool) -> None:
+def _draw_holes(ax: Axes, job: DrillJob, result: DrillResult, middle: Array, side: Array, after: bool) -> None:
     """One panel of `holes`; `side` (2, 3) holds the axes that are drawn."""
     colour = _AFTER if after else _BEFORE
     label = f"error {'after' if after else 'before'}, {magnified(job, result):g} times larger"
@@ -72,7 +72,7 @@ def _draw_holes(ax: Axes, job: Job, result: JobResult, middle: Array, side: Arra
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _name_holes(ax: Axes, job: Job, middle: Array, side: Array) -> None:
+def _name_holes(ax: Axes, job: DrillJob, middle: Array, side: Array) -> None:
     for name, position in {hole.name: hole.position for hole in job.holes}.items():
         at = side @ (position - middle)
         ax.annotate(name, at, xytext=(0, -13), textcoords="offset points", ha="center", fontsize=7, color="0.4")
@@ -83,7 +83,7 @@ def _once(ax: Axes, label: str) -> str:
     return "_" if label in ax.get_legend_handles_labels()[1] else label
 
 
-def plate(job: Job, result: JobResult) -> Figure:
+def plate(job: DrillJob, result: DrillResult) -> Figure:
     """Leave-one-out errors of the plate's holes."""
     figure = Figure(figsize=(4.6, 3.8), layout="constrained")
     ax = figure.subplots()
@@ -99,6 +99,6 @@ def plate(job: Job, result: JobResult) -> Figure:
     return figure
 
 
-def references_of(job: Job, group: str) -> list[Hole]:
+def references_of(job: DrillJob, group: str) -> list[Hole]:
     """Reference holes of a group, in the order of the drawing."""
     return [hole for hole in job.holes if hole.group == group and hole.reference]

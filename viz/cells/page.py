@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from stitch.comparison.plain_verdict import Judged
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from viz.cells.job_identity import job_identity
 from viz.identity import Row
 from viz.page_head import Head, Subject, write_page
@@ -58,7 +58,7 @@ class Page:
     pictures: Sequence[Picture]
     tables: Sequence[Table]
     notes: Sequence[str] = ()
-    light: Judged | None = None  # where the job states what is allowed
+    light: ToleranceVerdict | None = None  # where the job states what is allowed
 
 
 def write(page: Page, path: Path) -> None:

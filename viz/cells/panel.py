@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.panel.panel_job import Job
+from stitch.cells.panel.panel_job import PanelJob
 from stitch.cells.panel.panel_sentences import leg_sentence, shape_sentence
-from stitch.cells.panel.panel_solution import JobResult
-from stitch.comparison.plain_verdict import Judged
+from stitch.cells.panel.panel_solution import PanelResult
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -21,7 +21,7 @@ from viz.identity import Row
 _PER_NEWTON, _PER_MM = 4.0, 60.0
 
 
-def write_page(job: Job, result: JobResult, path: Path) -> None:
+def write_page(job: PanelJob, result: PanelResult, path: Path) -> None:
     """Sentence, shape, forces, errors along a motion, residuals of the robots; tables."""
     pictures = []
     if result.shape is not None:
@@ -45,21 +45,23 @@ def write_page(job: Job, result: JobResult, path: Path) -> None:
     write(Page("Panel held by robots", *words, pictures, tables, notes=notes, light=light), path)
 
 
-def _light(job: Job, result: JobResult) -> Judged | None:
+def _light(job: PanelJob, result: PanelResult) -> ToleranceVerdict | None:
     """Of the shape, against the job's tolerance."""
     if result.shape_largest is None:
         return None
     worst, beyond = float(result.shape_largest.max()), int((result.shape_largest > job.tolerance).sum())
     if not beyond:
-        return Judged("good", f"The shape is within {job.tolerance:g} mm at all clamps: {worst:.2f} mm at most.")
-    return Judged(
+        return ToleranceVerdict(
+            "good", f"The shape is within {job.tolerance:g} mm at all clamps: {worst:.2f} mm at most."
+        )
+    return ToleranceVerdict(
         "bad",
         f"The shape is not within {job.tolerance:g} mm at {beyond} of {len(job.robots)} clamps: {worst:.2f} mm at "
         "most, before the commanded motion.",
     )
 
 
-def _about(job: Job) -> list[Row]:
+def _about(job: PanelJob) -> list[Row]:
     readings = sum(own.reflectors.shape[0] * own.reflectors.shape[1] for own in job.calibration)
     control = "" if job.control is None else f", {len(job.control.nominal)} control points of the panel"
     tracker, legs = job.tracker, "" if job.legs is None else " of six legs each"
@@ -70,7 +72,7 @@ def _about(job: Job) -> list[Row]:
     ]
 
 
-def sentence(job: Job, result: JobResult) -> str:
+def sentence(job: PanelJob, result: PanelResult) -> str:
     """Pose and shape in one."""
     parts = []
     if result.pose_error is not None:
@@ -81,11 +83,11 @@ def sentence(job: Job, result: JobResult) -> str:
     return " ".join(parts) or f"{len(job.robots)} robots and the tracker are joined in one model."
 
 
-def _notes(result: JobResult) -> list[str]:
-    return [leg_sentence(o) for o in result.legs if o.found]
+def _notes(result: PanelResult) -> list[str]:
+    return [leg_sentence(o) for o in result.legs if o.detected]
 
 
-def _tables(job: Job, result: JobResult) -> list[Table]:
+def _tables(job: PanelJob, result: PanelResult) -> list[Table]:
     rows = []
     for model in result.models:
         sigma = np.sqrt(np.diag(model.covariance)).reshape(4, 3).max(axis=1)
@@ -97,7 +99,7 @@ def _tables(job: Job, result: JobResult) -> list[Table]:
     return [Table("Global model", header, rows)]
 
 
-def record(job: Job, result: JobResult, path: Path) -> None:
+def record(job: PanelJob, result: PanelResult, path: Path) -> None:
     """World frame: tracker, robots with flanges and clamps, the panel's control points by deviation, forces."""
     words = "\n\n".join(["# Panel", sentence(job, result), *_notes(result), _LEGEND])
     to_world = job.T_world_target
@@ -127,7 +129,7 @@ _LEGEND = (
 )
 
 
-def _record_legs(recording: stage.Recording, job: Job, name: str, T_base: Array, T_flange: Array) -> None:
+def _record_legs(recording: stage.Recording, job: PanelJob, name: str, T_base: Array, T_flange: Array) -> None:
     if job.legs is None:
         return
     feet, ends = frames.transform(T_base, job.legs.base), frames.transform(T_flange, job.legs.platform)
@@ -137,7 +139,7 @@ def _record_legs(recording: stage.Recording, job: Job, name: str, T_base: Array,
         stage.line(recording, f"robots/legs {name}/{k + 1}", np.array([feet[k], ends[k]]), stage.GREY, 10.0)
 
 
-def _record_shape(recording: stage.Recording, job: Job, result: JobResult) -> None:
+def _record_shape(recording: stage.Recording, job: PanelJob, result: PanelResult) -> None:
     assert job.control is not None
     places = frames.transform(job.T_world_target, job.control.nominal)
     outward = -(job.T_world_target @ result.contacts.T_panel_contact[job.control.clamp])[:, :3, 2]

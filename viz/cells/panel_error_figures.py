@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.panel.errors_along import ErrorsAlong
-from stitch.cells.panel.panel_job import Job
-from stitch.cells.panel.panel_solution import JobResult
+from stitch.cells.panel.errors_along import MotionErrors
+from stitch.cells.panel.panel_job import PanelJob
+from stitch.cells.panel.panel_solution import PanelResult
 from stitch.frames import Array
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
 
@@ -21,7 +21,7 @@ _STYLES: list[dict[str, Any]] = [
 ]
 
 
-def write_pictures(job: Job, result: JobResult, folder: Path) -> list[str]:
+def write_pictures(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
     """Write the errors to expect along a motion as PNG and SVG; returns the files' names."""
     names = ["errors.png", "errors.svg"]
     figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
@@ -30,7 +30,7 @@ def write_pictures(job: Job, result: JobResult, folder: Path) -> list[str]:
     return names
 
 
-def errors_figure(names: Sequence[str], master: int, shift: ErrorsAlong, turn: ErrorsAlong) -> Figure:
+def errors_figure(names: Sequence[str], master: int, shift: MotionErrors, turn: MotionErrors) -> Figure:
     """Error against distance and angle, one line per slave: the worst of the three axes."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots(2, 2, sharex="row", squeeze=False)

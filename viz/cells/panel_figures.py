@@ -5,14 +5,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.panel.panel_job import Job
-from stitch.cells.panel.panel_solution import JobResult
+from stitch.cells.panel.panel_job import PanelJob
+from stitch.cells.panel.panel_solution import PanelResult
 from stitch.frames import Array, Indices
 from viz.colours import BLUE, GREEN, ORANGE, SIGNED
 from viz.drawing import above
 
 
-def expected_after(job: Job, result: JobResult) -> Array:
+def expected_after(job: PanelJob, result: PanelResult) -> Array:
     """(K,) deviation across the surface, mm, that the commanded twists of the clamps leave at the control points."""
     assert result.shape is not None and job.control is not None
     after = np.zeros(len(job.control.clamp))
@@ -25,14 +25,14 @@ def expected_after(job: Job, result: JobResult) -> Array:
     return after
 
 
-def deviation_before(job: Job, result: JobResult) -> Array:
+def deviation_before(job: PanelJob, result: PanelResult) -> Array:
     """(K,) deviation across the surface, mm, outwards positive: a clamp's z looks into the panel."""
     assert result.shape is not None and job.control is not None
     inward = result.contacts.T_panel_contact[job.control.clamp][:, :3, 2]
     return np.asarray(-np.einsum("ki,ki->k", result.shape.deviations, inward))
 
 
-def shape(job: Job, result: JobResult) -> Figure:
+def shape(job: PanelJob, result: PanelResult) -> Figure:
     """Control points on the unrolled panel, coloured by their deviation, before and after."""
     assert job.control is not None
     figure = Figure(figsize=(10.5, 3.5), layout="constrained")
@@ -65,7 +65,7 @@ def _signed(value: float) -> str:
     return text[1:] if text[1:] == "0.00" else text
 
 
-def _draw_panel(ax: Axes, job: Job, result: JobResult) -> None:
+def _draw_panel(ax: Axes, job: PanelJob, result: PanelResult) -> None:
     for name, pads in zip(job.robots, result.contacts.pads, strict=True):
         at = _unrolled(job, pads)
         ax.fill(*at.T, facecolor="0.93", edgecolor="0.6")
@@ -76,13 +76,13 @@ def _draw_panel(ax: Axes, job: Job, result: JobResult) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _unrolled(job: Job, points: Array) -> Array:
+def _unrolled(job: PanelJob, points: Array) -> Array:
     """(N, 2) along the axis and around it, mm, of points (N, 3) of the panel frame."""
     R = job.layout.radius
     return np.column_stack([points[:, 0], R * np.arctan2(points[:, 1], points[:, 2] + R)])
 
 
-def forces(job: Job) -> Figure:
+def forces(job: PanelJob) -> Figure:
     """Size along z and across it at every clamp."""
     assert job.forces is not None
     figure = Figure(figsize=(7, 2.6), layout="constrained")
@@ -97,7 +97,7 @@ def forces(job: Job) -> Figure:
     return figure
 
 
-def misfit(job: Job, result: JobResult) -> Figure:
+def misfit(job: PanelJob, result: PanelResult) -> Figure:
     """Root mean square of the weighted residuals of each robot."""
     figure = Figure(figsize=(7, 2.4), layout="constrained")
     ax = figure.subplots()

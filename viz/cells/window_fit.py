@@ -8,10 +8,10 @@ import rerun as rr
 from stitch import frames
 from stitch.cells.window.allowance import allowance_sentence
 from stitch.cells.window.deviation import Deviations
-from stitch.cells.window.fit_sentences import agreement, with_unit
+from stitch.cells.window.fit_sentences import agreement_sentence, with_unit
 from stitch.cells.window.window_jobs import FitJob
-from stitch.cells.window.window_solution import Part
-from stitch.comparison.plain_verdict import Judged
+from stitch.cells.window.window_solution import FittedPart
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -22,7 +22,7 @@ from viz.identity import Row
 _RECORDED_POINTS, _WORST = 400_000, 10
 
 
-def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
+def write_page(job: FitJob, parts: list[FittedPart], path: Path) -> None:
     """Sentence, a map and a histogram for each part, poses and the worst cells."""
     pictures, unit = [], job.length_unit or NO_UNIT
     named = "" if job.length_unit else " Lengths in the unit of the CAD, whose file names none."
@@ -41,15 +41,15 @@ def write_page(job: FitJob, parts: list[Part], path: Path) -> None:
     write(Page("Scan onto CAD", *words, pictures, _tables(job, parts), light=_light(job, parts)), path)
 
 
-def _light(job: FitJob, parts: list[Part]) -> Judged:
+def _light(job: FitJob, parts: list[FittedPart]) -> ToleranceVerdict:
     bad, cells = (sum(int(x) for x in own) for own in zip(*map(_counts, parts), strict=True))
     if not bad:
-        return Judged("good", f"Within {with_unit(job, f'{job.tolerance:g}')}: all {cells} cells of the map.")
+        return ToleranceVerdict("good", f"Within {with_unit(job, f'{job.tolerance:g}')}: all {cells} cells of the map.")
     allowed = with_unit(job, f"{job.tolerance:g}")
-    return Judged("bad", f"Not within {allowed}: {bad} of {cells} cells of the map are beyond it.")
+    return ToleranceVerdict("bad", f"Not within {allowed}: {bad} of {cells} cells of the map are beyond it.")
 
 
-def _counts(part: Part) -> tuple[int, int]:
+def _counts(part: FittedPart) -> tuple[int, int]:
     return int(part.deviations.outside.sum()), len(part.deviations.outside)
 
 
@@ -63,17 +63,17 @@ def _about(job: FitJob) -> list[Row]:
     ]
 
 
-def sentence(job: FitJob, parts: list[Part]) -> str:
+def sentence(job: FitJob, parts: list[FittedPart]) -> str:
     """What was found and how it compares."""
     sentences = []
     for i, part in enumerate(parts):
-        sentences.append(agreement(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
+        sentences.append(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
         if part.fit.allowance is not None:
             sentences.append(allowance_sentence(part.fit.allowance, job.length_unit))
     return " ".join(sentences)
 
 
-def _tables(job: FitJob, parts: list[Part]) -> list[Table]:
+def _tables(job: FitJob, parts: list[FittedPart]) -> list[Table]:
     poses = []
     for i, part in enumerate(parts):
         sigma = part.fit.sigma
@@ -96,14 +96,14 @@ def _tables(job: FitJob, parts: list[Part]) -> list[Table]:
     return tables
 
 
-def _allowances(parts: list[Part]) -> list[Table]:
+def _allowances(parts: list[FittedPart]) -> list[Table]:
     """Stock on the parts; no table where nobody spoke of it."""
     rows = []
     for i, part in enumerate(parts):
         if (found := part.fit.allowance) is not None:
-            kind = "varying" if found.wanted.varying else "even" if found.wanted.free else "stated"
+            kind = "varying" if found.prior.varying else "even" if found.prior.free else "stated"
             sizes = (f"{size:+.4f}" for size in (found.value, found.lowest, found.highest))
-            rows.append((str(i + 1), kind, *sizes, f"{found.sigma:.4f}", f"{found.told:.0%}"))
+            rows.append((str(i + 1), kind, *sizes, f"{found.sigma:.4f}", f"{found.separable_share:.0%}"))
     header = ("part", "allowance", "mean", "lowest", "highest", "σ of the mean", "told from a motion")
     return [Table("Allowance: stock outside the CAD is plus", header, rows)] if rows else []
 
@@ -113,7 +113,7 @@ def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:
     return *(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]), verdict
 
 
-def record(job: FitJob, parts: list[Part], path: Path) -> None:
+def record(job: FitJob, parts: list[FittedPart], path: Path) -> None:
     """Base frame: CAD where it was found, points by deviation, scanners, programmed and corrected path."""
     size = job.cad.size
     words = f"# Scan onto CAD\n\n{sentence(job, parts)}\n\n{_LEGEND}"

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stitch.cells.window.deviation import Deviations
-from stitch.cells.window.window_solution import Part
+from stitch.cells.window.window_solution import FittedPart
 from viz.colours import BLUE, ORANGE, SIGNED
 
 # An STL has no unit.
@@ -40,7 +40,7 @@ def deviation_map(found: Deviations, unit: str) -> Figure:
     return figure
 
 
-def histogram(part: Part, unit: str) -> Figure:
+def histogram(part: FittedPart, unit: str) -> Figure:
     """Distances of all points, with the tolerance."""
     found = part.deviations
     figure = Figure(figsize=(7, 2.4), layout="constrained")

@@ -10,7 +10,7 @@ from stitch import frames
 from stitch.cells.window.seam import VERDICTS, Limits, Seam, Station
 from stitch.cells.window.seam_sentences import limits_text, stations_sentence
 from stitch.cells.window.window_jobs import SeamJob
-from stitch.comparison.plain_verdict import Judged
+from stitch.comparison.plain_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
@@ -44,15 +44,15 @@ def write_page(job: SeamJob, seams: list[Seam], path: Path) -> None:
     write(Page("Seam", *words, pictures, tables, light=_light(seams)), path)
 
 
-def _light(seams: list[Seam]) -> Judged:
+def _light(seams: list[Seam]) -> ToleranceVerdict:
     """Red where a station is bad, amber where one is open or was not measured."""
     good, bad = (sum(s.verdict == verdict for s in seams) for verdict in ("good", "bad"))
     told = f"{good} of {len(seams)} stations are within the limits with their two sigmas"
     if bad:
-        return Judged("bad", f"Not within the limits: {bad} of {len(seams)} stations are beyond them.")
+        return ToleranceVerdict("bad", f"Not within the limits: {bad} of {len(seams)} stations are beyond them.")
     if good < len(seams):
-        return Judged("check", f"Nothing is beyond the limits, but only {told}.")
-    return Judged("good", f"Within the limits: {told}.")
+        return ToleranceVerdict("check", f"Nothing is beyond the limits, but only {told}.")
+    return ToleranceVerdict("good", f"Within the limits: {told}.")
 
 
 def _about(job: SeamJob) -> list[Row]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.units import MICROMETRES
 from viz.review.chosen_field import Choice
 from viz.review.known_residuals import KnownResiduals, known_residuals
@@ -75,7 +75,7 @@ class RunReview:
     def keep_own_effects(self, text: str) -> Path:
         """Write the text as the run folder's own effects."""
         path = self.run / OWN_EFFECTS
-        with whole(path) as file:
+        with whole_file(path) as file:
             file.write_text(text, encoding="utf-8")
         return path
 

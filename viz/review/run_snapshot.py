@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stitch.comparison.model_history import change_of
-from stitch.comparison.run_verdict import headline
+from stitch.comparison.model_history import effect_changes
+from stitch.comparison.run_verdict import shorten_doubts
 from stitch.errors import InputError
 from stitch.reading.text_file import shortened
 from stitch.runs.run import LedgerStep
 from stitch.stored.run_documents import read_documents
-from stitch.units import MICROMETRES, amount
-from stitch.writing.plain_effects import in_words
+from stitch.units import MICROMETRES, format_amount
+from stitch.writing.plain_effects import effect_in_words
 from viz.review.told_candidates import told_diagnosis
 from viz.review.undo_history import undo_history
 
@@ -86,7 +86,7 @@ def _read(run: Path, version: str) -> Snapshot:
         "run": str(run),
         "session": result["session"],
         "name": result.get("name", Path(result["session"]).name),
-        "sentence": headline(result.get("plain") or result["verdict"], doubts),
+        "sentence": shorten_doubts(result.get("plain") or result["verdict"], doubts),
         "evidence": " ".join([*doubts, result["verdict"]]),
         "length_unit": result["length_unit"],
         "labelled": labelled,
@@ -97,7 +97,7 @@ def _read(run: Path, version: str) -> Snapshot:
         "steps": [{"step": s["step"], "mean": s["mean"] * um, "noise": s["of_noise"] * um} for s in steps],
         "ledger": [_step(ledger, i, um) for i in range(len(ledger))],
         "effects": _effects(result),
-        "in_words": [in_words(effect) for effect in result["effects"]],
+        "in_words": [effect_in_words(effect) for effect in result["effects"]],
         "diagnosis": diagnosis,
         "comparison": None if comparison is None else comparison[1],
         "history": undo_history([step.effects for step in ledger]),
@@ -116,7 +116,7 @@ def _step(ledger: tuple[LedgerStep, ...], i: int, um: float) -> dict[str, Any]:
     step = ledger[i]
     return {
         "step": i,
-        "change": change_of(ledger, i),
+        "change": effect_changes(ledger, i),
         "effects": list(step.effects),
         "residual": step.residual_rms * um,
         "heldout": step.heldout_rms * um if step.heldout_rms == step.heldout_rms else None,
@@ -132,7 +132,7 @@ def _effects(result: dict[str, Any]) -> list[dict[str, str]]:
         for effect, own in result["effects"].items()
         for name, p in own.items()
         if p.get("sigma") is not None
-        for told in [amount(p["value"], p["sigma"], p.get("unit", ""))]
+        for told in [format_amount(p["value"], p["sigma"], p.get("unit", ""))]
     ]
 
 

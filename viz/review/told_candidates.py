@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from stitch.units import amount
-from stitch.writing.plain_effects import what_it_is
+from stitch.units import format_amount
+from stitch.writing.plain_effects import effect_description
 
 # The clearest parameters of an effect that are told.
 _TOLD = 3
@@ -44,7 +44,7 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
 
     return {
         "effect": row["effect"],
-        "is": what_it_is(row["effect"]),
+        "is": effect_description(row["effect"]),
         "p": "–" if row["p_value"] is None else f"{row['p_value']:.1g}",
         "posterior": row["posterior"],
         "rms_if_added": in_um(row["rms_if_added"]),
@@ -58,11 +58,13 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
 def _amounts(parameters: dict[str, dict[str, Any]]) -> str:
     """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
     tried = [
-        f"{name} = {p.get('view') or amount(p['value'], None, p['unit'])}"
+        f"{name} = {p.get('view') or format_amount(p['value'], None, p['unit'])}"
         for name, p in parameters.items()
         if p["sigma"] is None
     ]
     fitted = {name: p for name, p in parameters.items() if p["sigma"]}
     clearest = sorted(fitted, key=lambda name: -abs(fitted[name]["value"]) / fitted[name]["sigma"])[:_TOLD]
-    told = [f"{name} = {amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest]
+    told = [
+        f"{name} = {format_amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest
+    ]
     return ", ".join(tried + told)

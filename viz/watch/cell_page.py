@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.units import rounded
-from stitch.watch.cell_course import CellCourse
+from stitch.watch.cell_course import CellTrend
 from stitch.watch.cell_report import CellReport, ParameterReport
-from stitch.watch.sentences import day_text, event_sentences, notes, size_text
-from stitch.watch.table_units import unit_of
+from stitch.watch.sentences import day_text, event_sentences, report_notes, size_text
+from stitch.watch.table_units import table_unit
 from viz import captions
 from viz.drawing import covariate
 from viz.filled_templates import render
@@ -21,7 +21,7 @@ from viz.watch.small_multiples import channel_drawing, drawings
 _FIRST = 6
 
 
-def write_page(course: CellCourse, path: Path) -> None:
+def write_page(course: CellTrend, path: Path) -> None:
     """Write the page of a cell; it needs nothing beside it."""
     report = course.report
     order = sorted(range(len(report.parameters)), key=lambda p: _urgency(report, report.parameters[p]))
@@ -32,7 +32,7 @@ def write_page(course: CellCourse, path: Path) -> None:
         report=report,
         light=light(report),
         events=[told[0].upper() + told[1:] if told.startswith("the ") else told for told in event_sentences(report)],
-        notes=notes(report),
+        notes=report_notes(report),
         identity=_identity(report),
         rows=[_row(report, report.parameters[p]) for p in order],
         first=drawings(course, order[:first]),
@@ -46,7 +46,7 @@ def write_page(course: CellCourse, path: Path) -> None:
         shown=len(course.times),
         caption=captions.WATCHED,
     )
-    with whole(path) as file:
+    with whole_file(path) as file:
         file.write_text(page, encoding="utf-8")
 
 
@@ -82,7 +82,7 @@ def _identity(report: CellReport) -> list[tuple[str, str]]:
 
 
 def _row(report: CellReport, p: ParameterReport) -> dict[str, Any]:
-    factor, unit = unit_of(p.unit, report.length_unit)
+    factor, unit = table_unit(p.unit, report.length_unit)
     moves = abs(p.drift_per_day) > 3 * p.drift_sigma
     until = "holds" if p.valid_until is None else "over" if p.valid_until <= report.last else day_text(p.valid_until)
     return {

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.watch.cell_report import CellReport
 from stitch.watch.sentences import day_text, event_sentences
 from viz.filled_templates import render
@@ -33,7 +33,7 @@ def write_page(cells: Sequence[tuple[CellReport, Path]], path: Path) -> None:
     ]
     rows.sort(key=lambda row: (_ORDER.index(row["light"]), row["name"]))
     counts = {colour: sum(row["light"] == colour for row in rows) for colour in _ORDER}
-    with whole(path) as file:
+    with whole_file(path) as file:
         file.write_text(render("plant.html.j2", rows=rows, sentence=_sentence(counts)), encoding="utf-8")
 
 

@@ -9,9 +9,9 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.watch.cell_course import CellCourse
+from stitch.watch.cell_course import CellTrend
 from stitch.watch.sentences import day_text
-from stitch.watch.table_units import unit_of
+from stitch.watch.table_units import table_unit
 from viz.watch.time_axis import time_marks, value_marks
 
 Array = NDArray[np.float64]
@@ -94,10 +94,10 @@ class Axes:
         return head + "".join(self.parts) + "</svg>"
 
 
-def parameter_drawing(course: CellCourse, p: int) -> tuple[str, str]:
+def parameter_drawing(course: CellTrend, p: int) -> tuple[str, str]:
     """Title and drawing of one parameter."""
     report = course.report.parameters[p]
-    factor, unit = unit_of(report.unit, course.report.length_unit)
+    factor, unit = table_unit(report.unit, course.report.length_unit)
     found, middle, sigma = (x[:, p] * factor for x in (course.values, course.smoothed, course.smoothed_sigmas))
     low, high = middle - _BAND * sigma, middle + _BAND * sigma
     ends = np.nanquantile(np.concatenate([found, low, high]), [0.003, 0.997])
@@ -126,6 +126,6 @@ def channel_drawing(times: Array, values: Array, name: str) -> str:
     return axes.svg(f"{name} over time")
 
 
-def drawings(course: CellCourse, parameters: Sequence[int]) -> list[tuple[str, str, bool]]:
+def drawings(course: CellTrend, parameters: Sequence[int]) -> list[tuple[str, str, bool]]:
     """Title, drawing and whether an alarm stands, of some parameters."""
     return [(*parameter_drawing(course, p), course.report.parameters[p].alarm is not None) for p in parameters]

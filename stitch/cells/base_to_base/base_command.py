@@ -22,6 +22,6 @@ def base(
       stitch base stand.toml --report page.html
     """
     # Loaded by who solves something: whoever asks for help has it at once.
-    from stitch.cells.base_to_base.solved_stand import solved_stand
+    from stitch.cells.base_to_base.solved_stand import run_base
 
-    solved_stand(file, recording, report, session, as_json)
+    run_base(file, recording, report, session, as_json)

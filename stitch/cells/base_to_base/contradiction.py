@@ -9,12 +9,12 @@ from itertools import combinations
 
 import numpy as np
 
-from stitch.cells.base_to_base.stand import Stand, Touched, rod_points
+from stitch.cells.base_to_base.stand import Stand, TouchedPoints, rod_points
 from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DistanceComparison:
     """One distance, by the stand and by a robot's joints."""
 
     pair: tuple[str, str]
@@ -33,15 +33,15 @@ class Comparison:
         return abs(self.difference) / self.sigma
 
 
-def compare_distances(stand: Stand) -> tuple[Comparison, ...]:
+def compare_distances(stand: Stand) -> tuple[DistanceComparison, ...]:
     """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
-    found = [_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
+    found = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
     known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
-    found += [_rail_pair(stand, i, j) for i, j in combinations(known, 2)]
+    found += [_compare_rail_pair(stand, i, j) for i, j in combinations(known, 2)]
     return tuple(sorted(found, key=lambda c: -c.sigmas))
 
 
-def _rod_pair(stand: Stand, i: int, j: int) -> Comparison:
+def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
     """Both slides count as one reading where they are equal: the pivot was not moved."""
     cups = rod_points(stand.slide, stand.angle, stand.length, stand.turn)
     apart = cups[j] - cups[i]
@@ -53,17 +53,19 @@ def _rod_pair(stand: Stand, i: int, j: int) -> Comparison:
         across = np.array([-along[1], along[0], 0.0])
         variance += (unit @ along * stand.sigma_length) ** 2
         variance += (unit @ across * stand.length[k] * stand.sigma_angle) ** 2
-    return _comparison(stand.rod, i, j, distance, variance)
+    return _distance_comparison(stand.rod, i, j, distance, variance)
 
 
-def _rail_pair(stand: Stand, i: int, j: int) -> Comparison:
+def _compare_rail_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
     distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
-    return _comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2)
+    return _distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2)
 
 
-def _comparison(touched: Touched, i: int, j: int, by_stand: float, variance: float) -> Comparison:
+def _distance_comparison(
+    touched: TouchedPoints, i: int, j: int, by_stand: float, variance: float
+) -> DistanceComparison:
     apart: Array = touched.points[j] - touched.points[i]
     by_robot = float(np.linalg.norm(apart))
     unit = apart / max(by_robot, np.finfo(float).tiny)
     variance += float(unit @ (touched.covariance[i] + touched.covariance[j]) @ unit)
-    return Comparison((touched.names[i], touched.names[j]), by_stand, by_robot, float(np.sqrt(variance)))
+    return DistanceComparison((touched.names[i], touched.names[j]), by_stand, by_robot, float(np.sqrt(variance)))

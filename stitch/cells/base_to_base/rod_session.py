@@ -9,7 +9,7 @@ from stitch.cells.session_tables import points_table
 from stitch.writing.session_files import SessionFiles, pose_columns
 
 
-def session(stand: Stand, result: BaseResult) -> SessionFiles:
+def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
     """One view for each rod setting; the sensor's frame is the stand's.
 
     The readings tell where the tip was, not how it was turned: its frame is taken parallel to the base, which changes

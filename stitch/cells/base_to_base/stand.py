@@ -13,7 +13,7 @@ from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Touched:
+class TouchedPoints:
     """Points that one robot touched, in its own base frame, with their covariance."""
 
     names: tuple[str, ...]
@@ -30,9 +30,9 @@ class Stand:
     """
 
     length_unit: str
-    rail: Touched
+    rail: TouchedPoints
     rail_slide: Array  # (N,)
-    rod: Touched
+    rod: TouchedPoints
     slide: Array  # (M,) position of the pivot along the rail
     angle: Array  # (M,) from the rail
     length: Array  # (M,) pivot to cup

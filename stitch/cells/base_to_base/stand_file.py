@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from stitch.cells.base_to_base.stand import Stand, Touched, cylinder_covariance, cylinder_points, rail_direction
+from stitch.cells.base_to_base.stand import Stand, TouchedPoints, cylinder_covariance, cylinder_points, rail_direction
 from stitch.cells.job_toml import check_keys, choice, finite, read_job_file, table, vectors
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.units import METRES
 
-FORMAT = "stitch-base/1"
+STAND_FORMAT = "stitch-base/1"
 # Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
 # that an eye can tell, and calls its distance and angle sensors better than that.
 _POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
@@ -28,11 +28,11 @@ def read_stand(file: Path | str) -> Stand:
         InputError: the file is missing, not TOML, or an entry is missing, unknown, not a number or impossible.
     """
     file = Path(file)
-    document = read_job_file(file, FORMAT, _KEYS, "examples/base_to_base.toml")
+    document = read_job_file(file, STAND_FORMAT, _KEYS, "examples/base_to_base.toml")
     unit, to_rad = _units(file, document)
     main, second = table(file, document, "main"), table(file, document, "second")
-    rail, rail_entries = _touched(file, "main", main, unit, to_rad)
-    rod, rod_entries = _touched(file, "second", second, unit, to_rad)
+    rail, rail_entries = _touched_points(file, "main", main, unit, to_rad)
+    rod, rod_entries = _touched_points(file, "second", second, unit, to_rad)
     settings = table(file, document, "rod")
     check_keys(file, "rod", settings, {"turn", "sigma_slide", "sigma_angle", "sigma_length"})
     turn = choice(file, "rod.turn", settings.get("turn", "clockwise"), tuple(_TURN))
@@ -66,9 +66,9 @@ def _units(file: Path, document: dict[str, Any]) -> tuple[float, float]:
     return METRES[length], 1.0 if angle == "rad" else float(np.pi / 180)
 
 
-def _touched(
+def _touched_points(
     file: Path, name: str, robot: dict[str, Any], unit: float, to_rad: float
-) -> tuple[Touched, list[dict[str, Any]]]:
+) -> tuple[TouchedPoints, list[dict[str, Any]]]:
     """The points of one robot, from coordinates or from joint 1, radius and height."""
     check_keys(file, name, robot, {"points", "sigma"})
     entries = robot.get("points")
@@ -97,7 +97,7 @@ def _touched(
         )
         covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
     names = tuple(str(entry.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
-    return Touched(names, np.array(points, float), np.array(covariances, float)), entries
+    return TouchedPoints(names, np.array(points, float), np.array(covariances, float)), entries
 
 
 def _entry(file: Path, place: str, entry: dict[str, Any], key: str) -> float:

@@ -38,31 +38,31 @@ class BaseFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def fit(stand: Stand) -> BaseFit:
+def fit_stand(stand: Stand) -> BaseFit:
     """Maximum likelihood over both base poses and over the true values of all rod readings.
 
     Raises:
         NoResultError: the readings leave a direction of the second base open.
     """
-    start = _start(stand)
+    start = _initial_poses(stand)
     solution = least_squares(
         lambda x: _residuals(stand, start, x),
-        np.zeros(_size(stand)),
+        np.zeros(_unknown_count(stand)),
         jac=lambda x: _jacobian(stand, start, x),
-        x_scale=_scales(stand),
+        x_scale=_unknown_scales(stand),
         method="trf",
         **_TOLERANCES,
     )
-    jacobian = solution.jac * _scales(stand)
+    jacobian = solution.jac * _unknown_scales(stand)
     U, values, Vt = np.linalg.svd(jacobian, full_matrices=False)
     if len(U) < len(Vt) or values[-1] < 1e-7 * values[0]:
         raise NoResultError(
             "turning the second base about the line through its points changes no reading; touch a third point "
             "off that line, or state level.second_base"
         )
-    covariance = (Vt.T / values**2) @ Vt * np.outer(_scales(stand), _scales(stand))
+    covariance = (Vt.T / values**2) @ Vt * np.outer(_unknown_scales(stand), _unknown_scales(stand))
     T_stand, T_base, *_ = _unpack(stand, start, solution.x)
-    rail, rod = _misfit(stand, start, solution.x)
+    rail, rod = _point_misfits(stand, start, solution.x)
     return BaseFit(
         T_base,
         T_stand,
@@ -74,10 +74,10 @@ def fit(stand: Stand) -> BaseFit:
     )
 
 
-def _start(stand: Stand) -> tuple[Array, Array]:
+def _initial_poses(stand: Stand) -> tuple[Array, Array]:
     """Level stand, and the second base from its points; bases upright where the points leave that open."""
     T_stand = level_stand(stand.rail.points, stand.rail_slide)
-    here = frames.transform(T_stand, _rod(stand.slide, stand))
+    here = frames.transform(T_stand, _corrected_rod_points(stand.slide, stand))
     there = stand.rod.points
     # The upright pair only decides what two points leave open: a thousandth of the points' spread.
     up = 1e-3 * np.linalg.norm(there - there.mean(axis=0)) * np.array([[0.0, 0.0, 1.0]])
@@ -88,15 +88,15 @@ def _start(stand: Stand) -> tuple[Array, Array]:
     return T_stand, frames.make(R, here.mean(axis=0) - R @ there.mean(axis=0))
 
 
-def _rod(slide: Array, stand: Stand) -> Array:
+def _corrected_rod_points(slide: Array, stand: Stand) -> Array:
     return rod_points(slide, stand.angle, stand.length, stand.turn)
 
 
-def _size(stand: Stand) -> int:
+def _unknown_count(stand: Stand) -> int:
     return 12 + len(stand.rail.points) + 3 * len(stand.slide)
 
 
-def _scales(stand: Stand) -> Array:
+def _unknown_scales(stand: Stand) -> Array:
     """Typical size of each unknown's error, for conditioning: rad for rotations, length elsewhere."""
     length = max(stand.sigma_length, stand.sigma_slide)
     pose = np.repeat([stand.sigma_angle, length], 3)
@@ -116,7 +116,7 @@ def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, 
     return poses[0], poses[1], along, *np.moveaxis(x[..., 12 + N :].reshape(*x.shape[:-1], 3, M), -2, 0)
 
 
-def _misfit(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
+def _point_misfits(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
     """Touched minus fitted points, each in the base of the robot that touched them."""
     T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
     rail = frames.transform(T_stand, along[..., None] * np.array([1.0, 0.0, 0.0]))
@@ -128,7 +128,7 @@ def _misfit(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, 
 def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
     """Everything over its sigma: touched points, rod readings, level of the stand and of the second base."""
     T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
-    rail, rod = _misfit(stand, start, x)
+    rail, rod = _point_misfits(stand, start, x)
     known = np.isfinite(stand.rail_slide)
     rows = [
         _whiten(rail, stand.rail.covariance),
@@ -146,9 +146,9 @@ def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
 
 def _jacobian(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
     """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
-    steps = np.diag(1e-2 * _scales(stand))
+    steps = np.diag(1e-2 * _unknown_scales(stand))
     both = _residuals(stand, start, x + np.stack([steps, -steps]))
-    return np.asarray((both[0] - both[1]).T / (2e-2 * _scales(stand)))
+    return np.asarray((both[0] - both[1]).T / (2e-2 * _unknown_scales(stand)))
 
 
 def _whiten(residuals: Array, covariance: Array) -> Array:

@@ -46,7 +46,7 @@ def project(stand: Stand) -> Projection:
         raise NoResultError(
             "the projection takes two points per robot and one slide; the least squares takes any number"
         )
-    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _rod(stand))
+    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _measured_rod_points(stand))
     gamma, p_xy = _plane_xy(stand)
     turned = stand.rod.points @ _rotation(2, gamma).T
     beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
@@ -136,5 +136,5 @@ def _rotation(axis: int, angle: float) -> Array:
     return np.asarray(frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3])
 
 
-def _rod(stand: Stand) -> Array:
+def _measured_rod_points(stand: Stand) -> Array:
     return rod_points(stand.slide, stand.angle, stand.length, stand.turn)

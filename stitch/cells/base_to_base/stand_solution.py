@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from stitch.cells.base_to_base.contradiction import Comparison, compare_distances
+from stitch.cells.base_to_base.contradiction import DistanceComparison, compare_distances
 from stitch.cells.base_to_base.stand import Stand
-from stitch.cells.base_to_base.stand_fit import BaseFit, fit
+from stitch.cells.base_to_base.stand_fit import BaseFit, fit_stand
 from stitch.cells.base_to_base.stand_projection import Projection, project
 from stitch.errors import NoResultError
 
 # A distance that differs by more than this many sigmas is a wrong reading, not noise (one in two million).
-LIMIT = 5.0
+CONTRADICTION_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -24,25 +24,25 @@ class BaseResult:
     fit: BaseFit
     projection: Projection | None
     no_projection: str | None  # why there is none
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[DistanceComparison, ...]
 
 
-def solve(stand: Stand) -> BaseResult:
+def solve_stand(stand: Stand) -> BaseResult:
     """Check, then solve by least squares and, where it applies, by the source's projection.
 
     Raises:
         NoResultError: the readings contradict each other, or leave the second base open.
     """
     comparisons = compare_distances(stand)
-    wrong = [c for c in comparisons if c.sigmas > LIMIT]
+    wrong = [c for c in comparisons if c.sigmas > CONTRADICTION_SIGMAS]
     if wrong:
         raise NoResultError(
             "rod and joints contradict each other: "
-            + "; ".join(describe(c, stand.length_unit) for c in wrong)
+            + "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
             + ". No transform is given; read these points again"
         )
-    solution = fit(stand)
-    if solution.p_value < 2 * norm.sf(LIMIT):
+    solution = fit_stand(stand)
+    if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
         raise NoResultError(
             f"the readings contradict each other: chi-square {solution.chi_square:.1f} with {solution.redundancy} "
             f"redundant readings; {_worst(stand, solution)}. Read that point again, or state larger sigmas"
@@ -53,7 +53,7 @@ def solve(stand: Stand) -> BaseResult:
         return BaseResult(stand.length_unit, solution, None, str(error), comparisons)
 
 
-def describe(c: Comparison, unit: str) -> str:
+def comparison_text(c: DistanceComparison, unit: str) -> str:
     """One comparison in words and numbers."""
     a, b = c.pair
     return (
@@ -62,7 +62,7 @@ def describe(c: Comparison, unit: str) -> str:
     )
 
 
-def document(result: BaseResult) -> dict[str, Any]:
+def base_document(result: BaseResult) -> dict[str, Any]:
     """Plain numbers for JSON: lengths in length_unit, angles in rad."""
     solution, projection = result.fit, result.projection
     return {

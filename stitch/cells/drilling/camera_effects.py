@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f
 
-from stitch.cells.drilling.camera_model import EFFECTS, CameraFit, Observations, fit_camera
+from stitch.cells.drilling.camera_model import CAMERA_EFFECTS, CameraFit, HoleObservations, fit_camera
 
 # An effect enters when chance would do as well in less than one of a thousand cases, and the BIC agrees.
-_P_LIMIT = 1e-3
+_EFFECT_P_LIMIT = 1e-3
 
 
 @dataclass(frozen=True)
-class Trial:
+class CameraEffectTest:
     """One effect tried on top of a fit."""
 
     effect: str
@@ -30,20 +30,20 @@ class EffectSelection:
 
     plain: CameraFit
     camera: CameraFit
-    trials: tuple[Trial, ...]
+    trials: tuple[CameraEffectTest, ...]
 
 
-def select_effects(seen: Observations) -> EffectSelection:
+def select_effects(observations: HoleObservations) -> EffectSelection:
     """Forward selection among EFFECTS by F-test and BIC, the best first.
 
     Raises:
         NoResultError: the observations fix no camera.
     """
-    plain = current = fit_camera(seen)
-    trials: list[Trial] = []
-    while len(current.effects) < len(EFFECTS):
-        fits = [fit_camera(seen, (*current.effects, e)) for e in EFFECTS if e not in current.effects]
-        tried = [_trial(current, bigger) for bigger in fits]
+    plain = current = fit_camera(observations)
+    trials: list[CameraEffectTest] = []
+    while len(current.effects) < len(CAMERA_EFFECTS):
+        fits = [fit_camera(observations, (*current.effects, e)) for e in CAMERA_EFFECTS if e not in current.effects]
+        tried = [_test_effect(current, bigger) for bigger in fits]
         best = int(np.argmin([t.bic_change for t in tried]))
         trials.append(tried[best])
         if not tried[best].accepted:
@@ -53,7 +53,7 @@ def select_effects(seen: Observations) -> EffectSelection:
     return EffectSelection(plain, current, tuple(trials))
 
 
-def _trial(smaller: CameraFit, bigger: CameraFit) -> Trial:
+def _test_effect(smaller: CameraFit, bigger: CameraFit) -> CameraEffectTest:
     count = bigger.residuals.size
     free = count - bigger.unknowns
     F = (smaller.sum_of_squares - bigger.sum_of_squares) / (bigger.sum_of_squares / free)
@@ -61,5 +61,7 @@ def _trial(smaller: CameraFit, bigger: CameraFit) -> Trial:
     p = float(f.sf(max(F, 0.0), 1, free))
     effect = bigger.effects[-1]
     value = bigger.k1 if effect == "k1" else bigger.plate_height
-    accepted = bool(p < _P_LIMIT and bic < 0)
-    return Trial(effect, value, bigger.sigma[effect], F=float(F), p_value=p, bic_change=float(bic), accepted=accepted)
+    accepted = bool(p < _EFFECT_P_LIMIT and bic < 0)
+    return CameraEffectTest(
+        effect, value, bigger.sigma[effect], F=float(F), p_value=p, bic_change=float(bic), accepted=accepted
+    )

@@ -15,12 +15,12 @@ from stitch.errors import NoResultError
 from stitch.frames import Array
 
 # Effects by the names that a report uses.
-EFFECTS = ("k1", "plate_height")
+CAMERA_EFFECTS = ("k1", "plate_height")
 _UNDISTORT_STEPS = 20
 
 
 @dataclass(frozen=True)
-class Observations:
+class HoleObservations:
     """Holes seen by the camera."""
 
     xyz: Array  # (N, 3) in the flange frame, length unit
@@ -80,18 +80,18 @@ def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
     return np.asarray(centre + arm)
 
 
-def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
+def fit_camera(observations: HoleObservations, effects: tuple[str, ...] = ()) -> CameraFit:
     """Projection and the named effects by least squares of the image distances.
 
     Raises:
         NoResultError: too few holes, all at one height, or a plate height error asked for without a plate.
     """
-    _check_enough(seen, effects)
-    centre = np.array(seen.image_size) / 2 - 0.5
-    corner = float(np.linalg.norm(seen.image_size) / 2)
+    _check_enough(observations, effects)
+    centre = np.array(observations.image_size) / 2 - 0.5
+    corner = float(np.linalg.norm(observations.image_size) / 2)
     # Normalised as the DLT wants it, for the refinement's conditioning too.
-    to_uv, to_xyz = normaliser(seen.uv), normaliser(seen.xyz)
-    start = _dlt(seen.xyz, seen.uv, to_xyz, to_uv)
+    to_uv, to_xyz = normaliser(observations.uv), normaliser(observations.xyz)
+    start = _dlt(observations.xyz, observations.uv, to_xyz, to_uv)
 
     def camera(x: Array) -> tuple[Array, dict[str, float]]:
         P = np.linalg.inv(to_uv) @ np.append(x[:11], 1.0).reshape(3, 4) @ to_xyz
@@ -99,8 +99,8 @@ def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
 
     def residuals(x: Array) -> Array:
         P, named = camera(x)
-        xyz = seen.xyz + np.outer(seen.on_plate, [0.0, 0.0, named.get("plate_height", 0.0)])
-        return (distort(_project(P, xyz), named.get("k1", 0.0), centre, corner) - seen.uv).ravel()
+        xyz = observations.xyz + np.outer(observations.on_plate, [0.0, 0.0, named.get("plate_height", 0.0)])
+        return (distort(_project(P, xyz), named.get("k1", 0.0), centre, corner) - observations.uv).ravel()
 
     solution = least_squares(residuals, np.append(start, np.zeros(len(effects))), method="lm", x_scale="jac")
     P, named = camera(solution.x)
@@ -118,13 +118,15 @@ def fit_camera(seen: Observations, effects: tuple[str, ...] = ()) -> CameraFit:
     )
 
 
-def _check_enough(seen: Observations, effects: tuple[str, ...]) -> None:
+def _check_enough(observations: HoleObservations, effects: tuple[str, ...]) -> None:
     """Refuse holes that leave the camera or an effect open."""
-    if len(seen.xyz) < 8 or np.ptp(seen.xyz[:, 2]) < 1e-3 * np.ptp(seen.xyz[:, 0]):
+    if len(observations.xyz) < 8 or np.ptp(observations.xyz[:, 2]) < 1e-3 * np.ptp(observations.xyz[:, 0]):
         raise NoResultError(
             "a camera beyond its work plane needs eight or more holes at different heights; measure some"
         )
-    if "plate_height" in effects and not (seen.on_plate.any() and np.unique(seen.xyz[~seen.on_plate, 2]).size > 1):
+    if "plate_height" in effects and not (
+        observations.on_plate.any() and np.unique(observations.xyz[~observations.on_plate, 2]).size > 1
+    ):
         raise NoResultError(
             "a plate height error shows only against a hole seen at several other heights; measure some"
         )

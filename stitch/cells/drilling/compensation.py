@@ -11,7 +11,7 @@ from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Compensation:
+class GroupCompensation:
     """Nominal to actual drive coordinates of one group."""
 
     T_actual_nominal: Array  # (4, 4)
@@ -23,7 +23,7 @@ class Compensation:
         return frames.transform(self.T_actual_nominal, positions), frames.rotate(self.T_actual_nominal, directions)
 
 
-def compensate(nominal: Array, actual: Array) -> Compensation:
+def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
     """Rigid motion from three or more reference holes (N, 3) by SVD (Kabsch 1976; source, formulas 15 and 16).
 
     Raises:
@@ -33,4 +33,4 @@ def compensate(nominal: Array, actual: Array) -> Compensation:
     if len(nominal) < 3 or on_a_line(nominal) or on_a_line(actual):
         raise NoResultError("a group needs three or more reference holes off one line; add a reference hole")
     T = align_points(nominal, actual)
-    return Compensation(T, actual - frames.transform(T, nominal), actual - nominal)
+    return GroupCompensation(T, actual - frames.transform(T, nominal), actual - nominal)

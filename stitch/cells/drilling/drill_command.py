@@ -23,6 +23,6 @@ def drill(
       stitch drill job.toml --report page.html
     """
     # Loaded by who solves something: whoever asks for help has it at once.
-    from stitch.cells.drilling.drilled_job import drilled_job
+    from stitch.cells.drilling.drilled_job import run_drill
 
-    drilled_job(file, output, recording, report, session, as_json=as_json)
+    run_drill(file, output, recording, report, session, as_json=as_json)

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from stitch.cells.csv_table import Columns, read_columns, refuse_twice
-from stitch.cells.drilling.camera_model import Observations
-from stitch.cells.job_toml import choice, file_beside, finite, read_job_file, vectors
-from stitch.cells.pose_table import COLUMNS, from_columns
+from stitch.cells.csv_table import CsvColumns, read_columns, require_unique
+from stitch.cells.drilling.camera_model import HoleObservations
+from stitch.cells.job_toml import choice, finite, read_job_file, resolve_file, vectors
+from stitch.cells.pose_table import POSE_COLUMNS, poses_from_columns
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.units import METRES
 
-FORMAT = "stitch-drill/1"
+DRILL_FORMAT = "stitch-drill/1"
 _FILES = {"plate", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
 _KEYS = {"format", "length_unit", "height", "image_size", *_FILES}
 # Cosine of the largest angle between tool and hole that a small error explains.
@@ -43,7 +43,7 @@ class PlacedTool:
 
 
 @dataclass(frozen=True)
-class Job:
+class DrillJob:
     """Everything of one drilling job. Lengths in length_unit."""
 
     length_unit: str
@@ -54,39 +54,39 @@ class Job:
     placed: dict[str, PlacedTool]  # by the reference hole
     rangers: dict[str, tuple[Array, Array]]  # planes (M, 4), readings (M,)
     marker_paths: tuple[Array, Array] | None  # joint 6, joint 1, in the measuring system
-    checks: Observations | None  # plate and check holes together
+    checks: HoleObservations | None  # plate and check holes together
     file: Path | None = None  # that was read
 
 
-def read_job(file: Path | str) -> Job:
+def read_drill_job(file: Path | str) -> DrillJob:
     """Read a job file and the tables it names, whose paths are relative to it.
 
     Raises:
         InputError: anything missing, unknown, contradictory or not a number; names the file, the place and what to do.
     """
     file = Path(file)
-    document = read_job_file(file, FORMAT, _KEYS, "examples/drilling/job.toml")
-    paths = {key: file_beside(file, key, document[key]) for key in _FILES if key in document}
+    document = read_job_file(file, DRILL_FORMAT, _KEYS, "examples/drilling/job.toml")
+    paths = {key: resolve_file(file, key, document[key]) for key in _FILES if key in document}
     for key in _NEEDED:
         if key not in paths:
             raise InputError(f"{file}: {key} is missing; name the CSV file")
     plate = read_columns(paths["plate"], "", "x y z u v")
-    holes = _holes(paths["holes"])
-    return Job(
+    holes = _read_holes(paths["holes"])
+    return DrillJob(
         length_unit=choice(file, "length_unit", document.get("length_unit"), tuple(METRES)),
         height=finite(file, "height", document.get("height"), positive=True),
         plate_xyz=plate.stack("x y z"),
         plate_uv=plate.stack("u v"),
         holes=holes,
-        placed=_placed(paths["placed"], holes),
-        rangers=_rangers(paths.get("rangers")),
-        marker_paths=_marker_paths(file, paths),
-        checks=_checks(file, document, paths, plate),
+        placed=_read_placed_tools(paths["placed"], holes),
+        rangers=_read_ranger_tables(paths.get("rangers")),
+        marker_paths=_read_marker_paths(file, paths),
+        checks=_read_check_holes(file, document, paths, plate),
         file=file,
     )
 
 
-def _holes(file: Path) -> tuple[Hole, ...]:
+def _read_holes(file: Path) -> tuple[Hole, ...]:
     table = read_columns(file, "hole group kind", "x y z i j k")
     positions, directions = table.stack("x y z"), table.stack("i j k")
     holes = []
@@ -104,10 +104,10 @@ def _holes(file: Path) -> tuple[Hole, ...]:
     return tuple(holes)
 
 
-def _placed(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedTool]:
-    table = read_columns(file, "hole", f"{COLUMNS} u v height")
-    poses, names = from_columns(table), table.texts["hole"]
-    refuse_twice(file, "hole", names)
+def _read_placed_tools(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedTool]:
+    table = read_columns(file, "hole", f"{POSE_COLUMNS} u v height")
+    poses, names = poses_from_columns(table), table.texts["hole"]
+    require_unique(file, "hole", names)
     for hole in holes:
         if hole.reference and hole.name not in names:
             raise InputError(f"{file}: reference hole {hole.name} is missing; add where the robot ended on it")
@@ -120,7 +120,7 @@ def _placed(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedTool]:
     return {name: PlacedTool(T_base_tool, uv, height) for name, T_base_tool, uv, height in seen}
 
 
-def _rangers(file: Path | None) -> dict[str, tuple[Array, Array]]:
+def _read_ranger_tables(file: Path | None) -> dict[str, tuple[Array, Array]]:
     if file is None:
         return {}
     table = read_columns(file, "ranger", "a b c d reading")
@@ -130,7 +130,7 @@ def _rangers(file: Path | None) -> dict[str, tuple[Array, Array]]:
     return {str(name): (planes[names == name], readings[names == name]) for name in dict.fromkeys(names)}
 
 
-def _marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array] | None:
+def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array] | None:
     if ("joint1" in paths) != ("joint6" in paths):
         raise InputError(f"{file}: joint1 and joint6 belong together; name both marker paths or neither")
     if "joint1" not in paths:
@@ -138,7 +138,9 @@ def _marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array] | N
     return tuple(read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))  # type: ignore[return-value]
 
 
-def _checks(file: Path, document: dict[str, Any], paths: dict[str, Path], plate: Columns) -> Observations | None:
+def _read_check_holes(
+    file: Path, document: dict[str, Any], paths: dict[str, Path], plate: CsvColumns
+) -> HoleObservations | None:
     """Holes of the plate and check holes together."""
     if "checks" not in paths:
         return None
@@ -146,7 +148,7 @@ def _checks(file: Path, document: dict[str, Any], paths: dict[str, Path], plate:
     size = vectors(file, "image_size", document.get("image_size"), (2,), form)
     width, height = (finite(file, "image_size", value, positive=True) for value in size.tolist())
     tables = plate, read_columns(paths["checks"], "", "x y z u v")
-    return Observations(
+    return HoleObservations(
         xyz=np.vstack([table.stack("x y z") for table in tables]),
         uv=np.vstack([table.stack("u v") for table in tables]),
         on_plate=np.repeat([True, False], [table.rows for table in tables]),

@@ -4,15 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from stitch.cells.drilling.camera_effects import Trial
-from stitch.cells.drilling.drill_solution import JobResult
+from stitch.cells.drilling.camera_effects import CameraEffectTest
+from stitch.cells.drilling.drill_solution import DrillResult
 from stitch.cells.drilling.tool_axis import ToolAxis
-from stitch.units import known_text
+from stitch.units import value_uncertainty_text
 
-_NOT_FOUND = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
+_ABSENT_EFFECTS = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
 
 
-def worth(result: JobResult, length_unit: str) -> str:
+def correction_sentence(result: DrillResult, length_unit: str) -> str:
     """What the correction is worth."""
     before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
     after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
@@ -23,7 +23,7 @@ def worth(result: JobResult, length_unit: str) -> str:
     )
 
 
-def hand_eye(result: JobResult, length_unit: str) -> Iterator[str]:
+def hand_eye_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
     """What camera and plate are worth; nothing where four holes leave none to test with."""
     if len(result.leave_one_out_errors):
         sizes = np.linalg.norm(result.leave_one_out_errors, axis=1)
@@ -33,31 +33,31 @@ def hand_eye(result: JobResult, length_unit: str) -> Iterator[str]:
         )
 
 
-def found_effects(result: JobResult, length_unit: str) -> Iterator[str]:
+def significant_effect_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
     """Effects of camera and tool that are taken out."""
     for trial in result.effects.trials if result.effects else ():
         if trial.accepted:
-            yield f"{_camera(trial, length_unit)} (1 σ; p = {trial.p_value:.1g}). That is taken out."
+            yield f"{_camera_effect_sentence(trial, length_unit)} (1 σ; p = {trial.p_value:.1g}). That is taken out."
     if result.tool_axis is not None and result.tool_axis.accepted:
-        yield f"The tool's true axis lies {_tilt(result.tool_axis)} off its frame's z (1 σ); the drives take it up."
+        yield f"The tool's true axis lies {_tool_tilt_sentence(result.tool_axis)} off its frame's z (1 σ); the drives take it up."
 
 
-def effects_not_found(result: JobResult) -> Iterator[str]:
+def absent_effect_sentences(result: DrillResult) -> Iterator[str]:
     """Effects of camera and tool that were looked for in vain."""
     for trial in result.effects.trials if result.effects else ():
         if not trial.accepted:
-            yield f"{_NOT_FOUND[trial.effect]} beyond chance (p = {trial.p_value:.1g})."
+            yield f"{_ABSENT_EFFECTS[trial.effect]} beyond chance (p = {trial.p_value:.1g})."
     if (tool := result.tool_axis) is not None and not tool.accepted:
-        yield f"No tilt of the tool's axis beyond chance ({_tilt(tool)}, 1 σ; p = {tool.p_value:.1g})."
+        yield f"No tilt of the tool's axis beyond chance ({_tool_tilt_sentence(tool)}, 1 σ; p = {tool.p_value:.1g})."
 
 
-def _camera(found: Trial, length_unit: str) -> str:
+def _camera_effect_sentence(effect_test: CameraEffectTest, length_unit: str) -> str:
     """What an effect of the camera is, and its size."""
-    if found.effect == "plate_height":
-        return f"The plate of holes is {known_text(found.value, found.sigma)} {length_unit} off its stated height"
-    size = known_text(100 * found.value, 100 * found.sigma)
+    if effect_test.effect == "plate_height":
+        return f"The plate of holes is {value_uncertainty_text(effect_test.value, effect_test.sigma)} {length_unit} off its stated height"
+    size = value_uncertainty_text(100 * effect_test.value, 100 * effect_test.sigma)
     return f"The lens shifts the image's corners by {size} % of their way from its middle"
 
 
-def _tilt(tool: ToolAxis) -> str:
+def _tool_tilt_sentence(tool: ToolAxis) -> str:
     return f"{np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}°"

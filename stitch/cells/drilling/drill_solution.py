@@ -6,8 +6,8 @@ import numpy as np
 
 from stitch.cells.drilling.base_frame import base_frame
 from stitch.cells.drilling.camera_effects import EffectSelection, select_effects
-from stitch.cells.drilling.compensation import Compensation, compensate
-from stitch.cells.drilling.drill_job import Hole, Job
+from stitch.cells.drilling.compensation import GroupCompensation, compensate_group
+from stitch.cells.drilling.drill_job import DrillJob, Hole
 from stitch.cells.drilling.hole_frame import euler_zyx, hole_rotation
 from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
 from stitch.cells.drilling.rangers import RangerFit, fit_ranger
@@ -33,12 +33,12 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class JobResult:
+class DrillResult:
     """Everything a job gives. Lengths in length_unit."""
 
     H: Array  # (3, 3) work plane to image
     leave_one_out_errors: Array  # (N, 2) of the plate's holes, in the work plane
-    groups: dict[str, Compensation]
+    groups: dict[str, GroupCompensation]
     drives: tuple[Drive, ...]
     rangers: dict[str, RangerFit]
     T_measuring_base: Array | None
@@ -46,7 +46,7 @@ class JobResult:
     tool_axis: ToolAxis | None
 
 
-def solve_job(job: Job) -> JobResult:
+def solve_drill_job(job: DrillJob) -> DrillResult:
     """Homography, compensation of every group, and what else the job holds readings for.
 
     What the check holes show of the camera is taken out of the reference holes' places.
@@ -57,19 +57,19 @@ def solve_job(job: Job) -> JobResult:
     xy = job.plate_xyz[:, :2]
     H = fit_homography(xy, job.plate_uv)
     effects = select_effects(job.checks) if job.checks is not None else None
-    groups: dict[str, Compensation] = {}
+    groups: dict[str, GroupCompensation] = {}
     for group in dict.fromkeys(hole.group for hole in job.holes):
         references = [hole for hole in job.holes if hole.group == group and hole.reference]
         if len(references) < 3:
             raise NoResultError(f"group {group}: {len(references)} reference holes; a group needs three or more")
-        actual = np.array([_actual(job, H, effects, hole.name) for hole in references])
-        groups[group] = compensate(np.array([hole.position for hole in references]), actual)
-    tool_axis = _tool_axis(job, groups)
-    return JobResult(
+        actual = np.array([_measured_hole(job, H, effects, hole.name) for hole in references])
+        groups[group] = compensate_group(np.array([hole.position for hole in references]), actual)
+    tool_axis = _fitted_tool_axis(job, groups)
+    return DrillResult(
         H,
         leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
         groups=groups,
-        drives=tuple(_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
+        drives=tuple(_corrected_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
         rangers={name: fit_ranger(*readings) for name, readings in job.rangers.items()},
         T_measuring_base=base_frame(*job.marker_paths) if job.marker_paths else None,
         effects=effects,
@@ -77,27 +77,27 @@ def solve_job(job: Job) -> JobResult:
     )
 
 
-def _tool_axis(job: Job, groups: dict[str, Compensation]) -> ToolAxis | None:
+def _fitted_tool_axis(job: DrillJob, groups: dict[str, GroupCompensation]) -> ToolAxis | None:
     """From each reference hole once, whatever number of groups it serves."""
     references = {hole.name: hole for hole in job.holes if hole.reference}
     directions = [groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in references.values()]
     return find_tool_axis(np.array([job.placed[name].T_base_tool[:3, :3] for name in references]), np.array(directions))
 
 
-def _drive(hole: Hole, group: Compensation, tool_axis: ToolAxis | None) -> Drive:
+def _corrected_drive(hole: Hole, group: GroupCompensation, tool_axis: ToolAxis | None) -> Drive:
     position, direction = (found[0] for found in group.apply(hole.position[None], hole.direction[None]))
     R = hole_rotation(direction)
     return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
 
 
-def _actual(job: Job, H: Array, effects: EffectSelection | None, name: str) -> Array:
+def _measured_hole(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
     """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
     placed = job.placed[name]
-    offset = np.append(seen_in_plane(job, H, effects, name), placed.height - job.height)
+    offset = np.append(hole_in_plane(job, H, effects, name), placed.height - job.height)
     return hole_coordinate(placed.T_base_tool, offset)
 
 
-def seen_in_plane(job: Job, H: Array, effects: EffectSelection | None, name: str) -> Array:
+def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
     """x, y (2,) in the flange frame at which the camera saw a reference hole.
 
     Where check holes have shown the camera beyond its work plane, at the hole's own height and without the effects that

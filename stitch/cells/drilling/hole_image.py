@@ -19,8 +19,8 @@ def _opencv() -> Any:
     return cv2
 
 
-def find_holes(image: NDArray[np.uint8], smallest: float = 20.0) -> Array:
-    """Centres (N, 2) in pixels of the dark, nearly elliptic spots wider than `smallest`; (0, 0) is a pixel's middle.
+def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
+    """Centres (N, 2) in pixels of the dark, nearly elliptic spots wider than `min_width`; (0, 0) is a pixel's middle.
 
     A spot's centre is the grey-weighted mean over its surroundings, so that partly covered edge pixels count.
 
@@ -39,7 +39,7 @@ def find_holes(image: NDArray[np.uint8], smallest: float = 20.0) -> Array:
         _, (a, b), _ = cv2.fitEllipse(contour)
         area = cv2.contourArea(contour)
         # Scratches and letters fill their ellipse badly; a hole fills it to a few per cent.
-        if min(a, b) < smallest or abs(area / (np.pi * a * b / 4) - 1) > 0.1:
+        if min(a, b) < min_width or abs(area / (np.pi * a * b / 4) - 1) > 0.1:
             continue
         centres.append(_centroid(image, cv2.boundingRect(contour)))
     return np.array(centres, float).reshape(-1, 2)

@@ -3,13 +3,13 @@
 import numpy as np
 
 from stitch import frames
-from stitch.cells.drilling.drill_job import Job
-from stitch.cells.drilling.drill_solution import JobResult, seen_in_plane
+from stitch.cells.drilling.drill_job import DrillJob
+from stitch.cells.drilling.drill_solution import DrillResult, hole_in_plane
 from stitch.cells.session_tables import points_table
 from stitch.writing.session_files import SessionFiles, pose_columns
 
 
-def session(job: Job, result: JobResult) -> SessionFiles:
+def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
     """One view for each reference hole; the sensors' frame is the flange's, and the drawing gives the targets.
 
     The sigma is what leaving one hole of the plate out says of the camera; the rangers' height has none of its own.
@@ -18,7 +18,7 @@ def session(job: Job, result: JobResult) -> SessionFiles:
     names = tuple(job.placed)
     views = [f"at-{name}" for name in names]
     T_base_flange = np.array([job.placed[name].T_base_tool @ T_tool_flange for name in names])
-    places = [np.append(seen_in_plane(job, result.H, result.effects, name), job.placed[name].height) for name in names]
+    places = [np.append(hole_in_plane(job, result.H, result.effects, name), job.placed[name].height) for name in names]
     errors = result.leave_one_out_errors
     sigma = np.full(len(names), np.sqrt((errors**2).mean())) if len(errors) else None
     return SessionFiles(

@@ -21,7 +21,7 @@ def fit_homography(xy: Array, uv: Array) -> Array:
             f"a homography needs four or more holes, {len(xy)} are given; find more of them in the image"
         )
     to_xy, to_uv = normaliser(xy), normaliser(uv)
-    p, q = _apply(to_xy, xy), _apply(to_uv, uv)
+    p, q = _apply_homography(to_xy, xy), _apply_homography(to_uv, uv)
     one, zero = np.ones(len(p)), np.zeros((len(p), 3))
     row = np.column_stack([p, one])
     matrix = np.vstack([np.hstack([row, zero, -q[:, :1] * row]), np.hstack([zero, row, -q[:, 1:] * row])])
@@ -35,14 +35,14 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     def matrix_of(x: Array) -> Array:
         return np.asarray(np.append(x, 1.0).reshape(3, 3))
 
-    refined = least_squares(lambda x: (_apply(matrix_of(x), p) - q).ravel(), start, method="lm").x
+    refined = least_squares(lambda x: (_apply_homography(matrix_of(x), p) - q).ravel(), start, method="lm").x
     H = np.linalg.inv(to_uv) @ matrix_of(refined) @ to_xy
     return np.asarray(H / H[2, 2])
 
 
 def to_plane(H: Array, uv: Array) -> Array:
     """Work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
-    return _apply(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
+    return _apply_homography(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
 
 
 def leave_one_out(xy: Array, uv: Array) -> Array:
@@ -64,6 +64,6 @@ def normaliser(points: Array) -> Array:
     return matrix
 
 
-def _apply(H: Array, points: Array) -> Array:
+def _apply_homography(H: Array, points: Array) -> Array:
     mapped = points @ H[:, :2].T + H[:, 2]
     return np.asarray(mapped[..., :2] / mapped[..., 2:])

@@ -27,7 +27,7 @@ class Rangers:
 
 
 @dataclass(frozen=True)
-class Surface:
+class RangedPlane:
     """The surface under the tool, in the flange frame."""
 
     normal: Array  # (3,) unit vector into the part, so close to +z
@@ -72,7 +72,7 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
     return RangerFit(x[:3], direction(x), float(np.sqrt(np.mean(distances(x) ** 2))))
 
 
-def surface(rangers: Rangers, readings: Array) -> Surface:
+def fit_ranged_plane(rangers: Rangers, readings: Array) -> RangedPlane:
     """Plane through the laser points of three or more readings (n,), and its height on the tool axis.
 
     The source takes the mean z of its four points, which is the same where the axis passes their centre.
@@ -81,4 +81,4 @@ def surface(rangers: Rangers, readings: Array) -> Surface:
     centre = points.mean(axis=0)
     normal = np.linalg.svd(points - centre)[2][2]
     normal = normal * np.sign(normal[2])
-    return Surface(normal, float(centre @ normal / normal[2]))
+    return RangedPlane(normal, float(centre @ normal / normal[2]))

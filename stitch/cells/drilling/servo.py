@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.cells.drilling.homography import to_plane
-from stitch.cells.drilling.rangers import Rangers, surface
+from stitch.cells.drilling.rangers import Rangers, fit_ranged_plane
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -27,7 +27,7 @@ class Thresholds:
 
 
 @dataclass(frozen=True)
-class Seeing:
+class FlangeSensors:
     """The calibrated sensors of the flange."""
 
     rangers: Rangers
@@ -37,7 +37,7 @@ class Seeing:
 
 
 @dataclass(frozen=True)
-class Sight:
+class HoleSight:
     """What the sensors say at one pose: hole against tool, in the flange frame."""
 
     normal: Array  # (3,)
@@ -46,17 +46,17 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Placed:
+class ServoResult:
     """The end of a servo loop."""
 
     T_base_tool: Array  # (4, 4)
-    sight: Sight
+    final_sight: HoleSight
     steps: int
 
     @property
     def hole(self) -> Array:
         """Drive coordinate (3,) of the hole: p + R'·(x', y', h' − h) (source, formula 14)."""
-        return hole_coordinate(self.T_base_tool, self.sight.offset)
+        return hole_coordinate(self.T_base_tool, self.final_sight.offset)
 
 
 def hole_coordinate(T_base_tool: Array, offset: Array) -> Array:
@@ -64,14 +64,14 @@ def hole_coordinate(T_base_tool: Array, offset: Array) -> Array:
     return np.asarray(T_base_tool[:3, 3] + T_base_tool[:3, :3] @ offset)
 
 
-def look(seeing: Seeing, ranges: Array, uv: Array) -> Sight:
+def measure_hole(sensors: FlangeSensors, ranges: Array, uv: Array) -> HoleSight:
     """One measurement in the flange frame, from the rangers' readings and an image point (2,)."""
-    seen = surface(seeing.rangers, ranges)
-    xy = to_plane(seeing.H, np.asarray(uv)[None])[0]
-    return Sight(seen.normal, seen.tilt, np.append(xy, seen.height - seeing.height))
+    seen = fit_ranged_plane(sensors.rangers, ranges)
+    xy = to_plane(sensors.H, np.asarray(uv)[None])[0]
+    return HoleSight(seen.normal, seen.tilt, np.append(xy, seen.height - sensors.height))
 
 
-def upright(T_base_tool: Array, normal: Array) -> Array:
+def align_tool_axis(T_base_tool: Array, normal: Array) -> Array:
     """The pose turned about the tool's origin so that its axis lies along `normal` (3,), given in the flange frame."""
     z = np.array([0.0, 0.0, 1.0])
     axis = np.cross(z, normal)
@@ -81,26 +81,26 @@ def upright(T_base_tool: Array, normal: Array) -> Array:
     return frames.make(R, T_base_tool[:3, 3])
 
 
-def place(measure: Measure, seeing: Seeing, T_base_tool: Array) -> Placed:
+def servo_to_hole(measure: Measure, sensors: FlangeSensors, T_base_tool: Array) -> ServoResult:
     """Tilt, then height, then camera offset, and again until all three are below their thresholds; starts at a pose
     (4, 4).
 
     Raises:
         NoResultError: the loop does not converge.
     """
-    limits = seeing.thresholds
+    limits = sensors.thresholds
     for step in range(_MOST_STEPS):
-        sight = look(seeing, *measure(T_base_tool))
+        sight = measure_hole(sensors, *measure(T_base_tool))
         x, y, dh = sight.offset
         R = T_base_tool[:3, :3]
         if sight.tilt >= limits.tilt:
-            T_base_tool = upright(T_base_tool, sight.normal)
+            T_base_tool = align_tool_axis(T_base_tool, sight.normal)
         elif abs(dh) >= limits.height:
             T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [0.0, 0.0, dh])
         elif np.hypot(x, y) >= limits.offset:
             T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [x, y, 0.0])
         else:
-            return Placed(T_base_tool, sight, step)
+            return ServoResult(T_base_tool, sight, step)
     raise NoResultError(
         f"the tool did not converge on the hole in {_MOST_STEPS} steps: tilt {np.degrees(sight.tilt):.2f}°, height "
         f"{dh:+.2f}, offset {np.hypot(x, y):.2f}; calibrate rangers and camera again"

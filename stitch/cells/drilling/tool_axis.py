@@ -13,8 +13,8 @@ from scipy.stats import f
 from stitch.frames import Array
 
 # With half a dozen reference holes a smaller limit would hide tilts of a degree.
-_P_LIMIT = 0.01
-_FEWEST = 4
+_TILT_P_LIMIT = 0.01
+_MIN_HOLES = 4
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:
     Hotelling's T² of the two small components against zero (Anderson 2003, section 5.2).
     """
     count = len(reported)
-    if count < _FEWEST:
+    if count < _MIN_HOLES:
         return None
     seen = np.einsum("nji,nj->ni", reported, directions)
     small = seen[:, :2]
@@ -53,4 +53,4 @@ def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:
     axis = seen.mean(axis=0)
     axis /= np.linalg.norm(axis)
     tilt = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))
-    return ToolAxis(axis, tilt, float(np.sqrt(np.trace(scatter) / 2 / count)), p, p < _P_LIMIT)
+    return ToolAxis(axis, tilt, float(np.sqrt(np.trace(scatter) / 2 / count)), p, p < _TILT_P_LIMIT)

@@ -20,7 +20,7 @@ _MINIMUM = 4  # poses: 12 reflectors, 36 readings for 15 unknowns
 
 
 @dataclass(frozen=True)
-class Readings:
+class ReflectorReadings:
     """One robot's calibration: M poses, three reflectors each; mm."""
 
     name: str
@@ -53,7 +53,7 @@ class RobotModel:
         return float(chi2.sf(self.chi_square, self.redundancy))
 
 
-def initial_guess(readings: Readings) -> tuple[Array, Array]:
+def initial_guess(readings: ReflectorReadings) -> tuple[Array, Array]:
     """T_world_base, T_flange_contact (4, 4) in closed form: AX = XB over motions from the first pose, then the base.
 
     Raises:
@@ -73,7 +73,7 @@ def initial_guess(readings: Readings) -> tuple[Array, Array]:
     return bases[0] @ frames.exp(offsets.mean(axis=0)), T_flange_contact
 
 
-def calibrate(readings: Readings) -> RobotModel:
+def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
     """Both unknowns at once, each reflector coordinate weighted by the tracker's sigma.
 
     The three reflectors are unknown points of the flange (9) beside the base (6), so nothing about the clamp need be

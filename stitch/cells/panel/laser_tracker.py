@@ -8,7 +8,7 @@ from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Tracker:
+class LaserTracker:
     """Lengths in mm. The maker's 10 µm + 5 µm/m is taken as one sigma of every coordinate, which is cautious."""
 
     position: Array  # (3,) in the world frame

@@ -13,7 +13,7 @@ from stitch.frames import Array
 
 
 @dataclass(frozen=True)
-class Layout:
+class ClampLayout:
     """Lengths in mm. Panel frame: origin in the middle of the outer surface, x along the axis, z outwards."""
 
     radius: float  # R of the outer surface
@@ -35,7 +35,7 @@ class Contacts:
     tilt: float  # θ between a clamp's plane and the axis, rad
 
 
-def contacts(layout: Layout) -> Contacts:
+def clamp_contacts(layout: ClampLayout) -> Contacts:
     """Pads and contact frames, symmetric about the panel's middle; the bases lie towards the ends.
 
     A clamp's chord W_c spans the angle 2·asin(W_c/2R), the free chord D the angle 2·asin(D/2R). The base's pads lie

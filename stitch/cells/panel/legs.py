@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stitch import frames
-from stitch.cells.panel.global_model import Readings, RobotModel
+from stitch.cells.panel.global_model import ReflectorReadings, RobotModel
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -42,7 +42,7 @@ class LegOffset:
     chi_square_drop: float  # chi-square with one degree of freedom if there is no offset
     runner_up: int  # the leg that explains the data next best
     runner_up_drop: float
-    found: bool  # beyond chance
+    detected: bool  # beyond chance
 
 
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
@@ -63,7 +63,7 @@ def leg_jacobian(legs: Legs, T_base_flange: Array) -> Array:
     return np.concatenate([np.cross(legs.platform, inside), inside], axis=-1)
 
 
-def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: int) -> LegOffset:
+def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, tests: int) -> LegOffset:
     """Score each leg on the residuals left by the fit, with base and clamp free to give way.
 
     Args:
@@ -91,7 +91,7 @@ def find_leg_offset(readings: Readings, model: RobotModel, legs: Legs, tests: in
         chi_square_drop=float(drops[best]),
         runner_up=int(second) + 1,
         runner_up_drop=float(drops[second]),
-        found=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
+        detected=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
     )
 
 

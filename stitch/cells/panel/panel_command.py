@@ -23,6 +23,6 @@ def panel(
       stitch panel job.toml --report page.html
     """
     # Loaded by who solves something: whoever asks for help has it at once.
-    from stitch.cells.panel.solved_panel import solved_panel
+    from stitch.cells.panel.solved_panel import run_panel
 
-    solved_panel(file, output, recording, report, session, as_json=as_json)
+    run_panel(file, output, recording, report, session, as_json=as_json)

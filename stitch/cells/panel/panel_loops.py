@@ -8,17 +8,17 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.panel.global_model import RobotModel
-from stitch.cells.panel.laser_tracker import Tracker
+from stitch.cells.panel.laser_tracker import LaserTracker
 from stitch.cells.panel.panel_motion import adjust_pose
 from stitch.cells.panel.rigid_fit import RigidFit, rigid_fit
-from stitch.cells.panel.shape_control import SHAPING, ControlPoints, largest, shape_step
+from stitch.cells.panel.shape_control import SHAPE_AXES, ControlPoints, largest_deviations, shape_step
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
 _MOST_CORRECTIONS = 10
 
 
-class Cell(Protocol):
+class PanelMachines(Protocol):
     """What a loop needs of the machines."""
 
     def drive(self, T_base_flange: Array, /) -> None:
@@ -32,12 +32,12 @@ class Cell(Protocol):
 
 
 @dataclass(frozen=True)
-class Stage:
+class PanelSetup:
     """Where the panel shall go, and what holds it."""
 
     models: Sequence[RobotModel]
     master: int
-    tracker: Tracker
+    tracker: LaserTracker
     T_world_target: Array  # (4, 4)
 
 
@@ -50,13 +50,13 @@ class ShapeRun:
     forces: list[Array]  # (N, 6) each
 
 
-def measure_pose(cell: Cell, stage: Stage, targets: Array) -> RigidFit:
+def measure_pose(cell: PanelMachines, stage: PanelSetup, targets: Array) -> RigidFit:
     """The panel's pose from its targets (K, 3), panel frame."""
     seen = cell.track(targets)
     return rigid_fit(targets, seen, stage.tracker.sigma(seen))
 
 
-def run_pose(cell: Cell, stage: Stage, targets: Array, T_base_flange: Array) -> Array:
+def run_pose(cell: PanelMachines, stage: PanelSetup, targets: Array, T_base_flange: Array) -> Array:
     """One adjustment: measure, move master and slaves; returns where the robots stand then, (N, 4, 4)."""
     bases = np.array([m.T_world_base for m in stage.models])
     T_world_panel = measure_pose(cell, stage, targets).T
@@ -66,7 +66,13 @@ def run_pose(cell: Cell, stage: Stage, targets: Array, T_base_flange: Array) -> 
 
 
 def run_shape(
-    cell: Cell, stage: Stage, control: ControlPoints, T_base_flange: Array, *, tolerance: float, axes: Array = SHAPING
+    cell: PanelMachines,
+    stage: PanelSetup,
+    control: ControlPoints,
+    T_base_flange: Array,
+    *,
+    tolerance: float,
+    axes: Array = SHAPE_AXES,
 ) -> ShapeRun:
     """Correct from poses (N, 4, 4) on until all control points are within the tolerance, mm.
 
@@ -80,7 +86,7 @@ def run_shape(
     for _ in range(_MOST_CORRECTIONS + 1):
         seen = frames.transform(T_target_world, cell.track(control.nominal))
         step = shape_step(seen, control, T_base_flange, contact, axes=axes)
-        deviations.append(largest(step.deviations, control))
+        deviations.append(largest_deviations(step.deviations, control))
         forces.append(cell.forces())
         if deviations[-1].max() <= tolerance:
             return ShapeRun(T_base_flange, deviations, forces)

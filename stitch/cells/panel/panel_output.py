@@ -7,16 +7,16 @@ import numpy as np
 
 from stitch.cells.panel.global_model import RobotModel
 from stitch.cells.panel.legs import LegOffset
-from stitch.cells.panel.panel_job import Job
-from stitch.cells.panel.panel_solution import JobResult
-from stitch.cells.pose_table import COLUMNS, to_numbers, write_columns, write_poses
+from stitch.cells.panel.panel_job import PanelJob
+from stitch.cells.panel.panel_solution import PanelResult
+from stitch.cells.pose_table import POSE_COLUMNS, rows_from_poses, write_columns, write_poses
 
 
-def document(job: Job, result: JobResult) -> dict[str, Any]:
+def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
     """Plain data for JSON. mm, degrees, N."""
     out: dict[str, Any] = {
-        "robots": {m.name: _robot(m) for m in result.models},
-        "leg_offsets": {o.robot: _leg(o) for o in result.legs},
+        "robots": {m.name: _robot_document(m) for m in result.models},
+        "leg_offsets": {o.robot: _leg_document(o) for o in result.legs},
         "errors": {
             "after_100_mm": result.errors.shift.position[:, -1].max(axis=0).tolist(),
             "after_2_deg": result.errors.turn.position[:, -1].max(axis=0).tolist(),
@@ -36,13 +36,13 @@ def document(job: Job, result: JobResult) -> dict[str, Any]:
         ok = bool(result.shape_largest.max() <= job.tolerance)
         out["shape"] = {"largest_deviation": deviation, "tolerance": job.tolerance, "within_tolerance": ok}
     if job.forces is not None:
-        out["forces"] = {name: _force(row) for name, row in zip(job.robots, job.forces, strict=True)}
+        out["forces"] = {name: _force_document(row) for name, row in zip(job.robots, job.forces, strict=True)}
     return out
 
 
-def _leg(o: LegOffset) -> dict[str, Any]:
+def _leg_document(o: LegOffset) -> dict[str, Any]:
     return {
-        "found": o.found,
+        "found": o.detected,
         "leg": o.leg,
         "offset": o.offset,
         "sigma": o.sigma,
@@ -52,7 +52,7 @@ def _leg(o: LegOffset) -> dict[str, Any]:
     }
 
 
-def _robot(model: RobotModel) -> dict[str, Any]:
+def _robot_document(model: RobotModel) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(model.covariance)).reshape(4, 3)
     return {
         "T_world_base": model.T_world_base.tolist(),
@@ -67,11 +67,11 @@ def _robot(model: RobotModel) -> dict[str, Any]:
     }
 
 
-def _force(row: np.ndarray) -> dict[str, float]:
+def _force_document(row: np.ndarray) -> dict[str, float]:
     return {"force_N": float(np.linalg.norm(row[3:])), "torque_Nm": float(np.linalg.norm(row[:3]) / 1000)}
 
 
-def write_folder(job: Job, result: JobResult, folder: Path) -> list[str]:
+def write_folder(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
     """Write commands and model; returns the files' names."""
     folder.mkdir(parents=True, exist_ok=True)
     write_poses(folder / "preposition.csv", "robot", job.robots, result.preposition)
@@ -89,11 +89,11 @@ def write_folder(job: Job, result: JobResult, folder: Path) -> list[str]:
     return written
 
 
-def _write_model(file: Path, job: Job, result: JobResult) -> None:
+def _write_model(file: Path, job: PanelJob, result: PanelResult) -> None:
     columns: dict[str, Any] = {"robot": list(job.robots)}
     for prefix, name in (("base", "T_world_base"), ("contact", "T_flange_contact")):
-        rows = to_numbers(np.array([getattr(m, name) for m in result.models]))
-        columns |= {f"{prefix}_{k}": rows[:, i] for i, k in enumerate(COLUMNS.split())}
+        rows = rows_from_poses(np.array([getattr(m, name) for m in result.models]))
+        columns |= {f"{prefix}_{k}": rows[:, i] for i, k in enumerate(POSE_COLUMNS.split())}
     sigma = np.array([np.sqrt(np.diag(m.covariance)) for m in result.models])
     for prefix, first in (("base", 0), ("contact", 6)):
         columns[f"{prefix}_sigma_deg"] = np.degrees(sigma[:, first : first + 3].max(axis=1))

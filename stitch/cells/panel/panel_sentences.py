@@ -3,8 +3,8 @@
 import numpy as np
 
 from stitch.cells.panel.legs import LegOffset
-from stitch.cells.panel.panel_job import Job
-from stitch.cells.panel.panel_solution import JobResult
+from stitch.cells.panel.panel_job import PanelJob
+from stitch.cells.panel.panel_solution import PanelResult
 
 # A likelihood ratio of 100 is a chi-square of 9.2.
 _CLEAR = 9.2
@@ -19,7 +19,7 @@ def leg_sentence(o: LegOffset) -> str:
     )
 
 
-def shape_sentence(job: Job, result: JobResult) -> str | None:
+def shape_sentence(job: PanelJob, result: PanelResult) -> str | None:
     """The clamp where the shape is off most; None without control points."""
     if result.shape_largest is None:
         return None

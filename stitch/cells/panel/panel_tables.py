@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.csv_table import Columns, read_columns
-from stitch.cells.panel.global_model import Readings
-from stitch.cells.panel.laser_tracker import Tracker
+from stitch.cells.csv_table import CsvColumns, read_columns
+from stitch.cells.panel.global_model import ReflectorReadings
+from stitch.cells.panel.laser_tracker import LaserTracker
 from stitch.cells.panel.rigid_fit import rigid_fit
-from stitch.cells.pose_table import COLUMNS, from_columns
+from stitch.cells.pose_table import POSE_COLUMNS, poses_from_columns
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices
 
@@ -19,28 +19,28 @@ _FLAT = 1e-3
 
 
 @dataclass(frozen=True)
-class Points:
+class PanelPoints:
     """Targets on the panel and where the tracker sees them, mm."""
 
     names: list[str]
     nominal: Array  # (K, 3) panel frame
-    seen: Array  # (K, 3) world frame
+    measured: Array  # (K, 3) world frame
     clamp: Indices  # (K,) index of the robot; −1 where the file has none
 
 
 def read_calibration(
-    file: Path, names: tuple[str, ...], tracker: Tracker, T_world_tracker: Array
-) -> tuple[Readings, ...]:
+    file: Path, names: tuple[str, ...], tracker: LaserTracker, T_world_tracker: Array
+) -> tuple[ReflectorReadings, ...]:
     """Each robot's poses and reflectors; the tracker's readings brought into the world.
 
     Raises:
         InputError: a column or robot is missing, or reflectors lie on one line.
     """
-    columns = read_columns(file, "robot", f"{COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
-    poses, seen = from_columns(columns), columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
+    columns = read_columns(file, "robot", f"{POSE_COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
+    poses, seen = poses_from_columns(columns), columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
     seen = frames.transform(T_world_tracker, seen)
     robot = np.array(columns.texts["robot"])
-    known(file, columns, names)
+    require_known_robots(file, columns, names)
     sides = seen[:, 1:] - seen[:, :1]
     flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) < _FLAT * (sides**2).sum(axis=(1, 2))
     if flat.any():
@@ -48,25 +48,27 @@ def read_calibration(
     for name in names:
         if not (robot == name).any():
             raise InputError(f"{file}: robot {name} has no row; measure its poses, or leave it out of the job")
-    return tuple(Readings(n, poses[robot == n], seen[robot == n], tracker.sigma(seen[robot == n])) for n in names)
+    return tuple(
+        ReflectorReadings(n, poses[robot == n], seen[robot == n], tracker.sigma(seen[robot == n])) for n in names
+    )
 
 
-def read_per_robot(file: Path, names: tuple[str, ...], wanted: str) -> Array:
+def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Array:
     """(N, k) one row of numbers for each robot, in the order of `names`.
 
     Raises:
         InputError: a column is missing, or a robot is missing, unknown or there twice.
     """
-    columns = read_columns(file, "robot", wanted)
-    known(file, columns, names)
+    columns = read_columns(file, "robot", column_names)
+    require_known_robots(file, columns, names)
     listed = columns.texts["robot"]
     for name in names:
         if listed.count(name) != 1:
             raise InputError(f"{file}: robot {name} stands in {listed.count(name)} rows; give each robot one")
-    return columns.stack(wanted)[[listed.index(name) for name in names]]
+    return columns.stack(column_names)[[listed.index(name) for name in names]]
 
 
-def read_points(file: Path, robots: tuple[str, ...] | None, T_world_tracker: Array) -> Points:
+def read_panel_points(file: Path, robots: tuple[str, ...] | None, T_world_tracker: Array) -> PanelPoints:
     """Targets (robots None) or control points, which name the robot whose clamp they lie beside.
 
     Raises:
@@ -75,16 +77,16 @@ def read_points(file: Path, robots: tuple[str, ...] | None, T_world_tracker: Arr
     columns = read_columns(file, "point robot" if robots else "point", "x y z seen_x seen_y seen_z")
     clamp = np.full(columns.rows, -1)
     if robots:
-        known(file, columns, robots)
+        require_known_robots(file, columns, robots)
         clamp = np.array([robots.index(name) for name in columns.texts["robot"]])
         for i, name in enumerate(robots):
             if not (clamp == i).any():
                 raise InputError(f"{file}: robot {name} has no control point; measure one or more beside its clamp")
     seen = frames.transform(T_world_tracker, columns.stack("seen_x seen_y seen_z"))
-    return Points(columns.texts["point"], columns.stack("x y z"), seen, clamp)
+    return PanelPoints(columns.texts["point"], columns.stack("x y z"), seen, clamp)
 
 
-def read_world(file: Path, tracker: Tracker) -> Array:
+def read_world(file: Path, tracker: LaserTracker) -> Array:
     """T_world_tracker (4, 4) from reference points; the tracker sits at its own frame's origin.
 
     Raises:
@@ -107,7 +109,7 @@ def read_world(file: Path, tracker: Tracker) -> Array:
     return frames.inverse(found.T)
 
 
-def known(file: Path, columns: Columns, names: tuple[str, ...]) -> None:
+def require_known_robots(file: Path, columns: CsvColumns, names: tuple[str, ...]) -> None:
     """Refuse robots that the job does not name.
 
     Raises:

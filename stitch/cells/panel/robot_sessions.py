@@ -3,10 +3,10 @@
 import numpy as np
 
 from stitch import frames
-from stitch.cells.panel.global_model import Readings, RobotModel
+from stitch.cells.panel.global_model import ReflectorReadings, RobotModel
 from stitch.cells.panel.legs import Legs, leg_lengths
-from stitch.cells.panel.panel_job import Job
-from stitch.cells.panel.panel_solution import JobResult
+from stitch.cells.panel.panel_job import PanelJob
+from stitch.cells.panel.panel_solution import PanelResult
 from stitch.cells.session_tables import points_table
 from stitch.frames import Array
 from stitch.writing.session_files import SessionFiles, pose_columns
@@ -14,17 +14,17 @@ from stitch.writing.session_files import SessionFiles, pose_columns
 _REFLECTORS = ("r1", "r2", "r3")
 
 
-def sessions(job: Job, result: JobResult) -> list[SessionFiles]:
+def robot_sessions(job: PanelJob, result: PanelResult) -> list[SessionFiles]:
     """One session a robot, since each has a base of its own; the sensor's frame is the world's.
 
     The poses are the controller's own, a leg offset that was found is still in them. A parallel robot has no chain of
     joints that a session could name; the lengths of its legs go along as covariates.
     """
     pairs = zip(job.calibration, result.models, strict=True)
-    return [_session(readings, model, job.legs) for readings, model in pairs]
+    return [_robot_session(readings, model, job.legs) for readings, model in pairs]
 
 
-def _session(readings: Readings, model: RobotModel, legs: Legs | None) -> SessionFiles:
+def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | None) -> SessionFiles:
     count = len(readings.T_base_flange)
     views = [f"{readings.name}{m + 1:03}" for m in range(count)]
     points = points_table(

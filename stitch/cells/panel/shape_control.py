@@ -9,7 +9,7 @@ from stitch.frames import Array, Indices
 
 # Of a contact frame's twist (rotation first): the panel is shaped by its z and by turns about x and y; the other axes
 # give way to force control, because the panel is stiff in its plane.
-SHAPING = np.array([True, True, False, False, False, True])
+SHAPE_AXES = np.array([True, True, False, False, False, True])
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ControlPoints:
 
 
 def shape_step(
-    measured: Array, control: ControlPoints, T_base_flange: Array, T_flange_contact: Array, axes: Array = SHAPING
+    measured: Array, control: ControlPoints, T_base_flange: Array, T_flange_contact: Array, axes: Array = SHAPE_AXES
 ) -> ShapeStep:
     """Move every clamp as its own control points need it.
 
@@ -61,7 +61,7 @@ def shape_step(
     return ShapeStep(T_contact @ frames.inverse(T_flange_contact), twists, deviations)
 
 
-def largest(deviations: Array, control: ControlPoints) -> Array:
+def largest_deviations(deviations: Array, control: ControlPoints) -> Array:
     """(N,) largest deviation across the panel's surface (along a contact frame's z) at each clamp, mm."""
     across = np.einsum("ki,ki->k", deviations, control.T_panel_contact[control.clamp][:, :3, 2])
     clamps = range(len(control.T_panel_contact))

@@ -7,17 +7,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cells.outputs import draw, show
+from stitch.cells.outputs import write_pictures, write_recording_and_page
 from stitch.cells.panel import robot_sessions
-from stitch.cells.panel.panel_job import Job, read_job
-from stitch.cells.panel.panel_output import document, write_folder
+from stitch.cells.panel.panel_job import PanelJob, read_panel_job
+from stitch.cells.panel.panel_output import panel_document, write_folder
 from stitch.cells.panel.panel_sentences import leg_sentence, shape_sentence
-from stitch.cells.panel.panel_solution import JobResult, solve_job
+from stitch.cells.panel.panel_solution import PanelResult, solve_panel_job
 from stitch.system.console import console
 from stitch.writing.session_files import write_sessions
 
 
-def solved_panel(
+def run_panel(
     file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
 ) -> None:
     """Solve a job and hand out what was asked for.
@@ -25,16 +25,16 @@ def solved_panel(
     Raises:
         InputError, NoResultError: as `stitch panel` ends.
     """
-    job = read_job(file)
-    result = solve_job(job)
+    job = read_panel_job(file)
+    result = solve_panel_job(job)
     written = []
     if output is not None:
-        written = write_folder(job, result, output) + draw("panel", output, job, result)
+        written = write_folder(job, result, output) + write_pictures("panel", output, job, result)
     if session is not None:
-        write_sessions(session, robot_sessions.sessions(job, result))
-    show("panel", recording, report, job, result)
+        write_sessions(session, robot_sessions.robot_sessions(job, result))
+    write_recording_and_page("panel", recording, report, job, result)
     if as_json:
-        print(json.dumps(document(job, result), indent=1))
+        print(json.dumps(panel_document(job, result), indent=1))
         return
     terminal = console()
     _print_model(terminal, result)
@@ -44,7 +44,7 @@ def solved_panel(
         print(f"{output}/{name}")
 
 
-def _print_model(terminal: Console, result: JobResult) -> None:
+def _print_model(terminal: Console, result: PanelResult) -> None:
     table = Table(title="Robots and tracker in one model: 1 σ of the worst axis", title_justify="left")
     for heading in ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p"):
         table.add_column(heading)
@@ -56,8 +56,8 @@ def _print_model(terminal: Console, result: JobResult) -> None:
     terminal.print(table)
 
 
-def _print_legs(terminal: Console, result: JobResult) -> None:
-    found = [offset for offset in result.legs if offset.found]
+def _print_legs(terminal: Console, result: PanelResult) -> None:
+    found = [offset for offset in result.legs if offset.detected]
     for o in found:
         terminal.print(leg_sentence(o))
     for model in result.models:
@@ -71,7 +71,7 @@ def _print_legs(terminal: Console, result: JobResult) -> None:
         terminal.print("No leg offset beyond chance in any robot.")
 
 
-def _print_moves(terminal: Console, job: Job, result: JobResult) -> None:
+def _print_moves(terminal: Console, job: PanelJob, result: PanelResult) -> None:
     shift, turn = (errors.position[:, -1].max() for errors in (result.errors.shift, result.errors.turn))
     terminal.print(
         f"With {job.robots[job.master]} as master, the others are off by {shift:.3f} mm rms at most after a shift by "

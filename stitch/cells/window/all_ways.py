@@ -6,15 +6,15 @@ On a large smooth sheet the few points of its flanks alone hold it in its plane.
 import numpy as np
 
 from stitch import frames
-from stitch.cells.window.joined_scans import Joined
+from stitch.cells.window.joined_scans import JoinedScans
 from stitch.frames import Array, Indices
 
-_POINTS = 20_000
+_SAMPLED_POINTS = 20_000
 # Normals are sorted into cells of a quarter of their unit length: about 15°.
 _DIRECTIONS = 4
 
 
-def all_ways(scan: Joined, T_base_part: Array) -> Indices:
+def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
     """(n,) indices of at most 20,000 usable points, as many of each direction as there are to share out.
 
     Args:
@@ -33,8 +33,8 @@ def all_ways(scan: Joined, T_base_part: Array) -> Indices:
 
 def _quota(counts: Indices) -> int:
     """The largest share per direction that keeps the sum within _POINTS."""
-    low, high = 1, _POINTS
+    low, high = 1, _SAMPLED_POINTS
     while low < high:
         middle = (low + high + 1) // 2
-        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _POINTS else (low, middle - 1)
+        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _SAMPLED_POINTS else (low, middle - 1)
     return low

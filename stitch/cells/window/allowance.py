@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 from numpy.polynomial import legendre
 
-from stitch.cells.window.cad import Surface
+from stitch.cells.window.cad import CadSurface
 from stitch.errors import InputError
 from stitch.frames import Array
 
@@ -19,7 +19,7 @@ _ORDERS = tuple(order for order in product(range(_DEGREE + 1), repeat=3) if 0 < 
 
 
 @dataclass(frozen=True)
-class Wanted:
+class AllowancePrior:
     """What is believed of the allowance before the fit; length_unit of the CAD."""
 
     known: float = 0.0
@@ -41,26 +41,26 @@ class Allowance:
     lowest: float  # over the fit's points; of an even allowance the value
     highest: float
     sigma_field: float  # largest 1-sigma at any of those points
-    wanted: Wanted
-    told: float  # share of it that no motion of the part imitates, 0 to 1; 1 where it was stated
+    prior: AllowancePrior
+    separable_share: float  # share of it that no motion of the part imitates, 0 to 1; 1 where it was stated
     coefficients: Array  # (K,) of the columns
-    cad: Surface
+    cad: CadSurface
 
     def at(self, points: Array) -> Array:
         """(N,) allowance at points (N, 3), part frame."""
-        return self.wanted.known + columns(points, self.cad, self.wanted) @ self.coefficients
+        return self.prior.known + allowance_columns(points, self.cad, self.prior) @ self.coefficients
 
 
-def read_allowance(text: str | None) -> Wanted:
+def read_allowance(text: str | None) -> AllowancePrior:
     """What `--allowance` asks for: `free`, `varying` or a number.
 
     Raises:
         InputError: neither.
     """
     if text is None:
-        return Wanted()
+        return AllowancePrior()
     if text in (FREE, VARYING):
-        return Wanted(free=True, varying=text == VARYING)
+        return AllowancePrior(free=True, varying=text == VARYING)
     try:
         known = float(text)
     except ValueError:
@@ -70,15 +70,15 @@ def read_allowance(text: str | None) -> Wanted:
             f"--allowance is {text!r}; write free (to find an even one), varying (one that changes slowly over the "
             "part), or the stock in the CAD's unit, as 0.3"
         )
-    return Wanted(known=known)
+    return AllowancePrior(known=known)
 
 
-def columns(points: Array, cad: Surface, wanted: Wanted) -> Array:
+def allowance_columns(points: Array, cad: CadSurface, prior: AllowancePrior) -> Array:
     """(N, K) allowance at points (N, 3), part frame, per unit of each number that is to be found."""
-    if not wanted.free:
+    if not prior.free:
         return np.zeros((len(points), 0))
     ones = np.ones((len(points), 1))
-    if not wanted.varying:
+    if not prior.varying:
         return ones
     half = np.maximum(np.ptp(np.asarray(cad.mesh.bounds), axis=0) / 2, 1e-9 * cad.size)
     scaled = np.clip((points - cad.centre) / half, -1.1, 1.1)
@@ -87,17 +87,17 @@ def columns(points: Array, cad: Surface, wanted: Wanted) -> Array:
     return np.column_stack([ones, *(x[:, i] * y[:, j] * z[:, k] for i, j, k in _ORDERS)])
 
 
-def allowance_sentence(found: Allowance, length_unit: str | None) -> str:
+def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
     """Its size with sigma, and what the sign means; None: nobody says in which unit."""
     unit = f" {length_unit}" if length_unit else ""
-    if not found.wanted.free:
-        return f"Allowance {found.value:+.4g}{unit} as stated (plus: stock outside the CAD)."
-    size = f"Allowance {found.value:+.4f} ± {found.sigma:.4f}{unit} (1 σ; plus: stock outside the CAD)"
-    if found.wanted.varying:
+    if not allowance.prior.free:
+        return f"Allowance {allowance.value:+.4g}{unit} as stated (plus: stock outside the CAD)."
+    size = f"Allowance {allowance.value:+.4f} ± {allowance.sigma:.4f}{unit} (1 σ; plus: stock outside the CAD)"
+    if allowance.prior.varying:
         size += (
-            f", from {found.lowest:+.4f} to {found.highest:+.4f}{unit} over the scan, each ± "
-            f"{found.sigma_field:.4f}{unit} at most"
+            f", from {allowance.lowest:+.4f} to {allowance.highest:+.4f}{unit} over the scan, each ± "
+            f"{allowance.sigma_field:.4f}{unit} at most"
         )
-    if found.told < FAINT:
-        size += f"; only {found.told:.1%} of it is told from a motion of the part, so that errors of form weigh in it"
+    if allowance.separable_share < FAINT:
+        size += f"; only {allowance.separable_share:.1%} of it is told from a motion of the part, so that errors of form weigh in it"
     return size + "."

@@ -21,7 +21,7 @@ _MOST_SAMPLES = 400_000
 
 
 @dataclass(frozen=True)
-class Surface:
+class CadSurface:
     """A triangle mesh with two ways to search it; part frame."""
 
     mesh: Any  # trimesh.Trimesh
@@ -36,7 +36,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestPartners:
     """For N points: signed distance along the CAD's normal, that normal, and whether the place is a partner."""
 
     distance: Array  # (N,) positive outside
@@ -44,7 +44,7 @@ class Nearest:
     accept: NDArray[np.bool_]  # (N,)
 
 
-def read_cad(file: Path) -> Surface:
+def read_cad(file: Path) -> CadSurface:
     """Read a mesh (STL, PLY, OBJ …) in length_unit.
 
     Raises:
@@ -58,10 +58,10 @@ def read_cad(file: Path) -> Surface:
         raise InputError(f"{file}: cannot be read ({reason_of(error)}); export the mesh again") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{file}: holds no triangles; export the CAD model as a triangle mesh")
-    return surface(mesh)
+    return cad_surface(mesh)
 
 
-def surface(mesh: Any) -> Surface:
+def cad_surface(mesh: Any) -> CadSurface:
     """Make a trimesh ready for searching."""
     centre = mesh.bounds.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
@@ -70,7 +70,7 @@ def surface(mesh: Any) -> Surface:
     count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
-    return Surface(
+    return CadSurface(
         mesh,
         boxes,
         centre,
@@ -83,7 +83,7 @@ def surface(mesh: Any) -> Surface:
     )
 
 
-def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
+def nearest_partners(cad: CadSurface, points: Array, normals: Array) -> NearestPartners:
     """Partners of points (N, 3) with normals (N, 3), part frame.
 
     First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
@@ -91,14 +91,14 @@ def nearest(cad: Surface, points: Array, normals: Array) -> Nearest:
     """
     _, face, place = cad.boxes.squared_distance(*_arrays(cad.mesh), np.ascontiguousarray(points, float))
     normal = np.array(cad.mesh.face_normals[face])
-    distance, accept = _judge(points - place, normal, normals, 1e-3 * cad.spacing)
+    distance, accept = _accept_partners(points - place, normal, normals, 1e-3 * cad.spacing)
     other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) < _FAR_SIDE)
     if len(other):
         index = sample_partners(cad, points[other], normals[other])
         normal[other] = cad.normals[index]
         off = points[other] - cad.samples[index]
-        distance[other], accept[other] = _judge(off, normal[other], normals[other], 2 * cad.spacing)
-    return Nearest(distance, normal, accept)
+        distance[other], accept[other] = _accept_partners(off, normal[other], normals[other], 2 * cad.spacing)
+    return NearestPartners(distance, normal, accept)
 
 
 def _arrays(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
@@ -106,15 +106,15 @@ def _arrays(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
     return np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.int64)
 
 
-def sample_partners(cad: Surface, points: Array, normals: Array) -> NDArray[np.int64]:
+def sample_partners(cad: CadSurface, points: Array, normals: Array) -> NDArray[np.int64]:
     """Index of the sample nearest in place and direction to each point (N, 3) with normal (N, 3)."""
     query = np.ascontiguousarray(np.hstack([points, cad.reach * normals]))
     return np.asarray(cad.tree.query(query, k=1)[1], np.int64)
 
 
-def _judge(off: Array, normal: Array, seen: Array, loose: float) -> tuple[Array, NDArray[np.bool_]]:
+def _accept_partners(off: Array, normal: Array, scan_normals: Array, loose: float) -> tuple[Array, NDArray[np.bool_]]:
     """Distance along the normal; a partner lies straight below its point, not beyond an edge of the surface."""
     distance = np.einsum("ij,ij->i", off, normal)
     aside = np.linalg.norm(off - distance[:, None] * normal, axis=1)
-    same = np.einsum("ij,ij->i", normal, seen) > _SAME_SIDE
+    same = np.einsum("ij,ij->i", normal, scan_normals) > _SAME_SIDE
     return distance, same & (aside <= 0.5 * np.abs(distance) + loose)

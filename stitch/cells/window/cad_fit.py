@@ -6,24 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
-from stitch.cells.window.all_ways import all_ways
-from stitch.cells.window.allowance import Allowance, Wanted, columns
-from stitch.cells.window.allowance_fit import describe, ridge, spread_of, told_apart
+from stitch.cells.window.all_ways import sample_normal_space
+from stitch.cells.window.allowance import Allowance, AllowancePrior, allowance_columns
+from stitch.cells.window.allowance_fit import robust_spread, separable_share, summarise_allowance, varying_ridge
 from stitch.cells.window.biweight import TUKEY, biweight, biweight_slope
-from stitch.cells.window.cad import Nearest, Surface, nearest
+from stitch.cells.window.cad import CadSurface, NearestPartners, nearest_partners
 from stitch.cells.window.cell_weights import cell_weights
-from stitch.cells.window.joined_scans import Joined
+from stitch.cells.window.joined_scans import JoinedScans
 from stitch.cells.window.regions import Regions
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
-_FEWEST = 50
+_MIN_FIT_POINTS = 50
 _ROUNDS = 80
 # A step below this share of the part is none; and cells along the part for the second kind of weight.
 _STILL, _CELLS = 1e-7, 40
 # A surface that leaves a direction open by this share of the best one fixes no pose.
 _OPEN = 1e-6
-NONE = Wanted()
+NO_ALLOWANCE = AllowancePrior()
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,12 @@ class CadFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def fit(
-    scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None = None, wanted: Wanted = NONE
+def fit_cad(
+    scan: JoinedScans,
+    cad: CadSurface,
+    T_base_part: Array,
+    regions: Regions | None = None,
+    prior: AllowancePrior = NO_ALLOWANCE,
 ) -> CadFit:
     """Refine a coarse T_base_part (4, 4) until it stands still, and with it the allowance if it is wanted.
 
@@ -57,19 +61,19 @@ def fit(
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
     """
-    scan = scan.take(all_ways(scan, T_base_part))
+    scan = scan.take(sample_normal_space(scan, T_base_part))
     noise = scan.noise if np.isfinite(scan.noise) else 0.0
     scale, by_cell = cad.size / 100, False
-    numbers, size = np.zeros(wanted.columns), cad.size / 100
+    numbers, size = np.zeros(prior.columns), cad.size / 100
     for _ in range(_ROUNDS):
-        seen = _look(scan, cad, T_base_part, regions, wanted)
-        rest = seen.distance - wanted.known - seen.stock @ numbers
+        seen = _find_correspondences(scan, cad, T_base_part, regions, prior)
+        rest = seen.distance - prior.known - seen.stock @ numbers
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
-        spread = spread_of(rest[seen.used], wanted)
+        spread = robust_spread(rest[seen.used], prior)
         scale = max(spread, 0.5 * scale, noise)
         weight = _weights(seen, rest, scale, cad.size / _CELLS if by_cell else None)
         N = _normal_matrix(seen.design, weight, cad)
-        shrink, size = ridge(N, numbers, scale, size)
+        shrink, size = varying_ridge(N, numbers, scale, size)
         pull = np.concatenate([np.zeros(6), numbers]) * shrink
         step = np.asarray(np.linalg.solve(N + np.diag(shrink), -seen.design.T @ (weight * rest) - pull), np.float64)
         T_base_part, numbers = moved_about(T_base_part, step[:6], cad.centre), numbers + step[6:]
@@ -86,7 +90,7 @@ def fit(
         rms=float(np.sqrt((left**2).mean())),
         inliers=float(np.mean(np.abs(left) < 0.54 * TUKEY * scale)),
         points=len(left),
-        allowance=describe(seen.local[seen.used], cad, wanted, numbers, covariance, N),
+        allowance=summarise_allowance(seen.local[seen.used], cad, prior, numbers, covariance, N),
     )
 
 
@@ -96,12 +100,14 @@ def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
 
 
-def _weights(seen: "_Seen", rest: Array, scale: float, cell: float | None) -> Array:
+def _weights(correspondences: "_Correspondences", rest: Array, scale: float, cell: float | None) -> Array:
     """(N,) by what is left of each point's distance, and of its whole cell's where cells have a size."""
-    by_point = np.asarray(seen.used * biweight(rest / (TUKEY * scale)))
+    by_point = np.asarray(correspondences.used * biweight(rest / (TUKEY * scale)))
     if cell is None:
         return by_point
-    return by_point * cell_weights(seen.local, replace(seen.found, distance=rest), seen.used, cell, scale)
+    return by_point * cell_weights(
+        correspondences.local, replace(correspondences.partners, distance=rest), correspondences.used, cell, scale
+    )
 
 
 def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: Array) -> Array:
@@ -117,33 +123,35 @@ def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: A
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Correspondences:
     """N points at one pose: part frame, partners, which may count, and how distances answer."""
 
     local: Array  # (N, 3)
-    found: Nearest
+    partners: NearestPartners
     used: NDArray[np.bool_]  # (N,)
     stock: Array  # (N, K) columns of the allowance
     design: Array  # (N, 6 + K) of the twist about the CAD's centre and the allowance
 
     @property
     def distance(self) -> Array:
-        return self.found.distance
+        return self.partners.distance
 
 
-def _look(scan: Joined, cad: Surface, T_base_part: Array, regions: Regions | None, wanted: Wanted) -> _Seen:
+def _find_correspondences(
+    scan: JoinedScans, cad: CadSurface, T_base_part: Array, regions: Regions | None, prior: AllowancePrior
+) -> _Correspondences:
     T = frames.inverse(T_base_part)
     local = frames.transform(T, scan.points)
-    found = nearest(cad, local, frames.rotate(T, scan.normals))
+    found = nearest_partners(cad, local, frames.rotate(T, scan.normals))
     used = found.accept if regions is None else found.accept & regions.used(local)
-    if used.sum() < _FEWEST:
+    if used.sum() < _MIN_FIT_POINTS:
         raise NoResultError(f"{used.sum()} points meet the CAD; check the start, the regions and the CAD's unit")
-    stock = columns(local, cad, wanted)
+    stock = allowance_columns(local, cad, prior)
     design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal, -stock])
-    return _Seen(local, found, used, stock, design)
+    return _Correspondences(local, found, used, stock, design)
 
 
-def _normal_matrix(design: Array, weight: Array, cad: Surface) -> Array:
+def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
     """(6 + K, 6 + K) of a Gauss-Newton step: a twist about the CAD's centre, and the numbers of the allowance."""
     N = np.einsum("ni,n,nj->ij", design, weight, design)
     units = np.repeat([cad.size / 2, 1.0], 3)
@@ -154,5 +162,5 @@ def _normal_matrix(design: Array, weight: Array, cad: Surface) -> Array:
             f"the scanned surface leaves a direction open (plane, cylinder or sphere){shift}; scan an edge too"
         )
     if len(N) > 6:
-        told_apart(N)
+        separable_share(N)
     return np.asarray(N)

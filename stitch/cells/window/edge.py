@@ -17,7 +17,7 @@ _REACH = 22.0
 
 
 @dataclass(frozen=True)
-class Edge:
+class SeamEdge:
     """In the station's frame: across the seam, height over the surface."""
 
     across: float
@@ -25,7 +25,7 @@ class Edge:
     covariance: Array  # (2, 2) of (across, height)
 
 
-def find_edge(points: Array, normals: Array, facing: float) -> Edge:
+def find_edge(points: Array, normals: Array, facing: float) -> SeamEdge:
     """Fit the outer surface (bent both ways) and the flank (straight down, bent along), intersect them at the station.
 
     Args:
@@ -60,7 +60,7 @@ def find_edge(points: Array, normals: Array, facing: float) -> Edge:
     J = np.column_stack(columns)
     spread = np.zeros((10, 10))
     spread[:6, :6], spread[6:, 6:] = surface_spread, wall_spread
-    return Edge(float(place[0]), float(place[1]), J @ spread @ J.T)
+    return SeamEdge(float(place[0]), float(place[1]), J @ spread @ J.T)
 
 
 def _meet(surface: Array, wall: Array, rim: float) -> Array:

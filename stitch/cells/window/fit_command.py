@@ -30,6 +30,6 @@ def fit(
       stitch fit casting.toml --allowance free
     """
     # Loaded by who solves something: whoever asks for help has it at once.
-    from stitch.cells.window.fitted_parts import fitted_parts
+    from stitch.cells.window.fitted_parts import run_fit
 
-    fitted_parts(file, allowance, output, recording, report, session=session, as_json=as_json)
+    run_fit(file, allowance, output, recording, report, session=session, as_json=as_json)

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from stitch.cells.pose_table import to_numbers
+from stitch.cells.pose_table import rows_from_poses
 from stitch.cells.window.allowance import allowance_sentence
 from stitch.cells.window.window_jobs import FitJob
-from stitch.cells.window.window_solution import Part
+from stitch.cells.window.window_solution import FittedPart
 from stitch.units import uncertainty_text
 
 NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
@@ -18,7 +18,7 @@ def with_unit(job: FitJob, size: str) -> str:
     return f"{size} {job.length_unit}" if job.length_unit else size
 
 
-def agreement(job: FitJob, part: Part, name: str) -> str:
+def agreement_sentence(job: FitJob, part: FittedPart, name: str) -> str:
     """How well the part lies on its CAD, and how many cells of the map are out."""
     bad, cells = part.deviations.outside, part.deviations.cells
     where = f"its points scatter about the CAD by {with_unit(job, f'{part.fit.scale:.3f}')} (1 σ)"
@@ -29,9 +29,9 @@ def agreement(job: FitJob, part: Part, name: str) -> str:
     return f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by {worst} at most."
 
 
-def details(job: FitJob, part: Part) -> Iterator[str]:
+def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
     """Pose with its sigma, stock, doubt, the worst cell and what did not count."""
-    yield _pose(job, part)
+    yield _pose_sentence(job, part)
     if part.fit.allowance is not None:
         yield allowance_sentence(part.fit.allowance, job.length_unit)
     if part.start.runner_up > 0.9 * part.start.share:
@@ -52,8 +52,8 @@ def details(job: FitJob, part: Part) -> Iterator[str]:
             yield f"{count} points in forbidden region {name} did not count."
 
 
-def _pose(job: FitJob, part: Part) -> str:
-    x, y, z, a, b, c = to_numbers(part.fit.T_base_part[None])[0]
+def _pose_sentence(job: FitJob, part: FittedPart) -> str:
+    x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
     shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
     place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
     return (

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.cells.csv_table import read_columns
-from stitch.cells.pose_table import COLUMNS, from_columns
+from stitch.cells.pose_table import POSE_COLUMNS, poses_from_columns
 from stitch.errors import InputError
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, prepare_view
+from stitch.measurement.scan import Scan, prepare_scan
 from stitch.reading.clouds import read_cloud
 from stitch.reading.session_folder import load_session
 from stitch.units import METRES
 
 # Fewer points have no neighbourhoods from which normals could be taken.
-_FEWEST = 50
+_MIN_SCAN_POINTS = 50
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedScans:
     """V scans as they came; where only the scanner's own poses are known, the scanner counts as the flange."""
 
     names: tuple[str, ...]
@@ -39,7 +39,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Joined:
+class JoinedScans:
     """N points of all scans, base frame, length_unit."""
 
     points: Array  # (N, 3)
@@ -49,17 +49,17 @@ class Joined:
     spacing: float
     noise: float  # 1-sigma across the surface, from the scans themselves
 
-    def take(self, keep: NDArray[np.bool_] | Indices) -> "Joined":
+    def take(self, keep: NDArray[np.bool_] | Indices) -> "JoinedScans":
         """The points of a mask or of indices."""
-        return Joined(
+        return JoinedScans(
             self.points[keep], self.normals[keep], self.usable[keep], self.area[keep], self.spacing, self.noise
         )
 
 
-def join(scans: Sequence[Scan], T_base_scanner: Array) -> Joined:
+def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
     """One cloud of scans in their scanner frames and their poses (V, 4, 4)."""
     pairs = list(zip(scans, T_base_scanner, strict=True))
-    return Joined(
+    return JoinedScans(
         np.vstack([frames.transform(T, scan.points) for scan, T in pairs]),
         np.vstack([frames.rotate(T, scan.normals) for scan, T in pairs]),
         np.concatenate([scan.usable for scan in scans]).astype(bool),
@@ -69,32 +69,32 @@ def join(scans: Sequence[Scan], T_base_scanner: Array) -> Joined:
     )
 
 
-def assemble(placed: Placed) -> Joined:
+def assemble_scans(placed: PlacedScans) -> JoinedScans:
     """Normals, edges and noise of each scan, then one cloud."""
     pairs = zip(placed.names, placed.clouds, strict=True)
-    return join([prepare_view(name, points) for name, points in pairs], placed.T_base_scanner)
+    return join_scans([prepare_scan(name, points) for name, points in pairs], placed.T_base_scanner)
 
 
-def read_table(file: Path) -> Placed:
+def read_scan_table(file: Path) -> PlacedScans:
     """A table of scans: `file` and the scanner's pose in the base, x y z a_deg b_deg c_deg.
 
     Raises:
         InputError: the table or a cloud is missing or malformed, or a cloud has too few points.
     """
-    table = read_columns(file, "file", COLUMNS)
+    table = read_columns(file, "file", POSE_COLUMNS)
     clouds = []
     for name in table.texts["file"]:
         points = read_cloud(file.parent / name).points
-        if len(points) < _FEWEST:
+        if len(points) < _MIN_SCAN_POINTS:
             raise InputError(f"{file.parent / name}: {len(points)} points are too few; scan again or drop its row")
         clouds.append(points)
     names = [Path(name).stem for name in table.texts["file"]]
     if len(set(names)) < len(names):
         names = [f"{i + 1:03}-{name}" for i, name in enumerate(names)]
-    return Placed(tuple(names), tuple(clouds), from_columns(table), np.eye(4))
+    return PlacedScans(tuple(names), tuple(clouds), poses_from_columns(table), np.eye(4))
 
 
-def read_session(folder: Path, hand_eye: Path) -> Placed:
+def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
     """Scans of a session (scanner on the flange) placed by its reported poses and a hand-eye from a JSON file.
 
     Raises:
@@ -105,13 +105,13 @@ def read_session(folder: Path, hand_eye: Path) -> Placed:
         raise InputError(f"{folder / 'session.toml'}: mount is {session.mount!r}; the scanner must ride on the flange")
     clouds = []
     for view in session.views:
-        if view.cloud is None or len(view.cloud.points) < _FEWEST:
+        if view.cloud is None or len(view.cloud.points) < _MIN_SCAN_POINTS:
             raise InputError(f"{folder / 'views.csv'}: view {view.name} has too few points; scan again or drop its row")
         clouds.append(view.cloud.points)
     poses = np.array([view.T_base_flange for view in session.views])
     T_flange_scanner = read_hand_eye(hand_eye, session.length_unit)
     names = tuple(session.names)
-    return Placed(names, tuple(clouds), poses, T_flange_scanner, session.length_unit)
+    return PlacedScans(names, tuple(clouds), poses, T_flange_scanner, session.length_unit)
 
 
 def read_hand_eye(file: Path, length_unit: str) -> Array:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from stitch.cells.outputs import show
+from stitch.cells.outputs import write_recording_and_page
 from stitch.cells.window import scan_session
 from stitch.cells.window.seam import Limits, Seam
 from stitch.cells.window.seam_sentences import stations_sentence
@@ -17,7 +17,7 @@ from stitch.system.console import console
 from stitch.writing.session_files import write_session
 
 
-def measured_seam(
+def run_seam(
     file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
 ) -> None:
     """Measure the stations of a seam and hand out what was asked for.
@@ -30,18 +30,18 @@ def measured_seam(
     if output is not None:
         write_seam(seams, output)
     if session is not None:
-        write_session(session, scan_session.session(file.stem, job.placed))
-    show("seam", recording, report, job, seams)
+        write_session(session, scan_session.scan_session(file.stem, job.placed))
+    write_recording_and_page("seam", recording, report, job, seams)
     if as_json:
         rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
         print(json.dumps(rows, indent=1))
         return
-    _print(seams, job.limits)
+    _print_seams(seams, job.limits)
     if output is not None:
         print(output)
 
 
-def _print(seams: list[Seam], limits: Limits) -> None:
+def _print_seams(seams: list[Seam], limits: Limits) -> None:
     table = Table(title="Stations, ± 1 σ", title_justify="left")
     for heading in ("station", "flush / mm", "gap / mm", "verdict"):
         table.add_column(heading)

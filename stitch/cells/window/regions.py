@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.cells.window.cad import Surface
+from stitch.cells.window.cad import CadSurface
 from stitch.frames import Array
 
 
@@ -39,7 +39,7 @@ class Regions:
         return inside
 
 
-def coverage(box: Box, cad: Surface, points: Array, normals: Array) -> float:
+def coverage(box: Box, cad: CadSurface, points: Array, normals: Array) -> float:
     """Share of the CAD in the box, on its better seen side, that has a scanned point (N, 3) close by; part frame.
 
     Of a thin sheet only one side can be seen, so samples that look the way the scan's points in the box look count.

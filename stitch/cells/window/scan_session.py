@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from stitch.cells.window.joined_scans import Placed
+from stitch.cells.window.joined_scans import PlacedScans
 from stitch.measurement.cloud import Cloud
 from stitch.writing.session_files import SessionFiles, pose_columns
 
 
-def session(name: str, placed: Placed, cad: Path | None = None) -> SessionFiles:
+def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> SessionFiles:
     """One view for each scan; where the job knew only the scanner's poses, the scanner itself counts as the flange."""
     files = [f"clouds/{view}.ply" for view in placed.names]
     tables = {"scanner": {"pose": placed.T_flange_scanner.tolist()}}

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.cells.window.edge import Edge, find_edge
-from stitch.cells.window.joined_scans import Joined
+from stitch.cells.window.edge import SeamEdge, find_edge
+from stitch.cells.window.joined_scans import JoinedScans
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -60,7 +60,7 @@ class Seam:
 
 
 def measure_seam(
-    scan: Joined, T_base_part: Array, stations: Sequence[Station], limits: Limits, pose_sigma: float = 0.0
+    scan: JoinedScans, T_base_part: Array, stations: Sequence[Station], limits: Limits, pose_sigma: float = 0.0
 ) -> list[Seam]:
     """Flush and gap at each station.
 
@@ -74,7 +74,7 @@ def measure_seam(
     return [_measure(scan, T_base_part, station, limits, pose_sigma) for station in stations]
 
 
-def _measure(scan: Joined, T_base_part: Array, station: Station, limits: Limits, pose_sigma: float) -> Seam:
+def _measure(scan: JoinedScans, T_base_part: Array, station: Station, limits: Limits, pose_sigma: float) -> Seam:
     T_station_base = frames.inverse(T_base_part @ station.T_part_station)
     points = frames.transform(T_station_base, scan.points)
     near = scan.usable & (np.abs(points) < np.array([_ACROSS, _ALONG, _DEPTH])).all(axis=1)
@@ -103,7 +103,7 @@ def _measure(scan: Joined, T_base_part: Array, station: Station, limits: Limits,
     )
 
 
-def _side(points: Array, normals: Array, side: float, name: str) -> Edge:
+def _side(points: Array, normals: Array, side: float, name: str) -> SeamEdge:
     """The edge on one side of the gap's middle: the inner part lies on its negative side, its flank looks to +."""
     here = side * points[:, 0] > 0
     try:

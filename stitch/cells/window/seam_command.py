@@ -23,6 +23,6 @@ def seam(
       stitch seam seam.toml --report page.html
     """
     # Loaded by who solves something: whoever asks for help has it at once.
-    from stitch.cells.window.measured_seam import measured_seam
+    from stitch.cells.window.measured_seam import run_seam
 
-    measured_seam(file, output, recording, report, session, as_json=as_json)
+    run_seam(file, output, recording, report, session, as_json=as_json)

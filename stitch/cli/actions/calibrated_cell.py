@@ -6,13 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from stitch.calibrate.link_table import link_table
-from stitch.calibrate.robot_calibration import calibrated
-from stitch.calibrate.robot_files import document_of as robot_document
-from stitch.calibrate.robot_files import write_robot
+from stitch.calibrate.robot_calibration import calibrated_robot_of_run
+from stitch.calibrate.robot_files import robot_document, write_robot
 from stitch.calibrate.sphere_calibration import calibrate_sphere
-from stitch.calibrate.sphere_report import document_of
-from stitch.calibrate.tracker_calibration import calibrate_tracker
-from stitch.calibrate.tracker_calibration import document_of as tracker_document
+from stitch.calibrate.sphere_report import sphere_document
+from stitch.calibrate.tracker_calibration import calibrate_tracker, tracker_document
 from stitch.cli.actions.diagnosed_run import write_diagnosis
 from stitch.cli.terminal.calibration_summary import length_row, show_hand_eye, show_robot
 from stitch.cli.terminal.streams import emit
@@ -24,14 +22,14 @@ from stitch.writing import run_folder
 from stitch.writing.json_file import to_json, write_json
 
 
-def calibrated_by_sphere(session: Path, radius_free: bool, output: Path | None, as_json: bool) -> None:
+def calibrate_by_sphere(session: Path, radius_free: bool, output: Path | None, as_json: bool) -> None:
     """Hand-eye from scans of one sphere.
 
     Raises:
         InputError, NoResultError: as `stitch calibrate sphere` ends.
     """
     loaded = load_session(session, at_most=None)
-    document = document_of(calibrate_sphere(loaded, radius_free), loaded)
+    document = sphere_document(calibrate_sphere(loaded, radius_free), loaded)
     if output is not None:
         write_json(document, output)
     if as_json:
@@ -53,7 +51,7 @@ def calibrated_by_sphere(session: Path, radius_free: bool, output: Path | None, 
     show_hand_eye(document, facts)
 
 
-def calibrated_by_tracker(session: Path, as_json: bool) -> None:
+def calibrate_by_tracker(session: Path, as_json: bool) -> None:
     """Base and tool from frames.csv.
 
     Raises:
@@ -77,7 +75,7 @@ def calibrated_by_tracker(session: Path, as_json: bool) -> None:
     show_hand_eye(document, facts)
 
 
-def calibrated_arm(session: Path, output: Path | None, *, force: bool, at_most: int, as_json: bool) -> None:
+def calibrate_arm(session: Path, output: Path | None, *, force: bool, at_most: int, as_json: bool) -> None:
     """What the arm's nominal model lacks.
 
     Raises:
@@ -85,7 +83,7 @@ def calibrated_arm(session: Path, output: Path | None, *, force: bool, at_most: 
     """
     loaded = load_session(session)
     first = run(loaded)
-    calibrated(first)
+    calibrated_robot_of_run(first)
     found, lines, diagnosis = suggest(state_of(first), at_most)
     result = found or first
     target = output or Path("runs") / f"{loaded.name}-robot"

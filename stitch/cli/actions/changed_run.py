@@ -6,26 +6,26 @@ from pathlib import Path
 
 from stitch.cli.actions.diagnosed_run import write_diagnosis
 from stitch.cli.terminal.ledger_summary import show_ledger
-from stitch.cli.terminal.live_line import doing
+from stitch.cli.terminal.live_line import show_activity
 from stitch.cli.terminal.recorders import recorder_for
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.effects.in_session import known, require
+from stitch.effects.in_session import find_effect, require_available
 from stitch.errors import InputError
 from stitch.revision import change
 from stitch.runs.run import Run
-from stitch.runs.state import State, state_of
+from stitch.runs.state import RunState, state_of
 from stitch.stepwise import suggest, suggest_group
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
 from stitch.writing import run_folder
 from stitch.writing.json_file import to_json
-from stitch.writing.plain_finding import next_step
+from stitch.writing.plain_finding import suggested_command
 from stitch.writing.result_document import result_document
 from stitch.writing.run_contents import others_of_rig
 
 
-def add_named(
+def add_effects(
     run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
 ) -> None:
     """Add effects by their names.
@@ -33,17 +33,17 @@ def add_named(
     Raises:
         InputError, NoResultError: as `stitch add` ends.
     """
-    with run_folder.held(run):
+    with run_folder.lock_run_folder(run):
         state = load_state(run, effects_file, trust=trust)
         used = state.model.effects
         for name in effects:
-            require(state.measurement, known(name))
+            require_available(state.measurement, find_effect(name))
             if name in used:
                 raise InputError(f"{name} is in the model of {run} already; to fix: leave it out")
-        _change(run, state, [*used, *effects], recording, as_json)
+        _refit_run(run, state, [*used, *effects], recording, as_json)
 
 
-def add_chosen(
+def add_diagnosed(
     run: Path,
     at_most: int | None,
     effects_file: Path | None = None,
@@ -58,32 +58,32 @@ def add_chosen(
     Raises:
         InputError, NoResultError: as `stitch add` ends.
     """
-    with run_folder.held(run):
-        with doing("diagnosing"):
+    with run_folder.lock_run_folder(run):
+        with show_activity("diagnosing"):
             state = load_state(run, effects_file, trust=trust)
-            run_folder.load_early("stitch.reports")
+            run_folder.preload_entry_points("stitch.reports")
             chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
-        found = _suggested(run, state, chosen, recording, as_json)
+        found = _keep_diagnosed(run, state, chosen, recording, as_json)
     if says_next and not as_json:
-        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
+        console().print(suggested_command(found, shlex.quote(str(run))), soft_wrap=True)
 
 
-def _suggested(
-    run: Path, state: State, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
+def _keep_diagnosed(
+    run: Path, state: RunState, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
 ) -> Diagnosis:
     """Write and show what a diagnosis chose; what was tried on the way leaves no recording, the end does."""
     result, lines, found = chosen
     for line in lines:
         console().print(line, soft_wrap=True)
     if result is not None:
-        with doing("writing cloud and page"), run_folder.changed(run) as scratch:
+        with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
                 before = replace(state_of(result), ledger=result.ledger[:-1])
                 again = change(before, result.effects, recorder_for(scratch, recording))
                 result = replace(again, notes=result.notes)
             run_folder.write_with_page(result, scratch)
-        _show(result, run, as_json)
+        _show_changed(result, run, as_json)
     elif as_json:
         emit((run / "result.json").read_text(encoding="utf-8").rstrip())
     else:
@@ -92,7 +92,7 @@ def _suggested(
     return found
 
 
-def drop_named(
+def drop_effects(
     run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
 ) -> None:
     """Take effects out by their names.
@@ -100,28 +100,28 @@ def drop_named(
     Raises:
         InputError, NoResultError: as `stitch drop` ends.
     """
-    with run_folder.held(run):
+    with run_folder.lock_run_folder(run):
         state = load_state(run, effects_file, trust=trust)
         used = state.model.effects
         for name in effects:
             if name not in used:
                 raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
         kept = [name for name in used if name not in effects]
-        _change(run, state, kept, recording, as_json)
+        _refit_run(run, state, kept, recording, as_json)
 
 
-def _change(run: Path, state: State, effects: list[str], recording: bool, as_json: bool) -> None:
+def _refit_run(run: Path, state: RunState, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it."""
-    run_folder.load_early("stitch.reports")
-    with doing("reading the run"), run_folder.changed(run) as scratch:
+    run_folder.preload_entry_points("stitch.reports")
+    with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
         result = change(state, effects, recorder_for(scratch, recording))
         run_folder.write_with_page(result, scratch)
-    _show(result, run, as_json)
+    _show_changed(result, run, as_json)
     if not as_json:
         console().print(f"Next: stitch diagnose {shlex.quote(str(run))}", soft_wrap=True)
 
 
-def _show(result: Run, run: Path, as_json: bool) -> None:
+def _show_changed(result: Run, run: Path, as_json: bool) -> None:
     if as_json:
         emit(to_json(result_document(result)))
         return

@@ -20,7 +20,7 @@ from stitch.system.console import console
 from stitch.writing.json_file import to_json
 
 
-def checked(sessions: list[Path], as_json: bool) -> None:
+def check_sessions(sessions: list[Path], as_json: bool) -> None:
     """Read sessions and say what they hold; what cannot be read is said for each.
 
     Raises:
@@ -29,21 +29,21 @@ def checked(sessions: list[Path], as_json: bool) -> None:
     facts, errors = [], []
     for path in sessions:
         try:
-            facts.append(summary(load_session(path)))
+            facts.append(session_summary(load_session(path)))
         except InputError as error:
             errors.append(str(error))
     if as_json:
         emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
     else:
         for fact in facts:
-            _print(fact)
+            _print_summary(fact)
     for line in errors:
         print(f"stitch: {line}", file=sys.stderr)
     if errors:
         raise typer.Exit(2)
 
 
-def deeply_checked(sessions: list[Path], as_json: bool) -> None:
+def check_deeply(sessions: list[Path], as_json: bool) -> None:
     """Every usual mistake tried on each session: what is wrong, in which views, how to fix it.
 
     Raises:
@@ -65,7 +65,7 @@ def deeply_checked(sessions: list[Path], as_json: bool) -> None:
         raise typer.Exit(2)
 
 
-def summary(session: Session) -> dict[str, object]:
+def session_summary(session: Session) -> dict[str, object]:
     """What a session holds, in plain numbers."""
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     sighted = [view.sighting.points for view in session.views if view.sighting is not None]
@@ -87,14 +87,14 @@ def summary(session: Session) -> dict[str, object]:
     }
 
 
-def _print(fact: dict[str, Any]) -> None:
+def _print_summary(fact: dict[str, Any]) -> None:
     table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
-    for name, told in _rows(fact):
+    for name, told in _summary_rows(fact):
         table.add_row(name, told)
     console().print(table)
 
 
-def _rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _summary_rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """The same for people: words for keys, lengths with their unit."""
     carried = "the scanner" if fact["mount"] == "eye_in_hand" else "the part"
     yield "mount", f"{fact['mount']}: {carried} sits at the flange"

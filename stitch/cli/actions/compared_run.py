@@ -9,28 +9,28 @@ from rich.console import Console
 from rich.table import Table as Printed
 
 from stitch.cli.terminal.streams import emit
-from stitch.comparison.compare_surfaces import compare
+from stitch.comparison.compare_surfaces import compare_surfaces
 from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.table import Table
-from stitch.comparison.tables import CLEAR, PLACE, Comparison, comparison_document
-from stitch.runs.state import State
+from stitch.comparison.table import ResidualTable
+from stitch.comparison.tables import CLEAR, PLACE, ResidualTables, comparison_document
+from stitch.runs.state import RunState
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.json_file import to_json, write_json
-from stitch.writing.run_folder import extend, held
+from stitch.writing.run_folder import call_entry_points, lock_run_folder
 
-_WORST = 5
-_SHOWN = 4
+_WORST_ROWS = 5
+_LISTED_TABLES = 4
 
 
-def compared_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+def run_compare(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Compare a run and show what was found.
 
     Raises:
         InputError, NoResultError: as `stitch compare` ends.
     """
-    with held(run):
+    with lock_run_folder(run):
         state = load_state(run, effects_file, trust=trust)
         found = write_comparison(state, run)
     if as_json:
@@ -39,72 +39,74 @@ def compared_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: 
         show_comparison(found, state, run)
 
 
-def show_comparison(found: Comparison, state: State, run: Path) -> None:
+def show_comparison(comparison: ResidualTables, state: RunState, run: Path) -> None:
     """The clearest tables, for people."""
     to_um = MICROMETRES[state.session.length_unit]
     terminal = console()
     what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
-    terminal.print(f"{length_text(found.rms, state.session.length_unit)} rms {what} under the model.")
-    for table in found.labelled:
-        _worst(terminal, table, _named(table, state), to_um)
-    terminal.print(_whether_clear(found), soft_wrap=True)
-    for group in found.groups[:_SHOWN]:
-        _one(terminal, group, found, to_um)
-    if rest := [_with_chance(found, group) for group in found.groups[_SHOWN:]]:
+    terminal.print(f"{length_text(comparison.rms, state.session.length_unit)} rms {what} under the model.")
+    for table in comparison.labelled:
+        _show_worst_rows(terminal, table, _row_names(table, state), to_um)
+    terminal.print(_significance_sentence(comparison), soft_wrap=True)
+    for group in comparison.groups[:_LISTED_TABLES]:
+        _show_table(terminal, group, comparison, to_um)
+    if rest := [_group_chance(comparison, group) for group in comparison.groups[_LISTED_TABLES:]]:
         terminal.print(f"Less clear (p = 1 where none is given): {'; '.join(rest)}.", soft_wrap=True)
     for file in ("compare.json", "pictures/compare.png"):
         if (run / file).exists():
             terminal.print(f"  {run / file}")
-    terminal.print(_next_step(run), soft_wrap=True)
+    terminal.print(_next_command(run), soft_wrap=True)
 
 
-def write_comparison(state: State, run: Path) -> Comparison:
+def write_comparison(state: RunState, run: Path) -> ResidualTables:
     """compare.json and what other packages make of it."""
-    found = compare(state) if state.measurement.capture.scans else compare_targets(state)
+    found = compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
     write_json(comparison_document(found), run / "compare.json")
-    extend("stitch.comparison_reports", found, state, run)
+    call_entry_points("stitch.comparison_reports", found, state, run)
     return found
 
 
-def _whether_clear(found: Comparison) -> str:
+def _significance_sentence(comparison: ResidualTables) -> str:
     """What the means of all bins say together; views are the samples."""
-    if not found.groups:
+    if not comparison.groups:
         return "Nothing that is known of the views changes from one to another."
-    if not found.means:
+    if not comparison.means:
         return "Nothing clear: the views are too few to say how well their means are known."
-    clear = [_with_chance(found, group) for group in found.groups if found.is_clear(group[0])]
+    clear = [_group_chance(comparison, group) for group in comparison.groups if comparison.is_clear(group[0])]
     if clear:
-        return f"Clear among {found.means} means of bins, p over all of them: {'; '.join(clear)}."
+        return f"Clear among {comparison.means} means of bins, p over all of them: {'; '.join(clear)}."
     return (
-        f"Nothing clear: chance alone makes the clearest of {found.means} means of bins as clear as this one "
-        f"({_chance(found, found.groups[0][0])}; clear is p ≤ {CLEAR}). "
+        f"Nothing clear: chance alone makes the clearest of {comparison.means} means of bins as clear as this one "
+        f"({_chance_text(comparison, comparison.groups[0][0])}; clear is p ≤ {CLEAR}). "
         "Errors whose sign changes with the pose do not show in such means."
     )
 
 
-def _with_chance(found: Comparison, group: Sequence[Table]) -> str:
-    return _names(group) + (f" ({_chance(found, group[0])})" if found.p_of_all(group[0]) < 1 else "")
+def _group_chance(comparison: ResidualTables, group: Sequence[ResidualTable]) -> str:
+    return _group_names(group) + (
+        f" ({_chance_text(comparison, group[0])})" if comparison.p_of_all(group[0]) < 1 else ""
+    )
 
 
-def _chance(found: Comparison, table: Table) -> str:
+def _chance_text(comparison: ResidualTables, table: ResidualTable) -> str:
     """How easily chance makes any of all means as clear as the clearest of a table."""
-    p = found.p_of_all(table)
+    p = comparison.p_of_all(table)
     return "p < 0.0001" if p < 1e-4 else f"p = {p:.2g}"
 
 
-def _names(group: Sequence[Table]) -> str:
+def _group_names(group: Sequence[ResidualTable]) -> str:
     """j2, torque 2_2 and torque 2_3: whose bins hold the same."""
     *others, last = [table.name for table in group]
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _next_step(run: Path) -> str:
+def _next_command(run: Path) -> str:
     """The command that most would type now."""
     folder = shlex.quote(str(run))
     return f"Next: stitch {'review' if (run / 'diagnosis.json').exists() else 'diagnose'} {folder}"
 
 
-def _named(table: Table, state: State) -> str:
+def _row_names(table: ResidualTable, state: RunState) -> str:
     """What the rows are; of places, in which unit and frame they are written."""
     if table.name != PLACE:
         return table.name
@@ -112,33 +114,36 @@ def _named(table: Table, state: State) -> str:
     return f"{table.name}, (x, y, z) in {state.session.length_unit} in the frame of the {frame}"
 
 
-def _worst(terminal: Console, table: Table, name: str, to_um: float) -> None:
+def _show_worst_rows(terminal: Console, table: ResidualTable, name: str, to_um: float) -> None:
     told = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"
         + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
-        for i in table.worst(_WORST)
+        for i in table.worst(_WORST_ROWS)
     )
     terminal.print(f"Worst by {name} (µm rms): {told}", soft_wrap=True)
 
 
-def _one(terminal: Console, group: Sequence[Table], found: Comparison, to_um: float) -> None:
+def _show_table(terminal: Console, group: Sequence[ResidualTable], comparison: ResidualTables, to_um: float) -> None:
     """One table for all properties whose bins hold the same, with the edges of the first."""
     table = group[0]
     unit = f" ({table.unit})" if table.unit else ""
-    others = f"; {_names(group[1:])} {'has' if len(group) == 2 else 'have'} the same bins" if len(group) > 1 else ""
-    clear = "" if found.is_clear(table) else ", not clear"
+    others = (
+        f"; {_group_names(group[1:])} {'has' if len(group) == 2 else 'have'} the same bins" if len(group) > 1 else ""
+    )
+    clear = "" if comparison.is_clear(table) else ", not clear"
     printed = Printed(
-        title=f"By {table.name}{unit}{others}: {_chance(found, table)} over all means{clear}", title_justify="left"
+        title=f"By {table.name}{unit}{others}: {_chance_text(comparison, table)} over all means{clear}",
+        title_justify="left",
     )
     for heading in ("from", "to", "mean (µm)", "± 1 σ", "rms (µm)", "count", "views"):
         printed.add_column(heading, justify="right")
     for i in range(len(table.count)):
         between = [f"{table.low[i]:.4g}", f"{table.high[i]:.4g}"]
-        amounts = [f"{x * to_um:{form}}" for x, form in _amounts(table, i)]
+        amounts = [f"{x * to_um:{form}}" for x, form in _row_amounts(table, i)]
         printed.add_row(*between, *amounts, str(int(table.count[i])), str(int(table.views[i])))
     terminal.print(printed)
 
 
-def _amounts(table: Table, i: int) -> list[tuple[float, str]]:
+def _row_amounts(table: ResidualTable, i: int) -> list[tuple[float, str]]:
     """Mean, its sigma and rms of one row, with the form in which each is printed."""
     return [(table.mean[i], "+.1f"), (table.mean_sigma[i], ".1f"), (table.rms[i], ".1f")]

@@ -7,126 +7,128 @@ from rich.console import Console
 from rich.table import Table
 
 from stitch.cli.terminal.budget_table import budget_table
-from stitch.cli.terminal.live_line import doing
+from stitch.cli.terminal.live_line import show_activity
 from stitch.cli.terminal.streams import emit
-from stitch.diagnosis.course_sentences import course_texts
+from stitch.diagnosis.course_sentences import curve_sentences
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.sentences import amounts_of
-from stitch.effects.in_session import where_from
-from stitch.model.hand_eye_uncertainty import stands_for
+from stitch.diagnosis.sentences import fitted_amounts
+from stitch.effects.in_session import describe_need
+from stitch.model.hand_eye_uncertainty import uncertainty_scope
 from stitch.pipeline import diagnose
-from stitch.runs.state import State
+from stitch.runs.state import RunState
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
 from stitch.units import length_text
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json, write_json
-from stitch.writing.plain_finding import next_step, plain_finding
-from stitch.writing.run_folder import extend, held, load_early
+from stitch.writing.plain_finding import plain_finding, suggested_command
+from stitch.writing.run_folder import call_entry_points, lock_run_folder, preload_entry_points
 
-_SHOWN = 6
+_LISTED_CANDIDATES = 6
 # Share of the posterior that must be said where no candidate has it.
-_LEFT = 0.05
+_MIN_DISPLACEMENT_SHARE = 0.05
 
 
-def diagnosed_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool, says_next: bool = True) -> None:
+def run_diagnose(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool, says_next: bool = True) -> None:
     """Diagnose a run and show what was found.
 
     Raises:
         InputError, NoResultError: as `stitch diagnose` ends.
     """
-    found, document, unit = _diagnosed(run, effects_file, trust)
+    found, document, unit = _diagnose_folder(run, effects_file, trust)
     if as_json:
         emit(to_json(document))
     else:
-        show(found, unit)
+        show_diagnosis(found, unit)
     if says_next and not as_json:
-        console().print(next_step(found, shlex.quote(str(run))), soft_wrap=True)
+        console().print(suggested_command(found, shlex.quote(str(run))), soft_wrap=True)
 
 
-def next_for_run(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+def run_next(run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Diagnose a run and say what to measure next.
 
     Raises:
         InputError, NoResultError: as `stitch next` ends.
     """
-    found, document, _ = _diagnosed(run, effects_file, trust)
+    found, document, _ = _diagnose_folder(run, effects_file, trust)
     if as_json:
         emit(to_json({"verdict": found.verdict, "effects": list(found.effects), "next": document["next"]}))
         return
     terminal = console()
     if not found.next:
-        terminal.print(_nothing_next(found), soft_wrap=True)
+        terminal.print(_no_next_reason(found), soft_wrap=True)
     for p in found.next:
         terminal.print(f"To separate {' from '.join(p.separates)}: {p.do}.", soft_wrap=True)
 
 
-def _nothing_next(found: Diagnosis) -> str:
-    if found.verdict == "adequate":
+def _no_next_reason(diagnosis: Diagnosis) -> str:
+    if diagnosis.verdict == "adequate":
         return "Nothing is missing: there is nothing to tell apart."
-    if len(found.effects) > 1:
-        return f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}."
+    if len(diagnosis.effects) > 1:
+        return (
+            f"No pose within reach, and no artefact that is known here, separates {' from '.join(diagnosis.effects)}."
+        )
     return "Nothing has to be told apart: no two candidate effects are aliases in these views."
 
 
-def _diagnosed(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
-    with held(run), doing("diagnosing"):
+def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
+    with lock_run_folder(run), show_activity("diagnosing"):
         state = load_state(run, effects_file, trust=trust)
-        load_early("stitch.diagnosis_reports")
+        preload_entry_points("stitch.diagnosis_reports")
         found = diagnose(state)
         return found, write_diagnosis(found, state, run), state.session.length_unit
 
 
-def write_diagnosis(found: Diagnosis, state: State, run: Path) -> dict[str, object]:
+def write_diagnosis(diagnosis: Diagnosis, state: RunState, run: Path) -> dict[str, object]:
     """diagnosis.json and what other packages make of it."""
-    document = diagnosis_document(found)
+    document = diagnosis_document(diagnosis)
     write_json(document, run / "diagnosis.json")
-    extend("stitch.diagnosis_reports", found, state, run)
+    call_entry_points("stitch.diagnosis_reports", diagnosis, state, run)
     return document
 
 
-def show(found: Diagnosis, length_unit: str) -> None:
+def show_diagnosis(diagnosis: Diagnosis, length_unit: str) -> None:
     """For everybody first, then the evidence, where the error comes from, the candidate effects, what to do next."""
     terminal = console()
-    terminal.print(plain_finding(found, length_unit), soft_wrap=True, style="bold")
-    for line in (*found.doubts, found.sentence):
+    terminal.print(plain_finding(diagnosis, length_unit), soft_wrap=True, style="bold")
+    for line in (*diagnosis.doubts, diagnosis.sentence):
         terminal.print(line, soft_wrap=True)
-    if found.verdict != "adequate":
-        terminal.print(stands_for(found.verdict), soft_wrap=True)
-    if (sources := budget_table(found.budget, length_unit)) is not None:
+    if diagnosis.verdict != "adequate":
+        terminal.print(uncertainty_scope(diagnosis.verdict), soft_wrap=True)
+    if (sources := budget_table(diagnosis.budget, length_unit)) is not None:
         terminal.print(sources)
     table = Table(title="Candidate effects", title_justify="left")
     for heading in ("effect", "p", "posterior", "rms if added", "held-out if added"):
         table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
-    for s in found.candidates[:_SHOWN]:
-        table.add_row(*_row(found, s, length_unit))
+    for s in diagnosis.candidates[:_LISTED_CANDIDATES]:
+        table.add_row(*_candidate_row(diagnosis, s, length_unit))
     terminal.print(table)
-    if (left := 1 - sum(s.ranked.posterior for s in found.candidates)) > _LEFT:
+    if (left := 1 - sum(s.ranked.posterior for s in diagnosis.candidates)) > _MIN_DISPLACEMENT_SHARE:
         terminal.print(f"{left:.2f} of the posterior: nothing is missing, or something without a name.", soft_wrap=True)
-    for s in found.candidates[:3]:
+    for s in diagnosis.candidates[:3]:
         if s.ranked.score.observable:
             alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
-            told = f"  {s.name}: {amounts_of(s.ranked)}" + (f"; aliases: {alike}" if alike else "")
+            told = f"  {s.name}: {fitted_amounts(s.ranked)}" + (f"; aliases: {alike}" if alike else "")
             terminal.print(told, soft_wrap=True)
-    unseen = [s.name for s in found.candidates if not s.ranked.score.observable]
+    unseen = [s.name for s in diagnosis.candidates if not s.ranked.score.observable]
     if unseen:
         terminal.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True)
-    for needs in sorted(set(found.missing.values())):
-        names = ", ".join(name for name, own in found.missing.items() if own == needs)
-        terminal.print(f"Not tested without {' and '.join(map(where_from, needs))}: {names}.", soft_wrap=True)
-    if found.verdict == "adequate":
-        _show_missed(terminal, found, length_unit)
-    for x in [x for x in found.depends_on if x.p_value < 0.05][:3]:
+    for needs in sorted(set(diagnosis.missing.values())):
+        names = ", ".join(name for name, own in diagnosis.missing.items() if own == needs)
+        terminal.print(f"Not tested without {' and '.join(map(describe_need, needs))}: {names}.", soft_wrap=True)
+    if diagnosis.verdict == "adequate":
+        _show_missed(terminal, diagnosis, length_unit)
+    for x in [x for x in diagnosis.depends_on if x.p_value < 0.05][:3]:
         terminal.print(f"What the present model leaves follows {x.covariate} (p = {x.p_value:.1g}).", soft_wrap=True)
-    for told in course_texts(found, length_unit):
+    for told in curve_sentences(diagnosis, length_unit):
         terminal.print(told, soft_wrap=True)
-    for p in found.next[:3]:
+    for p in diagnosis.next[:3]:
         terminal.print(f"To measure next: {p.do} (separates {', '.join(p.separates)}).", soft_wrap=True)
 
 
-def _show_missed(terminal: Console, found: Diagnosis, length_unit: str) -> None:
+def _show_missed(terminal: Console, diagnosis: Diagnosis, length_unit: str) -> None:
     """What effects too small to be seen could still do to the hand-eye."""
-    known = sorted(((s.hand_eye, s.name) for s in found.candidates if s.hand_eye is not None), reverse=True)
+    known = sorted(((s.hand_eye, s.name) for s in diagnosis.candidates if s.hand_eye is not None), reverse=True)
     told = ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3])
     if told:
         terminal.print(
@@ -136,10 +138,10 @@ def _show_missed(terminal: Console, found: Diagnosis, length_unit: str) -> None:
         )
 
 
-def _row(found: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
+def _candidate_row(diagnosis: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
     if not s.ranked.score.observable:
         return [s.name, "not seen", "–", "–", "–"]
     left = ["–", "–"]
     if s.cross_validation is not None:
-        left = [length_text(x, length_unit, zeros=True) for x in found.rms_if_added(s.cross_validation)]
+        left = [length_text(x, length_unit, zeros=True) for x in diagnosis.rms_if_added(s.cross_validation)]
     return [s.name, f"{s.ranked.adjusted:.1g}", f"{s.ranked.posterior:.2f}", *left]

@@ -5,34 +5,34 @@ from pathlib import Path
 from stitch.cli.terminal.streams import emit
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError, NoResultError
-from stitch.explanation.explain import NAME, Explanation, explain
+from stitch.explanation.explain import EFFECT_NAME, Explanation, explain
 from stitch.stored.load_state import load_state
 from stitch.system.console import console
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.units import length_text
 from stitch.writing.json_file import to_json
 
 
-def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+def run_explain(run: Path, output: Path | None, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Look for a formula, write it and show it.
 
     Raises:
         InputError, NoResultError: as `stitch explain` ends.
     """
     state = load_state(run, effects_file, trust=trust)
-    if NAME in state.model.effects:
+    if EFFECT_NAME in state.model.effects:
         raise InputError(
-            f"{run}: has an effect {NAME!r} in its model; to fix: give it another name in its file, and add that"
+            f"{run}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its file, and add that"
         )
     found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
     heldout = state.heldout_rms * found.heldout_share**0.5 if found.found else None
     if output is not None and found.found:
-        with whole(output) as file:
+        with whole_file(output) as file:
             file.write_text(found.source, encoding="utf-8")
     if as_json:
         emit(to_json(_document(found, heldout)))
     else:
-        _show(found, heldout, state.session.length_unit, run, output)
+        _show_explanation(found, heldout, state.session.length_unit, run, output)
     if not found.found and output is not None:
         raise NoResultError(
             f"{run}: no formula holds, nothing was written to {output}; what may matter beside can stand in columns of "
@@ -40,29 +40,33 @@ def explained_run(run: Path, output: Path | None, effects_file: Path | None, *, 
         )
 
 
-def _document(found: Explanation, heldout: float | None) -> dict[str, object]:
+def _document(explanation: Explanation, heldout: float | None) -> dict[str, object]:
     return {
-        "found": found.found,
-        "formula": found.formula,
-        "place": found.place,
+        "found": explanation.found,
+        "formula": explanation.formula,
+        "place": explanation.place,
         "heldout_rms": heldout,
-        "p_value": found.p_value if found.found else None,
-        "tested_formula": found.tested,  # of which p_value is
-        "sentence": found.why,
+        "p_value": explanation.p_value if explanation.found else None,
+        "tested_formula": explanation.tested,  # of which p_value is
+        "sentence": explanation.why,
     }
 
 
-def _show(found: Explanation, heldout: float | None, unit: str, run: Path, output: Path | None) -> None:
+def _show_explanation(
+    explanation: Explanation, heldout: float | None, unit: str, run: Path, output: Path | None
+) -> None:
     terminal = console()
-    terminal.print(found.why, soft_wrap=True)
+    terminal.print(explanation.why, soft_wrap=True)
     if heldout is None:
         return
     terminal.print(f"Added, it should leave {length_text(heldout, unit)} on views left out.", soft_wrap=True)
     if output is None:
         terminal.print(f"Next: stitch explain {run} -o mine.py", soft_wrap=True)
     else:
-        terminal.print(f"Next: read {output}, then stitch add {run} {NAME} --effects-file {output}", soft_wrap=True)
-        if found.place == "robot":
+        terminal.print(
+            f"Next: read {output}, then stitch add {run} {EFFECT_NAME} --effects-file {output}", soft_wrap=True
+        )
+        if explanation.place == "robot":
             # Of a measured arm a formula that left 7 to 16 % less in its own series left 10 to 27 % more in another.
             terminal.print(
                 "Only this session was asked; whether it is the arm's or belongs to this day tells, once it is added: "

@@ -17,17 +17,17 @@ from stitch.export.compensated_program import CompensatedProgram, compensated_pr
 from stitch.frames import Array
 from stitch.reading.csv_number import is_number
 from stitch.system.console import console
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 from stitch.units import angle_text, length_text
 from stitch.writing.json_file import to_json
 
-_J3 = ("own", "j2+j3")
-_SHOWN = 40
+_J3_CONVENTIONS = ("own", "j2+j3")
+_LISTED_TARGETS = 40
 # Below this (mm) nothing remains: no arm knows a nanometre.
-_NOTHING = 1e-6
+_NEGLIGIBLE_MOVE = 1e-6
 
 
-def exported_program(
+def export_program(
     file: Path,
     arm: ArmModel,
     output: Path | None,
@@ -49,16 +49,16 @@ def exported_program(
     if not 0 < limit < float("inf"):
         raise InputError(f"--limit {limit:g}: to fix: give a length above zero, in mm")
     program = read_program(file, frame, tool)
-    copy = compensated_program(program, arm, limit, _near(near, arm), _coupled(program, j3))
-    places = _places(program, output)
-    _write(copy, places)
+    copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
+    places = _output_files(program, output)
+    _write_program(copy, places)
     if as_json:
-        emit(to_json(_document(copy, list(places.values()), limit)))
+        emit(to_json(_program_document(copy, list(places.values()), limit)))
     else:
-        _show(copy, list(places.values()))
+        _show_moves(copy, list(places.values()))
 
 
-def _near(near: str | None, arm: ArmModel) -> Array | None:
+def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:
     if near is None:
         return None
     cells = near.split(",")
@@ -68,9 +68,9 @@ def _near(near: str | None, arm: ArmModel) -> Array | None:
     return np.asarray(np.radians(told))
 
 
-def _coupled(program: Program, j3: str | None) -> bool:
+def _is_j3_coupled(program: Program, j3: str | None) -> bool:
     """A FANUC counts J3 from the horizontal: whether the session's arm does too, its joint angles cannot tell."""
-    if j3 not in (None, *_J3):
+    if j3 not in (None, *_J3_CONVENTIONS):
         raise InputError(f"--j3 {j3}: to fix: own, or j2+j3")
     has_joints = any(point.joints is not None for point in program.points)
     if program.controller == "fanuc" and has_joints and j3 is None:
@@ -81,7 +81,7 @@ def _coupled(program: Program, j3: str | None) -> bool:
     return program.controller == "fanuc" and j3 == "j2+j3"
 
 
-def _places(program: Program, output: Path) -> dict[Path, Path]:
+def _output_files(program: Program, output: Path) -> dict[Path, Path]:
     """Where each file of the program goes: a KUKA's data list beside the copy, under the same name."""
     if output.suffix.lower() != program.file.suffix.lower():
         raise InputError(f"{output}: to fix: end the copy's name in {program.file.suffix}, as the program's does")
@@ -92,13 +92,13 @@ def _places(program: Program, output: Path) -> dict[Path, Path]:
     return places
 
 
-def _write(copy: CompensatedProgram, places: dict[Path, Path]) -> None:
+def _write_program(copy: CompensatedProgram, places: dict[Path, Path]) -> None:
     with ExitStack() as stack:
         for file, text in copy.texts.items():
-            stack.enter_context(whole(places[file])).write_bytes(program_bytes(text))
+            stack.enter_context(whole_file(places[file])).write_bytes(program_bytes(text))
 
 
-def _document(copy: CompensatedProgram, places: list[Path], limit: float) -> dict[str, Any]:
+def _program_document(copy: CompensatedProgram, places: list[Path], limit: float) -> dict[str, Any]:
     return {
         "format": "stitch-program/1",
         "program": str(copy.program.file),
@@ -113,22 +113,22 @@ def _document(copy: CompensatedProgram, places: list[Path], limit: float) -> dic
     }
 
 
-def _show(copy: CompensatedProgram, places: list[Path]) -> None:
+def _show_moves(copy: CompensatedProgram, places: list[Path]) -> None:
     terminal, rows = console(), copy.rows()
     table = Table(title=f"{copy.program.file.name}: targets moved", title_justify="left")
     for heading in ("target", "line", "moved", "U (k = 2)", "turned"):
         table.add_column(heading, justify="left" if heading == "target" else "right")
-    for row in rows[:_SHOWN]:
+    for row in rows[:_LISTED_TARGETS]:
         moved, U = length_text(row["moved_mm"], "mm", 4, zeros=True), length_text(row["U_mm"], "mm", zeros=True)
         table.add_row(row["target"], str(row["line"]), moved, U, angle_text(row["moved_mrad"] / 1e3))
     terminal.print(table)
-    if len(rows) > _SHOWN:
-        terminal.print(f"{len(rows) - _SHOWN} more; --json has all.", soft_wrap=True)
+    if len(rows) > _LISTED_TARGETS:
+        terminal.print(f"{len(rows) - _LISTED_TARGETS} more; --json has all.", soft_wrap=True)
     far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
     effects, unit = ", ".join(term.name for term in copy.arm.terms), "mm"
     terminal.print(
         f"Undone: {effects}. {far['target']} moves farthest, by {length_text(far['moved_mm'], unit)}; under the "
-        f"model {f'up to {length_text(left, unit)} remain' if left > _NOTHING else 'nothing remains'}.",
+        f"model {f'up to {length_text(left, unit)} remain' if left > _NEGLIGIBLE_MOVE else 'nothing remains'}.",
         soft_wrap=True,
     )
     for note in copy.notes:

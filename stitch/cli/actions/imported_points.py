@@ -3,14 +3,14 @@
 import sys
 from pathlib import Path
 
-from stitch.cli.terminal.streams import results
+from stitch.cli.terminal.streams import results_stream
 from stitch.controllers.importer import import_file
 from stitch.intake.import_table import import_table, is_table_of_poses
 from stitch.intake.stated import StatedTable
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 
 
-def imported_points(
+def run_import(
     file: Path, output: Path | None, unit: str, stated: StatedTable, *, frame: str | None, tool: str | None
 ) -> None:
     """Read a file as a table of poses, where it is one or anything is stated of one, else as a controller's.
@@ -23,9 +23,9 @@ def imported_points(
     else:
         imported = import_file(file, unit, frame, tool)
     if output is None:
-        results().write(imported.text)
+        results_stream().write(imported.text)
     else:
-        with whole(output) as scratch:
+        with whole_file(output) as scratch:
             scratch.write_text(imported.text, encoding="utf-8")
     for warning in imported.warnings:
         print(f"stitch: {file}: {warning}", file=sys.stderr)

@@ -7,15 +7,15 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from stitch.cli.terminal.streams import emit, results
+from stitch.cli.terminal.streams import emit, results_stream
 from stitch.effects.contract import EFFECTS, PLACES, Effect
-from stitch.effects.in_session import known
+from stitch.effects.in_session import find_effect
 from stitch.effects.user_file import load
 from stitch.system.console import console
 from stitch.writing.json_file import to_json
 
 
-def listed_effects(name: str | None, effects_file: Path | None, as_json: bool) -> None:
+def run_effects(name: str | None, effects_file: Path | None, as_json: bool) -> None:
     """Show the library, or one effect of it.
 
     Raises:
@@ -23,22 +23,22 @@ def listed_effects(name: str | None, effects_file: Path | None, as_json: bool) -
     """
     if effects_file:
         load(effects_file)
-    terminal = console(results())
+    terminal = console(results_stream())
     if as_json:
-        emit(to_json([_document(e) for e in ([known(name)] if name else EFFECTS.values())]))
+        emit(to_json([_document(e) for e in ([find_effect(name)] if name else EFFECTS.values())]))
         return
     if name:
-        _one(terminal, name)
+        _show_effect(terminal, name)
         return
     table = Table()
     for heading in ("effect", "place", "what nature does", "parameters"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "effect")
     for effect in EFFECTS.values():
-        table.add_row(effect.name, effect.place, effect.formula, signature(effect))
+        table.add_row(effect.name, effect.place, effect.formula, parameter_signature(effect))
     terminal.print(table)
 
 
-def signature(effect: Effect) -> str:
+def parameter_signature(effect: Effect) -> str:
     """The parameters with their units: c₁… (rad/(N m))."""
     return ", ".join(f"{key}{'' if s.kind == 'number' else '₁…'} ({s.unit})" for key, s in effect.specs.items())
 
@@ -66,8 +66,8 @@ def _document(effect: Effect) -> dict[str, Any]:
     }
 
 
-def _one(terminal: Console, name: str) -> None:
-    effect = known(name)
+def _show_effect(terminal: Console, name: str) -> None:
+    effect = find_effect(name)
     terminal.print(f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", soft_wrap=True)
     terminal.print(f"  {effect.formula}")
     kinds = {

@@ -2,22 +2,22 @@
 
 from stitch.detection.board import parse_board
 from stitch.errors import InputError
-from stitch.intake.targets_in_scans import LookedFor
+from stitch.intake.targets_in_scans import TargetSearch
 
 # Larger balls fit on no table.
 _LARGEST_MM = 2000.0
 
 
-def looked_for(board: list[str] | None, ball: list[str] | None) -> LookedFor:
+def parse_target_options(board: list[str] | None, ball: list[str] | None) -> TargetSearch:
     """What the options say.
 
     Raises:
         InputError: no board that is known, or no radius.
     """
-    return LookedFor(tuple(parse_board(text) for text in board or ()), _radii(ball) if ball else None)
+    return TargetSearch(tuple(parse_board(text) for text in board or ()), _ball_radii(ball) if ball else None)
 
 
-def _radii(stated: list[str]) -> tuple[float, ...]:
+def _ball_radii(stated: list[str]) -> tuple[float, ...]:
     """Radii in mm; none for balls of any radius."""
     if stated == ["any"]:
         return ()

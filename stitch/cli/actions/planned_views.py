@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cli.terminal.plan_summary import show
+from stitch.cli.terminal.plan_summary import show_plan
 from stitch.cli.terminal.streams import emit
-from stitch.effects.in_session import known
+from stitch.effects.in_session import find_effect
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.planning.cells import PlannedCell, cell_of_run, cell_of_session
-from stitch.planning.plan import Wanted, plan
+from stitch.planning.plan import PlanRequest, plan_further_views
 from stitch.reading.session_folder import load_session
 from stitch.stored.load_state import load_state
 from stitch.writing.json_file import to_json
@@ -31,7 +31,7 @@ class StatedCell:
 
 
 @dataclass(frozen=True)
-class Asked:
+class PlanOptions:
     """What further views are asked for."""
 
     views: int | None
@@ -40,17 +40,17 @@ class Asked:
     feature: str | None
 
 
-def planned_views(
-    folder: Path, asked: Asked, stated: StatedCell, output: Path | None, *, trust: bool, as_json: bool
+def run_plan(
+    folder: Path, options: PlanOptions, stated: StatedCell, output: Path | None, *, trust: bool, as_json: bool
 ) -> None:
     """Plan, write the views and show them.
 
     Raises:
         InputError, NoResultError: as `stitch plan` ends.
     """
-    wanted = _wanted(asked)
-    session, planned = _cell(folder, stated, trust=trust)
-    found = plan(session, planned, wanted)
+    wanted = _plan_request(options)
+    session, planned = _planned_cell(folder, stated, trust=trust)
+    found = plan_further_views(session, planned, wanted)
     document = plan_document(found, planned.cell.model.T_mount)
     if output is not None:
         with whole_folder(output) as scratch:
@@ -60,22 +60,22 @@ def planned_views(
     if as_json:
         emit(to_json(document))
     else:
-        show(found, planned.cell, output)
+        show_plan(found, planned.cell, output)
 
 
-def _wanted(asked: Asked) -> Wanted:
-    split = asked.split
+def _plan_request(options: PlanOptions) -> PlanRequest:
+    split = options.split
     for name in split or ():
-        known(name)
+        find_effect(name)
     if split is not None and split[0] == split[1]:
         raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
-    feature = asked.feature
-    at = None if feature is None else _numbers("--for", feature, "a place as x,y,z, as 0,20,150", 3)
-    halve = asked.halve or split is None
-    return Wanted(halve=halve, split=split, split_any=not asked.halve, views=asked.views, feature=at)
+    feature = options.feature
+    at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", 3)
+    halve = options.halve or split is None
+    return PlanRequest(halve=halve, split=split, split_any=not options.halve, views=options.views, feature=at)
 
 
-def _cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, PlannedCell]:
+def _planned_cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, PlannedCell]:
     """A finished run says all of its cell; of a session the options may say the rest."""
     if (folder / "result.json").is_file():
         odd = next((f"--{name}" for name, value in vars(stated).items() if value is not None), None)
@@ -85,7 +85,7 @@ def _cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, Pl
         return state.session, cell_of_run(state, folder)
     start = None
     if stated.start is not None:
-        start = np.radians(_numbers("--start", stated.start, "joint angles (°), as 0,-90,90,0,45,0"))
+        start = np.radians(_option_numbers("--start", stated.start, "joint angles (°), as 0,-90,90,0,45,0"))
     elif (folder / "session.toml").is_file() and not (folder / "views.csv").exists():
         raise InputError(
             f"{folder}: no views.csv; to fix: write planned joints or poses there, or give --start J1,J2,… in degrees, "
@@ -95,7 +95,7 @@ def _cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, Pl
     return session, cell_of_session(session, stated.part, stated.size, stated.field)
 
 
-def _numbers(option: str, text: str, what: str, count: int | None = None) -> Array:
+def _option_numbers(option: str, text: str, what: str, count: int | None = None) -> Array:
     try:
         found = np.array([float(word) for word in text.split(",")])
     except ValueError:

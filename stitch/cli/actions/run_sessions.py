@@ -4,15 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from stitch.cli.run_options import ModelOptions, RunOptions
-from stitch.cli.terminal.live_line import doing
+from stitch.cli.terminal.live_line import show_activity
 from stitch.cli.terminal.recorders import recorder_for
-from stitch.cli.terminal.run_summary import show
+from stitch.cli.terminal.run_summary import show_run
 from stitch.cli.terminal.streams import emit
-from stitch.effects.in_session import known
+from stitch.effects.in_session import find_effect
 from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.measurement.session import Session
-from stitch.model.arm import kept_arm
+from stitch.model.arm import keep_arm_effects
 from stitch.model.model_toml import ModelFile, write_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
@@ -25,66 +25,66 @@ from stitch.writing.result_document import model_of, result_document
 from stitch.writing.run_contents import FILES
 
 
-def run_sessions(sessions: list[Path], asked: RunOptions) -> None:
+def run_sessions(sessions: list[Path], options: RunOptions) -> None:
     """Run sessions of one rig into one folder, and say what was found; none: the one that one stands in.
 
     Raises:
         InputError, NoResultError: as `stitch run` ends.
     """
-    if asked.model.effects_file:
-        load_effects(asked.model.effects_file)
-    for name in asked.model.effects:
-        known(name)
-    method = method_named(asked.register or DEFAULT).name
+    if options.model.effects_file:
+        load_effects(options.model.effects_file)
+    for name in options.model.effects:
+        find_effect(name)
+    method = method_named(options.register or DEFAULT).name
     here = not sessions
-    sessions = sessions or [_here()]
-    memory = None if asked.memory is None else asked.memory / len(sessions)
+    sessions = sessions or [_current_session()]
+    memory = None if options.memory is None else options.memory / len(sessions)
     loaded = [load_session(path, memory=memory) for path in sessions]
-    names = _names(loaded)
-    target = asked.output or Path("../runs" if here else "runs") / "+".join(names)
-    model, kept, own_effects = _given(asked.model)
-    run_folder.load_early("stitch.reports")
+    names = _session_names(loaded)
+    target = options.output or Path("../runs" if here else "runs") / "+".join(names)
+    model, kept, own_effects = _given_models(options.model)
+    run_folder.preload_entry_points("stitch.reports")
     with (
-        doing(f"{'+'.join(names)}: reading the scans"),
-        run_folder.new_folder(target, sessions, asked.force) as scratch,
+        show_activity(f"{'+'.join(names)}: reading the scans"),
+        run_folder.new_folder(target, sessions, options.force) as scratch,
     ):
-        folders = _folders(scratch, names)
-        recorders = [recorder_for(folder, asked.recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, asked.model.effects, asked.keep, kept, method)
+        folders = _scratch_folders(scratch, names)
+        recorders = [recorder_for(folder, options.recording) for folder in folders]
+        runs = run_rig(loaded, model, recorders, options.model.effects, options.keep, kept, method)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         for result, folder in zip(runs, folders, strict=True):
-            run_folder.write_with_page(result, folder, asked.tolerance)
-            if asked.mesh:
+            run_folder.write_with_page(result, folder, options.tolerance)
+            if options.mesh:
                 write_mesh(result.fused, folder / "mesh.ply")
         if len(runs) > 1:
             write_model(model_of(runs[0]), scratch / "model.toml")
     documents = [result_document(result) for result in runs]
-    if asked.as_json:
+    if options.as_json:
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        show(runs, target, asked.tolerance, asked.says_next)
+        show_run(runs, target, options.tolerance, options.says_next)
 
 
-def _given(asked: ModelOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:
+def _given_models(options: ModelOptions) -> tuple[ModelFile | None, ModelFile | None, str | None]:
     """The model that is used as it is, the arm that is kept, and the file of the user's own effects, if any."""
-    if asked.hand_eye and (asked.effects or asked.arm):
+    if options.hand_eye and (options.effects or options.arm):
         raise InputError(
-            f"{'--arm' if asked.arm else '--effects'} and --hand-eye: a model that is used as it is brings its own "
+            f"{'--arm' if options.arm else '--effects'} and --hand-eye: a model that is used as it is brings its own "
             "effects; name one of the two"
         )
-    own = str(asked.effects_file.resolve()) if asked.effects_file else None
-    if asked.hand_eye:
-        return trusted_model(asked.hand_eye, asked.effects_file, asked.trust)[0], None, own
-    if asked.arm is None:
+    own = str(options.effects_file.resolve()) if options.effects_file else None
+    if options.hand_eye:
+        return trusted_model(options.hand_eye, options.effects_file, options.trust)[0], None, own
+    if options.arm is None:
         return None, None, own
-    stated, file = trusted_model(asked.arm, asked.effects_file, asked.trust)
-    kept = kept_arm(stated)
-    if twice := set(asked.effects) & set(kept.effects):
-        raise InputError(f"--effects {twice.pop()}: the arm of {asked.arm} brings it already; to fix: leave it out")
+    stated, file = trusted_model(options.arm, options.effects_file, options.trust)
+    kept = keep_arm_effects(stated)
+    if twice := set(options.effects) & set(kept.effects):
+        raise InputError(f"--effects {twice.pop()}: the arm of {options.arm} brings it already; to fix: leave it out")
     return None, kept, own or file
 
 
-def _here() -> Path:
+def _current_session() -> Path:
     """The folder one stands in, if it is a session."""
     if not Path("session.toml").is_file():
         raise InputError(
@@ -94,7 +94,7 @@ def _here() -> Path:
     return Path.cwd()
 
 
-def _names(sessions: list[Session]) -> list[str]:
+def _session_names(sessions: list[Session]) -> list[str]:
     """Names of the sessions: their folders in the folder of a rig."""
     names = [session.name for session in sessions]
     if len(set(names)) < len(names):
@@ -106,7 +106,7 @@ def _names(sessions: list[Session]) -> list[str]:
     return names
 
 
-def _folders(scratch: Path, names: list[str]) -> list[Path]:
+def _scratch_folders(scratch: Path, names: list[str]) -> list[Path]:
     folders = [scratch] if len(names) == 1 else [scratch / name for name in names]
     for folder in folders:
         folder.mkdir(exist_ok=True)

@@ -4,7 +4,7 @@ from rich.table import Table
 
 from stitch.comparison.model_history import model_history
 from stitch.comparison.run_verdict import run_verdict
-from stitch.diagnosis.thresholds import CLEAR, FAINT, FALL, RISE
+from stitch.diagnosis.thresholds import CLEAR_SIGMAS, FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 from stitch.model.hand_eye_uncertainty import hand_eye_lines
 from stitch.model.term import Term
 from stitch.runs.run import Run
@@ -26,7 +26,7 @@ def show_ledger(result: Run) -> None:
     for p, name in ((p, term.name) for term in result.terms for p in term.parameters):
         if p.fitted or p.grid:
             how = "" if p.fitted else " (of those tried, this explains most)"
-            terminal.print(f"  {name}.{p.name} = {p.told}{how}")
+            terminal.print(f"  {name}.{p.name} = {p.formatted}{how}")
     for line in remarks(result):
         terminal.print(line, soft_wrap=True)
     hand_eye = hand_eye_lines(result.T_mount, result.mount_covariance, result.session.mount, unit)
@@ -40,17 +40,17 @@ def remarks(result: Run) -> list[str]:
     if len(result.ledger) > 1:
         before, after = result.ledger[-2], result.ledger[-1]
         grown = sorted(set(after.effects) - set(before.effects))
-        if after.heldout_rms < FALL * before.heldout_rms:
+        if after.heldout_rms < HELDOUT_FALL * before.heldout_rms:
             earned = set(grown)
         elif grown:
             clear = max(_clearest(term) for term in result.terms if term.name in grown)
-            rose = after.heldout_rms > RISE * before.heldout_rms
+            rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
             out.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
     for term in result.terms:
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
             out.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
-        if _clearest(term) < FAINT:
+        if _clearest(term) < FAINT_SIGMAS:
             out.append(
                 f"{term.name}: views left out are predicted better with it, though no parameter differs from zero by "
                 "two sigmas, which count all that an arm may do beside it."
@@ -62,9 +62,9 @@ def remarks(result: Run) -> list[str]:
 
 def _unseen_in_residuals(names: str, clear: float, residual: str) -> str:
     """Of effects with which the held-out residual is no smaller, the clearest number so many sigmas from zero."""
-    if clear > CLEAR:
+    if clear > CLEAR_SIGMAS:
         return f"{names}: {clear:.0f} sigmas from zero, but too small for a residual to show."
-    if clear < FAINT:
+    if clear < FAINT_SIGMAS:
         return f"{names} did not earn a place: the held-out residual {residual}."
     return (
         f"{names}: the held-out residual {residual}, and the clearest number is {clear:.1f} sigmas from zero; a "

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from stitch.errors import InputError, NoResultError
-from stitch.system.whole_file import whole
+from stitch.system.whole_file import whole_file
 
 _BROWSERS = (
     "chromium",
@@ -43,7 +43,7 @@ def print_page(browser: str, page: Path, path: Path) -> None:
     """
     # As root a browser has no sandbox, and without a display no graphics card.
     root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    with whole(path) as file, tempfile.TemporaryDirectory() as profile:
+    with whole_file(path) as file, tempfile.TemporaryDirectory() as profile:
         arguments = ["--headless", "--disable-gpu", *root, f"--user-data-dir={profile}", "--no-pdf-header-footer"]
         target = Path(profile) / "page.pdf"
         try:

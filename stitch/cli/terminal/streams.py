@@ -10,34 +10,45 @@ from functools import wraps
 from typing import IO, Any, TextIO, TypeVar
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-_SPELT = {"µ": "u", "μ": "u", "–": "-", "—": "-", "±": "+-", "×": "x", "·": "*", "…": "...", "→": "->", "°": " deg"}
+_REPLACEMENTS = {
+    "µ": "u",
+    "μ": "u",
+    "–": "-",
+    "—": "-",
+    "±": "+-",
+    "×": "x",
+    "·": "*",
+    "…": "...",
+    "→": "->",
+    "°": " deg",
+}
 _results: list[IO[str]] = []
 
 
-def results_alone(command: Command) -> Command:
+def stdout_for_results(command: Command) -> Command:
     """The command with standard output kept for `emit`."""
 
     @wraps(command)
     def apart(*arguments: Any, **options: Any) -> Any:
-        with _apart():
+        with _stdout_redirected():
             return command(*arguments, **options)
 
     return apart  # type: ignore[return-value]
 
 
-def results() -> IO[str]:
+def results_stream() -> IO[str]:
     """Standard output, for results."""
     return _results[-1] if _results else sys.stdout
 
 
 def emit(text: str) -> None:
     """Write a result, and a line end, on standard output."""
-    print(text, file=results(), flush=True)
+    print(text, file=results_stream(), flush=True)
 
 
 @contextmanager
-def _apart() -> Iterator[None]:
-    with _descriptor_apart(sys.stdout) as stream:
+def _stdout_redirected() -> Iterator[None]:
+    with _descriptor_redirected(sys.stdout) as stream:
         _results.append(stream)
         try:
             with redirect_stdout(sys.stderr):
@@ -47,7 +58,7 @@ def _apart() -> Iterator[None]:
 
 
 @contextmanager
-def _descriptor_apart(out: TextIO) -> Iterator[IO[str]]:
+def _descriptor_redirected(out: TextIO) -> Iterator[IO[str]]:
     """What compiled libraries write to descriptor 1 goes to 2 as well."""
     try:
         out.flush()
@@ -69,18 +80,18 @@ def _descriptor_apart(out: TextIO) -> Iterator[IO[str]]:
 
 def speak_any_terminal() -> None:
     """Spell what a terminal's encoding does not have: um for µm."""
-    codecs.register_error("stitch-spell", _spell)
+    codecs.register_error("stitch-spell", _replace_unencodable)
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, ValueError):
             if (stream.encoding or "").lower().replace("-", "") != "utf8":
                 stream.reconfigure(errors="stitch-spell")  # type: ignore[union-attr]
 
 
-def _spell(error: UnicodeError) -> tuple[str, int]:
+def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     told = ""
     for letter in error.object[error.start : error.end]:
         plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
-        told += _SPELT.get(letter) or plain or "?"
+        told += _REPLACEMENTS.get(letter) or plain or "?"
     return told, error.end

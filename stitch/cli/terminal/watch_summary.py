@@ -9,23 +9,23 @@ from rich.table import Table
 from stitch.system.console import console
 from stitch.units import rounded
 from stitch.watch.cell_report import CellReport, ParameterReport
-from stitch.watch.sentences import day_text, headline, notes, size_text
-from stitch.watch.table_units import unit_of
+from stitch.watch.sentences import day_text, headline, report_notes, size_text
+from stitch.watch.table_units import table_unit
 
 
-def show(reports: Sequence[CellReport], folders: Sequence[Path], added: int | None, pages: bool) -> None:
+def show_watch(reports: Sequence[CellReport], folders: Sequence[Path], added: int | None, pages: bool) -> None:
     """For people, on standard error; verdicts last."""
     terminal = console()
     if added is not None:
         terminal.print(f"{added} new {'run' if added == 1 else 'runs'} in {folders[0]}", soft_wrap=True)
     # Of a plant the verdicts are enough; its page has the rest.
     for report in reports if len(reports) == 1 else ():
-        terminal.print(_table(report))
+        terminal.print(_cell_table(report))
         for p in report.parameters:
             if p.follows:
                 terminal.print(f"{p.name} follows {follows_text(p)}", soft_wrap=True)
     for report in reports:
-        for note in notes(report):
+        for note in report_notes(report):
             terminal.print(f"{report.name}: {note}", soft_wrap=True)
     for folder in folders if pages else ():
         terminal.print(f"  {folder / 'watch.html'}", soft_wrap=True)
@@ -35,7 +35,7 @@ def show(reports: Sequence[CellReport], folders: Sequence[Path], added: int | No
         terminal.print(headline(report), soft_wrap=True, style="bold")
 
 
-def _table(report: CellReport) -> Table:
+def _cell_table(report: CellReport) -> Table:
     span = f"{day_text(report.first)} to {day_text(report.last)}"
     title = f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, pad_edge=False)
@@ -43,7 +43,7 @@ def _table(report: CellReport) -> Table:
         words = heading in ("parameter", "unit", "moved")
         table.add_column(heading, justify="left" if words else "right", no_wrap=heading != "moved")
     for p in report.parameters:
-        factor, unit = unit_of(p.unit, report.length_unit)
+        factor, unit = table_unit(p.unit, report.length_unit)
         # A drift that is not known to be one is a dash.
         moves = abs(p.drift_per_day) > 3 * p.drift_sigma
         drift = rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–"

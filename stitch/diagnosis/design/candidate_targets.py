@@ -7,19 +7,19 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.measurement.measurement import Measurement, downwards
 from stitch.measurement.sightings import Sightings
 from stitch.model.model import Model
 from stitch.model.term import Term
 from stitch.observations.targets.effect_rows import effect_rows
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows, mixed_model_of_rows, rows_of
+from stitch.observations.targets.rows import TargetRows, mixed_model_of_rows, target_rows
 
 
 def candidate_rows(
-    measurement: Measurement, seen: Rows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
-) -> tuple[Rows, list[Array], Array]:
+    measurement: Measurement, seen: TargetRows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
+) -> tuple[TargetRows, list[Array], Array]:
     """Rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
 
     Args:
@@ -33,17 +33,17 @@ def candidate_rows(
     known = np.flatnonzero(np.isfinite(landmarks.positions).all(axis=1))
     measurement = _all_seen(measurement, seen, landmarks, known)
     undrawn = replace(landmarks, drawing=None, T_reference_part=None)
-    rows = rows_of(measurement.capture, seen.T_mount, undrawn)
+    rows = target_rows(measurement.capture, seen.T_mount, undrawn)
     unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
     rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
     covariance = mixed_model_of_rows(rows, rows.hand_eye).covariance(variances)
     return rows, effect_rows(rows, measurement, Model(seen.T_mount), terms), covariance
 
 
-def _all_seen(measurement: Measurement, seen: Rows, landmarks: Landmarks, known: Indices) -> Measurement:
+def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:
     """The measurement with sightings of all known targets, as good as those that were seen."""
     before, K = seen.sightings, len(measurement.T_base_flange)
-    bare = place("candidates", (), measurement.T_base_flange, measurement.mount)
+    bare = build_capture("candidates", (), measurement.T_base_flange, measurement.mount)
     back = frames.inverse(bare.poses(seen.T_mount))
     points = frames.transform(back, landmarks.positions[known])
     sightings = Sightings(

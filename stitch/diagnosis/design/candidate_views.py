@@ -11,17 +11,17 @@ from stitch.diagnosis.design.candidate_targets import candidate_rows
 from stitch.diagnosis.score import Score
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
-from stitch.measurement.capture import place
+from stitch.measurement.capture import build_capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.robot import Robot
 from stitch.measurement.torques import PAYLOAD, Torques, torques_of
 from stitch.measurement.views import Views
 from stitch.model.forward import moves_points, perturbed_frames
-from stitch.model.jacobian import twists
+from stitch.model.jacobian import pose_derivatives
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import Surfaces
-from stitch.observations.targets.target_model import Targets
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.targets.target_model import TargetObservation
 from stitch.statistics.variance_prior import NOISE
 
 _SAMPLES = 6000
@@ -43,15 +43,15 @@ class CandidateViews:
     half: Array  # (K, m, m) Cholesky factors of the scatter of one view
 
 
-def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> CandidateViews | None:
+def _of_surfaces(linear: LinearModel, seen: SurfaceObservation, a: Score, b: Score) -> CandidateViews | None:
     """Poses in which the scanner would see the part about as it has before; None if poses cannot show the effects."""
     zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
-    T_mount, centre = linear.model.T_mount, seen.freed.overlaps.gram.centre
+    T_mount, centre = linear.model.T_mount, seen.unconstrained.overlaps.gram.centre
 
     def poses_of(joints: Array) -> Array:
         assert linear.measurement.robot is not None
         T = kinematics.forward(linear.measurement.robot, joints)
-        return place("candidates", (), T, linear.measurement.mount).poses(T_mount)
+        return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
 
     joints = reachable(linear.measurement.views.joints, poses_of, seen.capture.poses(T_mount), centre)[:_TRIED]
     if moves_points(zero) or not len(joints):
@@ -60,13 +60,13 @@ def _of_surfaces(linear: LinearModel, seen: Surfaces, a: Score, b: Score) -> Can
     to_centre = frames.make(np.eye(3), -centre)
     own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
     extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
-    found = twists(measurement, bare, zero, centre)
+    found = pose_derivatives(measurement, bare, zero, centre)
     of_a, of_b = (c[s.form.keep].transpose(1, 2, 0) for c, s in zip(found, (a, b), strict=True))
     half = _view_scatter(linear, measurement, to_centre)
     return CandidateViews(joints, np.concatenate([own, extra], axis=2), of_a, of_b, half)
 
 
-def _of_targets(linear: LinearModel, seen: Targets, a: Score, b: Score) -> CandidateViews:
+def _of_targets(linear: LinearModel, seen: TargetObservation, a: Score, b: Score) -> CandidateViews:
     """Poses near those driven, in which all targets are seen."""
     joints = nearby(linear.measurement.views.joints)[:_TRIED]
     measurement = candidate_measurement(linear.measurement, joints)
@@ -80,15 +80,15 @@ def _of_targets(linear: LinearModel, seen: Targets, a: Score, b: Score) -> Candi
 
 
 # What was observed, and how it would look in a further view; nothing is proposed for what is not in here.
-_OF: dict[type, Callable[[LinearModel, Any, Score, Score], CandidateViews | None]] = {
-    Surfaces: _of_surfaces,
-    Targets: _of_targets,
+_VIEWS_BY_OBSERVATION: dict[type, Callable[[LinearModel, Any, Score, Score], CandidateViews | None]] = {
+    SurfaceObservation: _of_surfaces,
+    TargetObservation: _of_targets,
 }
 
 
 def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews | None:
     """Further views of a session for two effects; None if no pose can show them."""
-    of = _OF.get(type(linear.observation))
+    of = _VIEWS_BY_OBSERVATION.get(type(linear.observation))
     return None if of is None else of(linear, linear.observation, a, b)
 
 
@@ -125,7 +125,7 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
     assert measurement.robot is not None
     views, count = measurement.views, len(joints)
     last = np.repeat(views.joints[-1:], count, axis=0)
-    torques = _torques_there(measurement.robot, views, joints)
+    torques = _torques_at(measurement.robot, views, joints)
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
     # They would be taken at rest.
     velocity = None if views.velocity is None else np.zeros_like(joints)
@@ -153,7 +153,7 @@ def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Arra
     return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))
 
 
-def _torques_there(robot: Robot, views: Views, joints: Array) -> Torques:
+def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
     """At joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all views."""
     if views.torques.measured:
         near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)

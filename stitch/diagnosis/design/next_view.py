@@ -15,7 +15,7 @@ from stitch.diagnosis.score import Score
 from stitch.diagnosis.selection.ranking import Ranked
 from stitch.diagnosis.selection.verdict import Selection
 from stitch.diagnosis.sensitivity.aliases import alias_matrix
-from stitch.diagnosis.thresholds import SIMILAR, TOLD_APART
+from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.observations.linear_model import LinearModel
@@ -52,9 +52,9 @@ class Proposal:
     views: int | None = None  # how many such views are needed
 
 
-def propose(linear: LinearModel, selection: Selection) -> list[Proposal]:
+def propose_measurements(linear: LinearModel, selection: Selection) -> list[Proposal]:
     """What would tell the named group apart; without a group, the clearest candidate from what resembles it."""
-    group = _group(linear, selection)
+    group = _effects_to_separate(linear, selection)
     names = tuple(score.name for score in group)
     artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
     found = _best_pose(linear, group) if _can_move(linear.measurement) else None
@@ -67,7 +67,7 @@ def propose(linear: LinearModel, selection: Selection) -> list[Proposal]:
     return [pose, *artefacts]
 
 
-def _group(linear: LinearModel, selection: Selection) -> list[Score]:
+def _effects_to_separate(linear: LinearModel, selection: Selection) -> list[Score]:
     """What to separate: the group that was named, or the best candidate and its nearest alias; else nothing."""
     if len(selection.named) > 1:
         return [r.score for r in selection.named]
@@ -77,7 +77,7 @@ def _group(linear: LinearModel, selection: Selection) -> list[Score]:
     first: Ranked = selection.named[0] if selection.named else seen[0]
     others = [r.score for r in seen if r.name != first.name]
     row = alias_matrix(linear, [first.score, *others])[0, 1:]
-    return [first.score, others[int(row.argmax())]] if row.max() > SIMILAR else []
+    return [first.score, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
 
 
 def _can_move(measurement: Measurement) -> bool:
@@ -89,11 +89,11 @@ def _best_pose(linear: LinearModel, group: list[Score]) -> tuple[Array, int, tup
     they separate; None if poses cannot separate anything.
     """
     pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(linear, a, b))]
-    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * TOLD_APART]
+    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * SEPARATION_LAMBDA]
     if not pairs:
         return None
     k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())
-    counts = [np.ceil(max(TOLD_APART - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
+    counts = [np.ceil(max(SEPARATION_LAMBDA - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
     separated = dict.fromkeys(score.name for score in group if any(score.name in names for _, names in pairs))
     return np.degrees(pairs[0][0].joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
 

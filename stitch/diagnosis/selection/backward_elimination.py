@@ -3,17 +3,17 @@
 from collections.abc import Collection
 from functools import partial
 
-from stitch.diagnosis.candidates import as_fitted
-from stitch.diagnosis.selection.ranking import certain, ranked_one
+from stitch.diagnosis.candidates import candidate_as_fitted
+from stitch.diagnosis.selection.ranking import is_certain, rank_one
 from stitch.diagnosis.thresholds import MANY_POSES
 from stitch.diagnosis.validation.cross_validation import cross_validate
 from stitch.model.term import Term
-from stitch.runs.state import State
+from stitch.runs.state import RunState
 from stitch.stages.course import linearise
 from stitch.system.threads import parallel
 
 
-def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] | None:
+def find_effect_to_drop(state: RunState, names: Collection[str]) -> tuple[str, str] | None:
     """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
 
     Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
@@ -24,7 +24,7 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
     """
     asked = [term for term in state.model.terms if term.name in names]
     each = parallel if state.measurement.views.count < MANY_POSES else map
-    found = zip(asked, each(partial(_objection, state), asked), strict=True)
+    found = zip(asked, each(partial(_test_effect, state), asked), strict=True)
     failing = [(factor, term.name, reason) for term, (factor, reason) in found if reason is not None]
     if not failing:
         return None
@@ -32,15 +32,15 @@ def eliminated_effect(state: State, names: Collection[str]) -> tuple[str, str] |
     return name, reason
 
 
-def _objection(state: State, term: Term) -> tuple[float, str | None]:
+def _test_effect(state: RunState, term: Term) -> tuple[float, str | None]:
     """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
     name = term.name
     linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)
-    candidate = as_fitted(linear, term)
+    candidate = candidate_as_fitted(linear, term)
     if not candidate.forms[0].keep.any():
         return 0.0, f"{name} is not seen beside the others"
-    own = ranked_one(linear, candidate, tests=1)
+    own = rank_one(linear, candidate, tests=1)
     factor = own.score.log_bayes_factor
-    if not certain(own):
+    if not is_certain(own):
         return factor, f"{name} explains too little beside the others"
-    return factor, cross_validate(linear, own.score).idle(name)
+    return factor, cross_validate(linear, own.score).rejection_reason(name)

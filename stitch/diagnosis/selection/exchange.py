@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import promising
-from stitch.diagnosis.selection.ranking import Ranked, certain, conditioned, ranked_one, without
-from stitch.diagnosis.thresholds import TRIED
+from stitch.diagnosis.selection.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank_one
+from stitch.diagnosis.thresholds import CANDIDATES_TRIED
 from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate
 from stitch.observations.linear_model import LinearModel
 
@@ -21,11 +21,11 @@ class Exchange:
     """One effect for another."""
 
     name: str  # that gives way
-    objection: str
-    instead: Ranked
+    rejection_reason: str
+    replacement: Ranked
 
 
-def likelier_beyond(
+def find_exchange(
     linear: LinearModel,
     candidates: Sequence[Candidate],
     chosen: Sequence[Ranked],
@@ -42,22 +42,26 @@ def likelier_beyond(
         found = beyond[r.name]
         if found is None or not found.errs_somewhere:
             continue
-        rest = without(linear, chosen, r)
-        rivals = _rivals(rest, [c for c in candidates if c.name not in {own.name for own in chosen}], found)
+        rest = conditioned_without(linear, chosen, r)
+        rivals = _better_extrapolating_effects(
+            rest, [c for c in candidates if c.name not in {own.name for own in chosen}], found
+        )
         for rival in rivals:
-            beside = conditioned(rest, [rival])
-            left = extrapolate(beside, ranked_one(beside, r.score.candidate, len(candidates)).score)
+            beside = conditioned_on_effects(rest, [rival])
+            left = extrapolate(beside, rank_one(beside, r.score.candidate, len(candidates)).score)
             if left is not None and not left.helps:
-                return Exchange(r.name, f"{left.objection(r.name)}; this beside {rival.name}", rival)
+                return Exchange(r.name, f"{left.rejection_reason(r.name)}; this beside {rival.name}", rival)
     return None
 
 
-def _rivals(rest: LinearModel, candidates: Sequence[Candidate], found: Extrapolation) -> list[Ranked]:
+def _better_extrapolating_effects(
+    rest: LinearModel, candidates: Sequence[Candidate], found: Extrapolation
+) -> list[Ranked]:
     """Effects that are likelier to hold at a further end than one that was found, the likeliest first."""
     out = list[tuple[float, Ranked]]()
-    for candidate, _ in promising(rest, candidates, TRIED):
-        other = ranked_one(rest, candidate, len(candidates))
-        own = extrapolate(rest, other.score) if certain(other) else None
+    for candidate, _ in promising(rest, candidates, CANDIDATES_TRIED):
+        other = rank_one(rest, candidate, len(candidates))
+        own = extrapolate(rest, other.score) if is_certain(other) else None
         if own is not None and own.helps and own.likely > found.likely:
             out.append((own.likely, other))
     return [other for _, other in sorted(out, key=lambda item: -item[0])]

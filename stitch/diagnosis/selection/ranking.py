@@ -41,7 +41,7 @@ class Ranked:
         return not self.score.candidate.empirical
 
     @property
-    def over_nothing(self) -> float:
+    def log_odds_over_nothing(self) -> float:
         """Log odds over nothing being missing."""
         return self.log_posterior - float(np.log(PRIOR_NOTHING))
 
@@ -69,25 +69,25 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
     return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
 
 
-def ranked_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
+def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
     scores = list(parallel(partial(score, linear), candidates, "candidate effects"))
     return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
 
 
-def beside(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
+def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
     """The same where something else has this log posterior in the model of `best`: all shares make room for it."""
     here = next(r for r in ranked if r.name == best.name).posterior
     room = 1 + here * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
     return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
 
 
-def ranked_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:
+def rank_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:
     """One candidate that was chosen among so many."""
     return rank([score(linear, candidate)], tests)[0][0]
 
 
-def contends(r: Ranked) -> bool:
+def is_contender(r: Ranked) -> bool:
     """Significant, more likely than nothing, and seen.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
@@ -97,21 +97,25 @@ def contends(r: Ranked) -> bool:
     return r.physical and s.observable and r.adjusted < ALPHA_NAME and s.log_bayes_factor > 0
 
 
-def certain(r: Ranked) -> bool:
+def is_certain(r: Ranked) -> bool:
     """Enough for an alarm."""
-    return contends(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR
+    return is_contender(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR
 
 
-def without(linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, near: LinearModel | None = None) -> LinearModel:
+def conditioned_without(
+    linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, near: LinearModel | None = None
+) -> LinearModel:
     """The evidence beside all effects but one.
 
     Args:
         near: of `conditioned_on`.
     """
-    return conditioned(linear, [r for r in chosen if r.name != one.name], near)
+    return conditioned_on_effects(linear, [r for r in chosen if r.name != one.name], near)
 
 
-def conditioned(linear: LinearModel, chosen: Sequence[Ranked], near: LinearModel | None = None) -> LinearModel:
+def conditioned_on_effects(
+    linear: LinearModel, chosen: Sequence[Ranked], near: LinearModel | None = None
+) -> LinearModel:
     """The evidence beside some effects."""
     if not chosen:
         return linear

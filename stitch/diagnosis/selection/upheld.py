@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from stitch.diagnosis.selection.ranking import Ranked, conditioned
+from stitch.diagnosis.selection.ranking import Ranked, conditioned_on_effects
 from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.thresholds import STEADY
+from stitch.diagnosis.thresholds import MIN_STEADINESS
 from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
-from stitch.diagnosis.validation.halves import Halves, halves
+from stitch.diagnosis.validation.halves import Halves, validate_in_halves
 from stitch.observations.linear_model import LinearModel
 
 
-def validated(
+def validate_named(
     selection: Selection, found: Mapping[str, CrossValidation], in_halves: Mapping[str, Halves | None]
 ) -> Selection:
     """An effect that does not hold on views left out or in halves, or that one view carries, is not named; a second
@@ -23,7 +23,7 @@ def validated(
     for named in (selection.named[0], selection.second):
         if named is None:
             continue
-        refusal = _refused(named, found.get(named.name), in_halves.get(named.name))
+        refusal = _rejection_reason(named, found.get(named.name), in_halves.get(named.name))
         if refusal is None:
             if named is selection.named[0]:
                 return selection
@@ -33,20 +33,22 @@ def validated(
     return Selection("unknown_effect", (), selection.ranked, selection.empirical, notes=kept)
 
 
-def hold_together(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
+def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
     """True if each of two effects stands that test beside the other, beside which it was scored."""
     asked = (pair, pair[::-1])
     return not any(
-        _refused(one, cross_validate(conditioned(linear, [other]), one.score), halves(one.score))
+        _rejection_reason(
+            one, cross_validate(conditioned_on_effects(linear, [other]), one.score), validate_in_halves(one.score)
+        )
         for one, other in asked
     )
 
 
-def _refused(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:
+def _rejection_reason(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:
     """Why an effect does not stand the test of views left out."""
-    if left_out is not None and left_out.steadiness < STEADY:
+    if left_out is not None and left_out.steadiness < MIN_STEADINESS:
         return f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
     if left_out is not None and not left_out.helps:
         share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
         return f"{named.name} would not help on views left out (mean square pose error {share} of now)"
-    return None if halves is None else halves.objection(named.name)
+    return None if halves is None else halves.rejection_reason(named.name)

@@ -18,7 +18,7 @@ class Alias:
     correlation: float  # of this one's fitted pattern with the best that the other can do
 
 
-def pattern(linear: LinearModel, scored: Score) -> Array:
+def effect_pattern(linear: LinearModel, scored: Score) -> Array:
     """(n,) what the fitted candidate does to the views, in units of their scatter."""
     white = linear.residual(scored.form.columns)
     if np.any(scored.values):
@@ -33,13 +33,13 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
 
     The other effect may use all its parameters, but none beyond ten times its plausible size.
     """
-    patterns = [pattern(linear, s) for s in scores]
+    patterns = [effect_pattern(linear, s) for s in scores]
     whites = [linear.residual(s.candidate.forms[0].columns) for s in scores]
     out = np.eye(len(scores))
     for i, y in enumerate(patterns):
         for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):
             if i != j:
-                out[i, j] = imitated(y, white * scored.candidate.forms[0].sizes)
+                out[i, j] = imitated_share(y, white * scored.candidate.forms[0].sizes)
     return out
 
 
@@ -49,7 +49,7 @@ def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = 0.
     return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
 
 
-def imitated(y: Array, X: Array) -> float:
+def imitated_share(y: Array, X: Array) -> float:
     """How much of a pattern (n,) columns (n, p) of plausible size can do, 0 … 1; nothing at all is like nothing."""
     length = float(np.linalg.norm(y))
     if length == 0 or not X.size:

@@ -21,9 +21,9 @@ from stitch.observations.linear_model import LinearModel
 from stitch.statistics.tails import f_limit, noncentral_f_tail
 
 # Squares, in units of the scatter, beyond which an effect is of no plausible size: its prior holds back all of it.
-_BEYOND = 1e6
+_UNDETECTABLE = 1e6
 # Of plausible size and nothing else.
-ALONE = {1.0: 1.0}
+SINGLE_SCALE = {1.0: 1.0}
 
 
 def least_noncentrality(
@@ -31,7 +31,7 @@ def least_noncentrality(
     weight: float,
     tests: int,
     degrees_of_freedom: float,
-    scales: Mapping[float, float] = ALONE,
+    scales: Mapping[float, float] = SINGLE_SCALE,
 ) -> float:
     """θᵀIθ that a form needs to be detected.
 
@@ -50,7 +50,7 @@ def least_noncentrality(
     factor, told = LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
     by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
     needed = max(by_p, min(by_factor))
-    if needed > _BEYOND:
+    if needed > _UNDETECTABLE:
         return float("inf")
 
     def missed(shift: float) -> float:
@@ -75,7 +75,7 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
 
 
 @dataclass(frozen=True)
-class Shown:
+class FormInformation:
     """What the views show of one form of a candidate."""
 
     names: tuple[str, ...]  # of its free parameters (p,)
@@ -83,22 +83,24 @@ class Shown:
     sizes: Array  # (p,) plausible ones
     weight: float  # share of the candidate's prior
     degrees_of_freedom: float  # of the scatter along the columns
-    scales: Mapping[float, float] = field(default_factory=lambda: ALONE)  # of the plausible sizes, with their shares
+    scales: Mapping[float, float] = field(
+        default_factory=lambda: SINGLE_SCALE
+    )  # of the plausible sizes, with their shares
 
 
-def smallest_detectable(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
+def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
     """Smallest detectable size of every free parameter of a candidate among so many."""
     linear = linear.without([candidate.name])
     shown = []
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
         white = linear.residual(form.columns)
-        known = linear.satterthwaite.of(linear.in_blocks(white))
+        known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
         names = tuple(p.name for p in form.free)
-        shown.append(Shown(names, white, form.sizes, float(weight), known, scales_of(linear)))
-    return smallest_sizes(shown, tests)
+        shown.append(FormInformation(names, white, form.sizes, float(weight), known, scales_of(linear)))
+    return detectable_sizes_by_form(shown, tests)
 
 
-def smallest_sizes(forms: Sequence[Shown], tests: int) -> dict[str, float]:
+def detectable_sizes_by_form(forms: Sequence[FormInformation], tests: int) -> dict[str, float]:
     """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
     for form in forms:

@@ -17,50 +17,50 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unknown.joint_laws import JointLaw, joint_laws
-from stitch.diagnosis.unknown.law_covariates import followed_in_words
+from stitch.diagnosis.unknown.law_covariates import covariates_in_words
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.mean_factor import log_mean
+from stitch.statistics.mean_factor import log_mean_exp
 
 
-def clear_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
+def significant_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Laws of single joints of which one is there, likeliest first, () if none is.
 
     With the likeliest joint come those that 20 to 1 does not tell from it, each by its likeliest kind of law, with the
     log Bayes factor of its kinds together over all that the prior holds.
     """
-    return _likely(joint_laws(linear)) or _alone(linear)
+    return _likeliest_law_per_joint(joint_laws(linear)) or _laws_without_arm_errors(linear)
 
 
-def _alone(linear: LinearModel) -> tuple[JointLaw, ...]:
+def _laws_without_arm_errors(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Of which one, where neither joints nor links err but by it, is 20 to 1 likelier than none and explains no less
     than all of them together."""
-    if linear.pose_errors is None or not linear.pose_errors.of_one_joint:
+    if linear.pose_errors is None or not linear.pose_errors.joint_processes:
         return ()
-    right = linear.arm_right
+    right = linear.without_arm
     tried = joint_laws(right)
     whole = 0.5 * (right.null.deviance - linear.null.deviance)
     if tried[0].log_bayes_factor < whole:
         return ()
-    return tuple(replace(law, log_bayes_factor=law.log_bayes_factor - whole) for law in _likely(tried))
+    return tuple(replace(law, log_bayes_factor=law.log_bayes_factor - whole) for law in _likeliest_law_per_joint(tried))
 
 
-def _likely(laws: Sequence[JointLaw]) -> tuple[JointLaw, ...]:
+def _likeliest_law_per_joint(laws: Sequence[JointLaw]) -> tuple[JointLaw, ...]:
     """Of every joint that 20 to 1 does not tell from the likeliest its likeliest law, () where none is so much
     likelier than nothing.
 
     Args:
         laws: of all kinds and joints, likeliest first.
     """
-    if not laws or log_mean([law.log_bayes_factor for law in laws]) <= ODDS:
+    if not laws or log_mean_exp([law.log_bayes_factor for law in laws]) <= ODDS:
         return ()
     of_joint = {k: [law for law in laws if law.joint == k] for k in dict.fromkeys(law.joint for law in laws)}
     factors = {k: [law.log_bayes_factor for law in own] for k, own in of_joint.items()}
     together = {k: float(logsumexp(own) - np.log(len(laws))) for k, own in factors.items()}
     near = [k for k in together if together[k] > max(together.values()) - ODDS]
-    return tuple(_told(of_joint[k], together[k]) for k in sorted(near, key=lambda k: -together[k]))
+    return tuple(_law_with_alternatives(of_joint[k], together[k]) for k in sorted(near, key=lambda k: -together[k]))
 
 
-def _told(laws: Sequence[JointLaw], together: float) -> JointLaw:
+def _law_with_alternatives(laws: Sequence[JointLaw], together: float) -> JointLaw:
     """The likeliest law of a joint, with what it may follow as well.
 
     Args:
@@ -68,4 +68,4 @@ def _told(laws: Sequence[JointLaw], together: float) -> JointLaw:
         together: log Bayes factor of them.
     """
     near = [law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS]
-    return replace(laws[0], log_bayes_factor=together, may_follow=tuple(dict.fromkeys(map(followed_in_words, near))))
+    return replace(laws[0], log_bayes_factor=together, may_follow=tuple(dict.fromkeys(map(covariates_in_words, near))))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.unknown.joint_laws import JointLaw
-from stitch.diagnosis.unknown.law_covariates import Along, followed_by
+from stitch.diagnosis.unknown.law_covariates import LawCovariate, covariates_of_law
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array
 from stitch.model.term import term_of
@@ -28,7 +28,7 @@ class JointCurve:
     at: Array  # (G,) of the covariate, in the unit that its name ends with
     error: Array  # (G,) of the joint that errs, rad
     sigma: Array  # (G,) of `error`, rad
-    stood: Array  # (V,) the covariate in the views
+    view_values: Array  # (V,) the covariate in the views
     may_follow: tuple[str, ...] = ()  # what these views do not tell apart, the likeliest first
 
     @property
@@ -45,23 +45,23 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
     """
     found = []
     for law in laws:
-        alike = law.errors.alike_of(law.process)
-        whole = float(_given_views(law, alike, alike)[0].var())
-        found += [_course(law, along, whole) for along in followed_by(law)]
+        alike = law.errors.kernel_of(law.process)
+        whole = float(_law_given_views(law, alike, alike)[0].var())
+        found += [_curve_along(law, along, whole) for along in covariates_of_law(law)]
     return tuple(sorted((c for c in found if c.share > _WORTH), key=lambda c: -c.share))
 
 
-def _course(law: JointLaw, along: Along, whole: float) -> JointCurve:
+def _curve_along(law: JointLaw, along: LawCovariate, whole: float) -> JointCurve:
     """`whole` is the variance over the views of all that the law does, rad²."""
-    at, views = along.stood, len(along.stood)
+    at, views = along.view_values, len(along.view_values)
     grid = np.linspace(at.min(), at.max(), _PLACES)
     places = np.append(grid, at)
     # Of the function averaged over where all else stood.
-    rest = np.broadcast_to(along.of_the_rest, (views, views))
-    with_views = rest.mean(axis=0) * along.of_it(places, at)
-    with_places = rest.mean() * along.of_it(places, places)
+    rest = np.broadcast_to(along.remaining_kernel, (views, views))
+    with_views = rest.mean(axis=0) * along.kernel(places, at)
+    with_places = rest.mean() * along.kernel(places, places)
     centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_PLACES, views])
-    mean, covariance = _given_views(law, centred @ with_views, centred @ with_places @ centred.T)
+    mean, covariance = _law_given_views(law, centred @ with_views, centred @ with_places @ centred.T)
     return JointCurve(
         joint=law.joint,
         covariate=along.covariate,
@@ -69,12 +69,12 @@ def _course(law: JointLaw, along: Along, whole: float) -> JointCurve:
         at=along.unit * grid,
         error=mean[:_PLACES],
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),
-        stood=along.unit * at,
+        view_values=along.unit * at,
         may_follow=law.may_follow,
     )
 
 
-def _given_views(law: JointLaw, with_views: Array, prior: Array) -> tuple[Array, Array]:
+def _law_given_views(law: JointLaw, with_views: Array, prior: Array) -> tuple[Array, Array]:
     """Mean (G,) and covariance (G, G) of places of the law, rad, from what the views show.
 
     Args:

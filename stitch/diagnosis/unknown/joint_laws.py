@@ -20,15 +20,15 @@ from functools import cached_property
 import numpy as np
 
 from stitch.diagnosis.thresholds import PRIOR_UNKNOWN
-from stitch.diagnosis.unknown.process_size import at_likeliest_size
-from stitch.diagnosis.unknown.smooth_processes import with_covariance
+from stitch.diagnosis.unknown.process_size import size_process
+from stitch.diagnosis.unknown.smooth_processes import process_with_covariance
 from stitch.frames import Array
-from stitch.observations.error_model import with_errors
+from stitch.observations.error_model import with_pose_errors
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import SMOOTH
+from stitch.observations.pose_errors import SMOOTH_SCALE
 from stitch.statistics import amplitude_scales
 from stitch.statistics.kernels import SmoothErrors
-from stitch.statistics.mean_factor import log_mean
+from stitch.statistics.mean_factor import log_mean_exp
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import VarianceFit, at_variances, fit_variances
 
@@ -56,18 +56,18 @@ class JointLaw:
     def errors(self) -> SmoothErrors:
         """Of its kind, of all joints."""
         assert self.base.pose_errors is not None
-        return self.base.pose_errors.of_one_joint[self.follows]
+        return self.base.pose_errors.joint_processes[self.follows]
 
     @cached_property
     def model(self) -> LinearModel:
         """With the law as the last of its pose errors, all sizes fitted."""
         errors = self.base.pose_errors
         assert errors is not None
-        own = self.base.reduce(self.base.reduce(self.errors.of(self.process)).T)
-        every = errors.beside(f"joint {self.joint} by no known law", own, SMOOTH)
-        mixed = with_errors(self.base.mixed, every)
-        null = self.fit or _fit(self.base, mixed)
-        return replace(self.base, mixed=mixed, pose_errors=every, null=null, whole=None)
+        own = self.base.reduce(self.base.reduce(self.errors.twist_covariance(self.process)).T)
+        every = errors.with_component(f"joint {self.joint} by no known law", own, SMOOTH_SCALE)
+        mixed = with_pose_errors(self.base.mixed, every)
+        null = self.fit or _fit_law(self.base, mixed)
+        return replace(self.base, mixed=mixed, pose_errors=every, null=null, full_model=None)
 
     def fitted(self) -> "JointLaw":
         """With all variances sought anew: what a law explains is no scatter."""
@@ -81,27 +81,27 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `some_law` charges it for that.
     """
-    return tuple(sorted(laws_by(base, _kinds(base)), key=lambda law: -law.log_bayes_factor))
+    return tuple(sorted(laws_of_kinds(base, _kinds(base)), key=lambda law: -law.log_bayes_factor))
 
 
-def log_posterior(base: LinearModel) -> float:
+def joint_law_log_posterior(base: LinearModel) -> float:
     """That some joint follows such a law, of any kind, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
     laws = joint_laws(base)
-    return float(some_law(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
+    return float(log_posterior_of_any(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
 
 
-def some_law(log_bayes_factors: Array) -> Array:
+def log_posterior_of_any(log_bayes_factors: Array) -> Array:
     """(…) log posterior that one of the laws is there, from the log Bayes factors (L, …) of each: all kinds of laws of
     all joints share the prior alike, and none of their sizes is known."""
-    return np.asarray(log_mean(log_bayes_factors) + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
+    return np.asarray(log_mean_exp(log_bayes_factors) + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
 
 
 def law_covariances(base: LinearModel) -> list[list[Array]]:
     """(n, n) in the channel of the laws of usual size, those of one kind of one joint together."""
-    of_one_joint = {} if base.pose_errors is None else base.pose_errors.of_one_joint
+    of_one_joint = {} if base.pose_errors is None else base.pose_errors.joint_processes
     return [
-        [SMOOTH**2 * base.reduce(base.reduce(smooth.of(p)).T) for p in smooth.of_joint(joint)]
+        [SMOOTH_SCALE**2 * base.reduce(base.reduce(smooth.twist_covariance(p)).T) for p in smooth.of_joint(joint)]
         for smooth in of_one_joint.values()
         for joint in dict.fromkeys(smooth.joints)
     ]
@@ -109,17 +109,17 @@ def law_covariances(base: LinearModel) -> list[list[Array]]:
 
 def _kinds(base: LinearModel) -> Sequence[str]:
     """All that the views tell of."""
-    return () if base.pose_errors is None else tuple(base.pose_errors.of_one_joint)
+    return () if base.pose_errors is None else tuple(base.pose_errors.joint_processes)
 
 
-def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
+def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     """Of every joint, by each of these kinds that the views tell of.
 
     All variances are sought anew for the likeliest few; for the others their likelihood at the null's is a bound.
     """
-    of_one_joint = {} if base.pose_errors is None else base.pose_errors.of_one_joint
+    of_one_joint = {} if base.pose_errors is None else base.pose_errors.joint_processes
     tried = [
-        _at_the_null(base, follows, process)
+        _law_at_null(base, follows, process)
         for follows in kinds
         if follows in of_one_joint
         for process in range(len(of_one_joint[follows].joints))
@@ -129,25 +129,25 @@ def laws_by(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
     every: dict[tuple[int, str], list[JointLaw]] = {}
     for law in tried:
         every.setdefault((law.joint, law.follows), []).append(law)
-    return [_mean(laws) for laws in every.values()]
+    return [_average_laws(laws) for laws in every.values()]
 
 
-def _mean(laws: Sequence[JointLaw]) -> JointLaw:
+def _average_laws(laws: Sequence[JointLaw]) -> JointLaw:
     """The likeliest of a joint's laws of a kind; which of them it is, nobody knows."""
     likeliest = max(laws, key=lambda law: law.log_bayes_factor)
-    return replace(likeliest, log_bayes_factor=float(log_mean([law.log_bayes_factor for law in laws])))
+    return replace(likeliest, log_bayes_factor=float(log_mean_exp([law.log_bayes_factor for law in laws])))
 
 
-def _at_the_null(base: LinearModel, follows: str, process: int) -> JointLaw:
+def _law_at_null(base: LinearModel, follows: str, process: int) -> JointLaw:
     assert base.pose_errors is not None
-    smooth = base.pose_errors.of_one_joint[follows]
+    smooth = base.pose_errors.joint_processes[follows]
     joint, motions = smooth.joints[process] + 1, smooth.columns[:, process].reshape(-1, 6, 1)
-    sized = at_likeliest_size(base, with_covariance(joint, motions, smooth.alike_of(process)))
+    sized = size_process(base, process_with_covariance(joint, motions, smooth.kernel_of(process)))
     return JointLaw(joint, follows, process, sized.gain, base)
 
 
-def _fit(base: LinearModel, mixed: MixedModel) -> VarianceFit:
+def _fit_law(base: LinearModel, mixed: MixedModel) -> VarianceFit:
     """At the maximum, sought from the likeliest of several starts."""
-    nulls = [at.null.variances for at in (base, *base.elsewhere)]
-    starts: list[Array] = [np.append(null, times * SMOOTH**2) for null in nulls for times in TIMES]
+    nulls = [at.null.variances for at in (base, *base.alternative_starts)]
+    starts: list[Array] = [np.append(null, times * SMOOTH_SCALE**2) for null in nulls for times in TIMES]
     return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))

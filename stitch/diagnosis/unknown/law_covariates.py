@@ -9,24 +9,24 @@ import numpy as np
 from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.frames import Array
 from stitch.measurement.torques import STILL
-from stitch.observations.flange_errors import WANDERING, in_steps, usual_step
+from stitch.observations.flange_errors import DRIFT_MEMORY, time_in_steps, usual_time_step
 from stitch.observations.joint_processes import (
     ALL_ANGLES,
-    ITS_LOAD,
+    JOINT_LOAD,
     OWN_ANGLE,
-    THE_WAY,
-    TIME_ALONE,
+    TIME_ONLY,
+    TRAVEL,
     TWO_ANGLES,
     WAVES,
     WITH_TIME,
 )
 from stitch.statistics.kernels import (
-    alike_closely,
-    alike_in_joints,
-    alike_in_waves,
-    alike_joint_by_joint,
-    alike_within,
-    reach_of_way,
+    direction_reach,
+    exponential_kernel,
+    joint_kernel_factors,
+    periodic_kernel,
+    rbf_joints,
+    short_range_kernel,
 )
 
 JOINT_ANGLES = "the joint angles"
@@ -34,92 +34,98 @@ _DEGREES = float(np.degrees(1.0))
 
 
 @dataclass(frozen=True)
-class Along:
+class LawCovariate:
     """One number that a law follows, and the factors of the law's covariance."""
 
     covariate: str
-    stood: Array  # (V,)
-    of_it: Callable[[Array, Array], Array]  # (S, O) between places (S,) and (O,)
-    of_the_rest: Array | float = 1.0  # (V, V) between views, by all that the law follows beside it
+    view_values: Array  # (V,)
+    kernel: Callable[[Array, Array], Array]  # (S, O) between places (S,) and (O,)
+    remaining_kernel: Array | float = 1.0  # (V, V) between views, by all that the law follows beside it
     unit: float = 1.0  # of the covariate per unit of `stood`
 
 
-def followed_by(law: JointLaw) -> list[Along]:
+def covariates_of_law(law: JointLaw) -> list[LawCovariate]:
     """All of them, by the kind of the law."""
-    return _FOLLOWED[law.follows][1](law)
+    return _COVARIATES_OF_KIND[law.follows][1](law)
 
 
-def followed_in_words(law: JointLaw) -> str:
+def covariates_in_words(law: JointLaw) -> str:
     """The same as people say it: the joint angles, the way it came, time, its load."""
-    return _FOLLOWED[law.follows][0]
+    return _COVARIATES_OF_KIND[law.follows][0]
 
 
-def _angle(joint: int, stood: Array, of_it: Callable[[Array, Array], Array], rest: Array | float = 1.0) -> Along:
+def _angle(joint: int, stood: Array, of_it: Callable[[Array, Array], Array], rest: Array | float = 1.0) -> LawCovariate:
     """Along the angle of a joint, counted from 0; `stood` (V,) rad."""
-    return Along(f"j{joint + 1}_deg", stood, of_it, rest, _DEGREES)
+    return LawCovariate(f"j{joint + 1}_deg", stood, of_it, rest, _DEGREES)
 
 
-def _all_angles(law: JointLaw) -> list[Along]:
+def _all_angles(law: JointLaw) -> list[LawCovariate]:
     joints = law.base.measurement.views.joints
-    factors = alike_joint_by_joint(joints, joints)
+    factors = joint_kernel_factors(joints, joints)
     return [
-        _angle(j, q, _of_angle, np.asarray(np.prod(np.delete(factors, j, axis=2), axis=2)))
+        _angle(j, q, _smooth_in_angle, np.asarray(np.prod(np.delete(factors, j, axis=2), axis=2)))
         for j, q in enumerate(joints.T)
     ]
 
 
-def _two_angles(law: JointLaw) -> list[Along]:
+def _two_angles(law: JointLaw) -> list[LawCovariate]:
     joints, two = law.base.measurement.views.joints, (law.joint - 1, law.errors.others[law.process])
     return [
-        _angle(j, joints[:, j], _of_one_of_two, _of_one_of_two(joints[:, other], joints[:, other]))
+        _angle(j, joints[:, j], _factor_of_one_angle, _factor_of_one_angle(joints[:, other], joints[:, other]))
         for j, other in (two, two[::-1])
     ]
 
 
-def _own_angle(law: JointLaw) -> list[Along]:
+def _own_angle(law: JointLaw) -> list[LawCovariate]:
     own = law.joint - 1
-    return [_angle(own, law.base.measurement.views.joints[:, own], alike_closely)]
+    return [_angle(own, law.base.measurement.views.joints[:, own], short_range_kernel)]
 
 
-def _waves(law: JointLaw) -> list[Along]:
+def _periodic_angle(law: JointLaw) -> list[LawCovariate]:
     own = law.joint - 1
-    of_it = partial(alike_in_waves, period=law.errors.periods[law.process])
+    of_it = partial(periodic_kernel, period=law.errors.periods[law.process])
     return [_angle(own, law.base.measurement.views.joints[:, own], of_it)]
 
 
-def _the_way(law: JointLaw) -> list[Along]:
+def _approach(law: JointLaw) -> list[LawCovariate]:
     own, views = law.joint - 1, law.base.measurement.views
     q, came = views.joints[:, own], views.joints[:, own] - views.previous[:, own]
-    of_move = partial(alike_within, reach=reach_of_way(q))
+    of_move = partial(exponential_kernel, reach=direction_reach(q))
     return [
-        _angle(own, q, _of_angle, of_move(came, came)),
-        Along(f"j{law.joint}_move_deg", came, of_move, _of_angle(q, q), _DEGREES),
+        _angle(own, q, _smooth_in_angle, of_move(came, came)),
+        LawCovariate(f"j{law.joint}_move_deg", came, of_move, _smooth_in_angle(q, q), _DEGREES),
     ]
 
 
-def _with_time(law: JointLaw) -> list[Along]:
-    return [_in_time(law, (1 + alike_in_joints(law.base.measurement.views.joints)) / 2)]
+def _angles_and_time(law: JointLaw) -> list[LawCovariate]:
+    return [_along_time(law, (1 + rbf_joints(law.base.measurement.views.joints)) / 2)]
 
 
-def _time_alone(law: JointLaw) -> list[Along]:
-    return [_in_time(law, 1.0)]
+def _time_only(law: JointLaw) -> list[LawCovariate]:
+    return [_along_time(law, 1.0)]
 
 
-def _in_time(law: JointLaw, rest: Array | float) -> Along:
+def _along_time(law: JointLaw, rest: Array | float) -> LawCovariate:
     measurement = law.base.measurement
-    seconds = usual_step(measurement)
+    seconds = usual_time_step(measurement)
     name, unit = ("time_s", seconds) if seconds else ("view", 1.0)
-    return Along(name, in_steps(measurement), partial(alike_within, reach=WANDERING["slowly wandering"]), rest, unit)
+    return LawCovariate(
+        name,
+        time_in_steps(measurement),
+        partial(exponential_kernel, reach=DRIFT_MEMORY["slowly wandering"]),
+        rest,
+        unit,
+    )
 
 
-def _its_load(law: JointLaw) -> list[Along]:
-    torques, whole = law.base.measurement.views.torques, law.errors.alike_of(law.process)
+def _joint_load(law: JointLaw) -> list[LawCovariate]:
+    torques, whole = law.base.measurement.views.torques, law.errors.kernel_of(law.process)
     own = [t for t, k in enumerate(torques.joint) if k == law.joint - 1 and np.ptp(torques.values[:, t]) > STILL]
     found = []
     for t in own:
         stood = torques.values[:, t]
-        of_it = partial(alike_within, reach=len(own) * float(np.ptp(stood)))
-        found.append(Along(_load_name(torques.names[t]), stood, of_it, whole / of_it(stood, stood)))
+        of_it = partial(exponential_kernel, reach=len(own) * float(np.ptp(stood)))
+        found.append(LawCovariate(_load_name(torques.names[t]), stood, of_it, whole / of_it(stood, stood)))
     return found
 
 
@@ -129,23 +135,23 @@ def _load_name(torque: str) -> str:
 
 
 # By kind of law what it follows, in words and along what its course is told.
-_FOLLOWED: dict[str, tuple[str, Callable[[JointLaw], list[Along]]]] = {
+_COVARIATES_OF_KIND: dict[str, tuple[str, Callable[[JointLaw], list[LawCovariate]]]] = {
     ALL_ANGLES: (JOINT_ANGLES, _all_angles),
     TWO_ANGLES: (JOINT_ANGLES, _two_angles),
     OWN_ANGLE: (JOINT_ANGLES, _own_angle),
-    WAVES: (JOINT_ANGLES, _waves),
-    THE_WAY: ("the way it came", _the_way),
-    WITH_TIME: ("time", _with_time),
-    TIME_ALONE: ("time", _time_alone),
-    ITS_LOAD: ("its load", _its_load),
+    WAVES: (JOINT_ANGLES, _periodic_angle),
+    TRAVEL: ("the way it came", _approach),
+    WITH_TIME: ("time", _angles_and_time),
+    TIME_ONLY: ("time", _time_only),
+    JOINT_LOAD: ("its load", _joint_load),
 }
 
 
-def _of_angle(some: Array, others: Array) -> Array:
+def _smooth_in_angle(some: Array, others: Array) -> Array:
     """(S, O) of a smooth function of one angle, (S,) and (O,) rad."""
-    return alike_in_joints(some[:, None], others[:, None])
+    return rbf_joints(some[:, None], others[:, None])
 
 
-def _of_one_of_two(some: Array, others: Array) -> Array:
+def _factor_of_one_angle(some: Array, others: Array) -> Array:
     """(S, O) the factor of one angle, (S,) and (O,) rad, in what follows two."""
-    return np.asarray(2 * _of_angle(some, others) - 1)
+    return np.asarray(2 * _smooth_in_angle(some, others) - 1)

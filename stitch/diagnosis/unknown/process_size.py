@@ -49,7 +49,7 @@ class FittedProcess:
         return np.asarray(self.columns @ self.fit.mean[-self.columns.shape[1] :])
 
 
-def at_likeliest_size(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
+def size_process(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
     """Its size at the null's variances.
 
     Over the eigenvalues k of the columns' information and the shares g of what was seen: log BF(s) =
@@ -66,13 +66,13 @@ def at_likeliest_size(linear: LinearModel, process: SmoothProcess) -> SizedProce
     return SizedProcess(process, float(sizes[found.argmax()]), float(found.max()))
 
 
-def fitted(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedProcess:
+def fit_process(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedProcess:
     """With all variances sought anew: what a process explains is no scatter, and where the scatter is less it is
     likelier of another size."""
     columns = sized.process.columns(linear)
     G, unit = linear.in_blocks(columns), np.ones(columns.shape[1])
     fit = fit_variances(linear.mixed, G, sized.size * unit, start=linear.null.variances)
-    size = at_likeliest_size(replace(linear, null=fit), sized.process).size
+    size = size_process(replace(linear, null=fit), sized.process).size
     again = fit_variances(linear.mixed, G, size * unit, start=fit.variances)
     size, fit = (size, again) if again.deviance < fit.deviance else (sized.size, fit)
     gained = 0.5 * (linear.null.deviance - fit.deviance) - float(np.log(tried))

@@ -4,6 +4,6 @@ from stitch.diagnosis.unknown import joint_laws, time_laws
 from stitch.observations.linear_model import LinearModel
 
 
-def log_posterior(base: LinearModel) -> float:
+def unnamed_law_log_posterior(base: LinearModel) -> float:
     """Of the likelier, as those of effects in the same model (`Ranked`); −∞ where there is none."""
-    return max(joint_laws.log_posterior(base), time_laws.log_posterior(base))
+    return max(joint_laws.joint_law_log_posterior(base), time_laws.time_law_log_posterior(base))

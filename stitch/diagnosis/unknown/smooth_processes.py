@@ -10,11 +10,11 @@ from scipy.linalg import eigh
 
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Indices
-from stitch.model.jacobian import twists
+from stitch.model.jacobian import pose_derivatives
 from stitch.model.term import term_of
-from stitch.observations.flange_errors import WANDERING, flange_twists, in_steps
+from stitch.observations.flange_errors import DRIFT_MEMORY, flange_twists, time_in_steps
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.kernels import REACH, SHORT_REACH, alike_in_joints, alike_in_time
+from stitch.statistics.kernels import REACH, SHORT_REACH, ornstein_uhlenbeck, rbf_joints
 
 # Columns of a process, and the share of its largest variance that the last of them has at least.
 _MOST, _LEAST = 96, 1e-3
@@ -35,69 +35,69 @@ class SmoothProcess:
     def columns(self, linear: LinearModel) -> Array:
         """(n, p·R) of the channel: each motion in each course."""
         moved = self.motions[:, :, :, None] * self.shapes[:, None, None, :]
-        return linear.observation.by_twists(moved.reshape(6 * len(moved), -1))
+        return linear.observation.from_twists(moved.reshape(6 * len(moved), -1))
 
 
-def of_joints(linear: LinearModel) -> Array:
+def joint_motions(linear: LinearModel) -> Array:
     """(n, V, 6, 1) twists of the views by a radian of each joint."""
     offset = term_of(linear.measurement, EFFECTS["joint_offset"])
-    return next(twists(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
+    return next(pose_derivatives(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
 
 
-def alone(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
+def single_joint_processes(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
     """Per joint: that it follows all joints, its own angle closely, or its own and the one that it comes from."""
     views = linear.measurement.views
-    every = _following(views.joints)
+    every = _smooth_courses(views.joints)
     out = []
     for k, motion in enumerate(motions):
         own, came = views.joints[:, [k]], views.previous[:, [k]]
-        courses = (every, _following(own, SHORT_REACH), _following(np.hstack([own, came])))
+        courses = (every, _smooth_courses(own, SHORT_REACH), _smooth_courses(np.hstack([own, came])))
         out.append([SmoothProcess(k + 1, motion, shapes) for shapes in courses])
     return out
 
 
-def in_pairs(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
+def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
     """Joint k, counted from 0, that follows its own angle and that of one other."""
     joints = linear.measurement.views.joints
     for other in range(joints.shape[1]):
         if other != k:
-            yield SmoothProcess(k + 1, motions[k], _following(joints[:, [k, other]]))
+            yield SmoothProcess(k + 1, motions[k], _smooth_courses(joints[:, [k, other]]))
 
 
-def with_covariance(joint: int, motions: Array, alike: Array) -> SmoothProcess:
+def process_with_covariance(joint: int, motions: Array, kernel: Array) -> SmoothProcess:
     """A joint, counted from 1, that follows a process of covariance (V, V); motions (V, 6, 1) as above."""
-    return SmoothProcess(joint, motions, alike @ _leading(alike, len(alike)))
+    return SmoothProcess(joint, motions, kernel @ _leading_courses(kernel, len(kernel)))
 
 
-def wandering(linear: LinearModel) -> SmoothProcess:
+def wandering_flange(linear: LinearModel) -> SmoothProcess:
     """A flange that wanders."""
-    measurement, time = linear.measurement, in_steps(linear.measurement)
+    measurement, time = linear.measurement, time_in_steps(linear.measurement)
     knots = _knots(len(time))
-    alike = alike_in_time(time, WANDERING["slowly wandering"], time[knots])
+    alike = ornstein_uhlenbeck(time, DRIFT_MEMORY["slowly wandering"], time[knots])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
-    return SmoothProcess(None, carried, alike @ _leading(alike[knots], _MOST // 6))
+    return SmoothProcess(None, carried, alike @ _leading_courses(alike[knots], _MOST // 6))
 
 
-def _following(angles: Array, reach: float = REACH) -> Array:
+def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
     """(V, R) smooth courses over some angles (V, a), without what is alike in all views: that has a name."""
     knots = angles[_knots(len(angles))]
-    leading = _leading_among(np.ascontiguousarray(knots).tobytes(), len(knots), reach)
-    shapes = alike_in_joints(angles, knots, reach) @ leading
+    leading = _leading_courses_cached(np.ascontiguousarray(knots).tobytes(), len(knots), reach)
+    shapes = rbf_joints(angles, knots, reach) @ leading
     return np.asarray(shapes - shapes.mean(axis=0))
 
 
 @lru_cache(maxsize=_KEPT)
-def _leading_among(angles: bytes, views: int, reach: float) -> Array:
+def _leading_courses_cached(angles: bytes, views: int, reach: float) -> Array:
     """(K, R) of the knots whose angles these are: the same in every diagnosis of a session."""
     knots = np.frombuffer(angles).reshape(views, -1)
-    return _leading(alike_in_joints(knots, knots, reach), _MOST)
+    return _leading_courses(rbf_joints(knots, knots, reach), _MOST)
 
 
 def _knots(views: int) -> Indices:
     return np.unique(np.linspace(0, views - 1, min(views, _KNOTS)).astype(np.int64))
 
 
-def _leading(covariance: Array, most: int) -> Array:
+def _leading_courses(covariance: Array, most: int) -> Array:
     """(K, R) of which the courses with unit coefficients of a process are made, by its covariance with the knots."""
     last = len(covariance) - 1
     values, vectors = eigh(covariance, subset_by_index=(max(last + 1 - most, 0), last))

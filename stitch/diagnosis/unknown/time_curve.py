@@ -6,14 +6,14 @@ import numpy as np
 
 from stitch.diagnosis.unknown.time_laws import TimeLaw
 from stitch.frames import Array
-from stitch.observations.flange_errors import in_steps, usual_step, usual_twist
+from stitch.observations.flange_errors import time_in_steps, usual_time_step, usual_twist
 from stitch.statistics.variance_components import at_variances
 
 _PLACES = 6  # from one view to the next
 # Turning and moving have one size in the law, and that of the other would shrink what is said of either: a prior of so
 # many sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
-TURNED, MOVED = slice(3), slice(3, 6)
+ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TimeCurve:
     error: Array  # (G, 6) rotation (rad), then translation (length_unit)
     sigma: Array  # (G, 6)
 
-    def most(self, of: slice) -> tuple[int, float, float]:
+    def largest(self, of: slice) -> tuple[int, float, float]:
         """Where the rotation, `TURNED`, or the translation, `MOVED`, is largest, how large it is there, its sigma."""
         size = np.linalg.norm(self.error[:, of], axis=1)
         k = int(size.argmax())
@@ -36,7 +36,7 @@ class TimeCurve:
 def time_curve(law: TimeLaw) -> TimeCurve:
     """The course of a law of the flange in time, and its sigma: a free fit at the fitted sizes of all other errors."""
     linear = law.base
-    time = np.sort(in_steps(linear.measurement))
+    time = np.sort(time_in_steps(linear.measurement))
     places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
     steps = np.interp(places, np.arange(len(time)), time)
     shapes, found = law.course.course(steps), law.fitted
@@ -51,7 +51,7 @@ def time_curve(law: TimeLaw) -> TimeCurve:
     way = -unit if linear.measurement.eye_to_hand else unit
     return TimeCurve(
         steps=steps,
-        seconds=usual_step(linear.measurement),
+        seconds=usual_time_step(linear.measurement),
         error=way * (shapes @ coefficients.T),
         sigma=unit * np.sqrt(np.maximum(variance, 0.0)),
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from stitch.diagnosis.unknown.smooth_processes import SmoothProcess
 from stitch.frames import Array
-from stitch.observations.flange_errors import flange_twists, in_steps, usual_step
+from stitch.observations.flange_errors import flange_twists, time_in_steps, usual_time_step
 from stitch.observations.linear_model import LinearModel
 from stitch.units import duration_text
 
@@ -24,13 +24,15 @@ _FULL_WIDTH = 2.355
 
 
 # Periods between those that are tried, where one of them is clear.
-_FINER = 17
+_PERIOD_REFINEMENT = 17
 # Of a swing in which all that moves does so at once: one of these is within a sixteenth of a period of any phase.
 _PHASES = 8
 # Times (T,) in steps from view to view → shapes (T, R) of a process.
-_Course = Callable[[Array], Array]
-_Told = tuple[str, str, _Course, float | None]  # its kind, in words, and with its frequency if it is a swing
-_SWING, _SWING_AT_ONCE, _STRETCH = "swing", "swing at once", "stretch"
+_TimeCourse = Callable[[Array], Array]
+_DescribedCourse = tuple[
+    str, str, _TimeCourse, float | None
+]  # its kind, in words, and with its frequency if it is a swing
+_SWING, _SWING_IN_PHASE, _STRETCH = "swing", "swing at once", "stretch"
 
 
 @dataclass(frozen=True)
@@ -40,26 +42,26 @@ class TimeProcess:
     kind: str
     words: str  # what they do: "they …"
     process: SmoothProcess
-    course: _Course
+    course: _TimeCourse
     frequency: float | None = None  # 1/step, of a swing
 
 
 def time_processes(linear: LinearModel) -> list[TimeProcess]:
     """All that are tried, of any size and direction in the flange's frame."""
-    time = in_steps(linear.measurement)
+    time = time_in_steps(linear.measurement)
     span = _span(time)
     apart = max(_APART / span, _FASTEST / _MOST_FREQUENCIES)
     frequencies = np.arange(_LEAST_SWINGS / span, _FASTEST, apart)
-    at_once = _swings_at_once(linear, frequencies)
+    at_once = _swings_in_phase(linear, frequencies)
     return _processes(linear, time, [*_swings(linear, frequencies), *at_once, *_stretches(linear, time)])
 
 
-def with_nearly_its_period(linear: LinearModel, swing: TimeProcess) -> list[TimeProcess]:
+def processes_near_period(linear: LinearModel, swing: TimeProcess) -> list[TimeProcess]:
     """A swing, and others between it and the next ones that are tried."""
     assert swing.frequency is not None
-    time = in_steps(linear.measurement)
+    time = time_in_steps(linear.measurement)
     reach = _APART / _span(time)
-    return _processes(linear, time, _swings(linear, swing.frequency + np.linspace(-reach, reach, _FINER)))
+    return _processes(linear, time, _swings(linear, swing.frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)))
 
 
 def _span(time: Array) -> float:
@@ -67,7 +69,7 @@ def _span(time: Array) -> float:
     return max(float(np.ptp(time)), 1.0)
 
 
-def _processes(linear: LinearModel, time: Array, courses: Iterable[_Told]) -> list[TimeProcess]:
+def _processes(linear: LinearModel, time: Array, courses: Iterable[_DescribedCourse]) -> list[TimeProcess]:
     carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return [
         TimeProcess(kind, words, SmoothProcess(None, carried, course(time)), course, frequency)
@@ -75,17 +77,17 @@ def _processes(linear: LinearModel, time: Array, courses: Iterable[_Told]) -> li
     ]
 
 
-def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_Told]:
+def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedCourse]:
     """Sines, of another phase in each motion, in words."""
     for f in map(float, frequencies):
-        yield _SWING, f"swing to and fro about every {_lasting(linear, 1 / f)}", partial(_waves, f), f
+        yield _SWING, f"swing to and fro about every {_duration_in_words(linear, 1 / f)}", partial(_waves, f), f
 
 
-def _swings_at_once(linear: LinearModel, frequencies: Array) -> Iterator[_Told]:
+def _swings_in_phase(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedCourse]:
     """The same with one phase for all motions, as where one temperature moves them: half as many numbers."""
     for _, words, waves, f in _swings(linear, frequencies):
         for phase in np.arange(_PHASES) * np.pi / _PHASES:
-            yield _SWING_AT_ONCE, words, partial(_wave, waves, phase), f
+            yield _SWING_IN_PHASE, words, partial(_wave, waves, phase), f
 
 
 def _waves(frequency: float, time: Array) -> Array:
@@ -94,12 +96,12 @@ def _waves(frequency: float, time: Array) -> Array:
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
-def _wave(waves: _Course, phase: float, time: Array) -> Array:
+def _wave(waves: _TimeCourse, phase: float, time: Array) -> Array:
     """(T, 1) the one of them with a phase."""
     return np.asarray(waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]]))
 
 
-def _stretches(linear: LinearModel, time: Array) -> Iterator[_Told]:
+def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedCourse]:
     """Bumps that begin and end within the session, in words."""
     first, last, width = float(time.min()), float(time.max()), _SHORTEST
     views = linear.measurement.views
@@ -111,7 +113,7 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[_Told]:
             away = np.abs(time - middle) / width
             if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
                 name = views.names[views.number[away.argmin()]]
-                words = f"are off for a stretch of {_lasting(linear, _FULL_WIDTH * width)} about view {name}"
+                words = f"are off for a stretch of {_duration_in_words(linear, _FULL_WIDTH * width)} about view {name}"
                 yield _STRETCH, words, partial(_bump, middle, width), None
         width *= 2
 
@@ -121,7 +123,7 @@ def _bump(middle: float, width: float, time: Array) -> Array:
     return np.asarray(np.exp(-0.5 * ((time - middle) / width) ** 2)[:, None])
 
 
-def _lasting(linear: LinearModel, steps: float) -> str:
+def _duration_in_words(linear: LinearModel, steps: float) -> str:
     """A time in steps from view to view, in words."""
-    step = usual_step(linear.measurement)
+    step = usual_time_step(linear.measurement)
     return f"{steps:.2g} views" + (f" ({duration_text(steps * step)})" if step > 0 else "")

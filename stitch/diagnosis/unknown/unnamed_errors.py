@@ -5,25 +5,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.clear_joints import clear_laws
+from stitch.diagnosis.unknown.clear_joints import significant_laws
 from stitch.diagnosis.unknown.joint_laws import JointLaw
 from stitch.diagnosis.unknown.law_covariates import JOINT_ANGLES
 from stitch.diagnosis.unknown.process_size import FittedProcess
 from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
-from stitch.diagnosis.unknown.time_laws import clear_time_law
-from stitch.diagnosis.unknown.unnamed_courses import clear_course
-from stitch.observations.flange_errors import WANDERING
+from stitch.diagnosis.unknown.time_laws import significant_time_law
+from stitch.diagnosis.unknown.unnamed_courses import significant_course
+from stitch.observations.flange_errors import DRIFT_MEMORY
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import STOPS
+from stitch.observations.pose_errors import STOP_COMPONENTS
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_prior import NOISE
 
 # Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
-_JOINTS, _TIME = "follow the joints", "wander in time"
+_FOLLOW_JOINTS, _WANDER_IN_TIME = "follow the joints", "wander in time"
 
 
 @dataclass(frozen=True)
-class Unnamed:
+class RepeatingError:
     """One kind of errors that repeat, beside all others."""
 
     words: str  # "they …"
@@ -35,12 +35,12 @@ class Unnamed:
     process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
 
 
-def to_be_said(unnamed: tuple[Unnamed, ...], implausible: bool) -> tuple[Unnamed, ...]:
+def reportable(unnamed: tuple[RepeatingError, ...], implausible: bool) -> tuple[RepeatingError, ...]:
     """Those of them that are said: where poses scatter as no arm does, only beside a law that stands out."""
     return unnamed if not implausible or any(u.of_one for u in unnamed) else ()
 
 
-def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
+def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     """Kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
 
     Without a prior of pose errors the likeliest alone (`unnamed_courses.py`).
@@ -50,18 +50,18 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     three nats (`variance_prior.py`), which the odds of 20 to 1 stand for.
     """
     if linear.pose_errors is None:
-        return _course(linear)
-    law = _likelier(_clear_law(linear), _time_law(linear))
-    if _gain(linear, linear.nothing_again.null.deviance) < ODDS:
+        return _course_errors(linear)
+    law = _likelier_errors(_joint_law_errors(linear), _time_law_errors(linear))
+    if _log_evidence_gain(linear, linear.independent_only.null.deviance) < ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
-        _JOINTS: tuple(n for n, of_arm in zip(names, linear.pose_errors.of_arm, strict=True) if of_arm),
-        _TIME: tuple(WANDERING),
-        "are shared by the scans of a stop": STOPS,
+        _FOLLOW_JOINTS: tuple(n for n, of_arm in zip(names, linear.pose_errors.arm_components, strict=True) if of_arm),
+        _WANDER_IN_TIME: tuple(DRIFT_MEMORY),
+        "are shared by the scans of a stop": STOP_COMPONENTS,
     }
     found = [
-        Unnamed(words, _gain(linear, _deviance_without(linear, kind)), words == _JOINTS)
+        RepeatingError(words, _log_evidence_gain(linear, _deviance_without(linear, kind)), words == _FOLLOW_JOINTS)
         for words, kind in kinds.items()
         if any(name in kind for name in names)
     ]
@@ -75,9 +75,9 @@ def unnamed_errors(linear: LinearModel) -> tuple[Unnamed, ...]:
     return tuple(wanted) or (max(found, key=lambda u: u.log_bayes_factor),)
 
 
-def _clear_law(linear: LinearModel) -> Unnamed | None:
+def _joint_law_errors(linear: LinearModel) -> RepeatingError | None:
     """That of one joint, beside all that the prior holds or in place of what an arm does."""
-    laws = clear_laws(linear)
+    laws = significant_laws(linear)
     if not laws:
         return None
     which = " or ".join(f"joint {joint}" for joint in sorted(law.joint for law in laws))
@@ -85,20 +85,20 @@ def _clear_law(linear: LinearModel) -> Unnamed | None:
     # Of laws that nobody knows none is certain to be of the kind that explains most.
     words = f"come from {which} above all, likeliest by {' or '.join(followed)}"
     if JOINT_ANGLES in followed:
-        words = f"{_JOINTS}, {which} above all"
-    return Unnamed(words, laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
+        words = f"{_FOLLOW_JOINTS}, {which} above all"
+    return RepeatingError(words, laws[0].log_bayes_factor, joints=True, of_one=True, laws=laws)
 
 
-def _time_law(linear: LinearModel) -> Unnamed | None:
+def _time_law_errors(linear: LinearModel) -> RepeatingError | None:
     """That of the flange in time."""
-    law = clear_time_law(linear)
+    law = significant_time_law(linear)
     if law is None:
         return None
     factor, curve = law.log_bayes_factor, time_curve(law)
-    return Unnamed(law.course.words, factor, joints=False, of_one=True, curve=curve, process=law.fitted)
+    return RepeatingError(law.course.words, factor, joints=False, of_one=True, curve=curve, process=law.fitted)
 
 
-def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
+def _likelier_errors(joint: RepeatingError | None, time: RepeatingError | None) -> RepeatingError | None:
     """Of a joint's law and one in time, which can stand in for each other; both where 20 to 1 tells neither."""
     found = sorted((u for u in (joint, time) if u is not None), key=lambda u: -u.log_bayes_factor)
     if len(found) == 2 and found[0].log_bayes_factor - found[1].log_bayes_factor < ODDS:
@@ -106,16 +106,16 @@ def _likelier(joint: Unnamed | None, time: Unnamed | None) -> Unnamed | None:
     return found[0] if found else None
 
 
-def _course(linear: LinearModel) -> tuple[Unnamed, ...]:
+def _course_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     """Where poses count as scattering independently."""
-    course = clear_course(linear)
+    course = significant_course(linear)
     if course is None:
         return ()
-    words = _TIME if course.joint is None else f"{_JOINTS}, joint {course.joint} above all"
-    return (Unnamed(words, course.log_bayes_factor, course.joint is not None, process=course),)
+    words = _WANDER_IN_TIME if course.joint is None else f"{_FOLLOW_JOINTS}, joint {course.joint} above all"
+    return (RepeatingError(words, course.log_bayes_factor, course.joint is not None, process=course),)
 
 
-def _gain(linear: LinearModel, deviance: float) -> float:
+def _log_evidence_gain(linear: LinearModel, deviance: float) -> float:
     return 0.5 * (deviance - linear.null.deviance)
 
 
@@ -124,7 +124,7 @@ def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     assert linear.pose_errors is not None and linear.mixed.further is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     every = np.append(np.ones(NOISE + 1, bool), keep)
-    further = linear.mixed.further.of(keep)
+    further = linear.mixed.further.select(keep)
     mixed = replace(linear.mixed, components=linear.mixed.components[every], further=further)
     plain = np.append(linear.scatter_only.null.variances, 1e-2 * further.scales**2)
     return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import WORTH
+from stitch.diagnosis.thresholds import MAX_REMAINING_SHARE
 from stitch.frames import Array
-from stitch.observations.linear_model import LinearModel, Trial
-from stitch.observations.response import Prior
-from stitch.statistics.shares import share_of
+from stitch.observations.linear_model import LinearModel, LinearTrial
+from stitch.observations.response import CoefficientPrior
+from stitch.statistics.shares import mean_square_share
 
 # Of a plausible size: what was not found has some size, or its prior would have none.
-_NOTHING = 1e-6
+_NEGLIGIBLE_SQUARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class CrossValidation:
         """True if views left out are predicted better, by more than folds differ."""
         return self.poses <= 1 - self.poses_sigma
 
-    def idle(self, name: str) -> str | None:
+    def rejection_reason(self, name: str) -> str | None:
         """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
-        if self.helps and self.poses <= WORTH:
+        if self.helps and self.poses <= MAX_REMAINING_SHARE:
             return None
         share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
         return f"{name} hardly helps on views left out (mean square error {share} of without)"
@@ -45,37 +45,37 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     are predicted, beside everything else that poses may err by.
     """
     fitted = linear.scatter_only
-    beside = scored.beside or linear
-    trial, shares, weights, scatter = _left_out(beside, scored)
+    beside = scored.base_model or linear
+    trial, shares, weights, scatter = _residual_shares_by_fold(beside, scored)
     whole = trial
     if beside is not fitted:
-        whole, shares, weights, _ = _left_out(fitted, score(fitted, scored.candidate))
-    poses, poses_sigma = share_of(*scatter)
-    present = fitted.present
+        whole, shares, weights, _ = _residual_shares_by_fold(fitted, score(fitted, scored.candidate))
+    poses, poses_sigma = mean_square_share(*scatter)
+    present = fitted.baseline_trial
     return CrossValidation(
         inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
         heldout=float(np.average(shares, weights=weights)),
         poses=poses,
         poses_sigma=poses_sigma,
-        steadiness=_steadiness(beside, trial, _columns(beside, scored), trial.solve()),
+        steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
     )
 
 
-def _columns(linear: LinearModel, scored: Score) -> Array:
+def _model_and_candidate_columns(linear: LinearModel, scored: Score) -> Array:
     """(·, a + k) response to the model and the candidate."""
     return np.hstack([linear.design, scored.form.response])
 
 
-def _left_out(linear: LinearModel, scored: Score) -> tuple[Trial, list[float], list[float], Array]:
+def _residual_shares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, list[float], list[float], Array]:
     """The fit with a candidate; per fold the share of its squares that a fit without it leaves, their weights, and
     (2, G) scatter of its poses."""
-    X, points = _columns(linear, scored), scored.candidate.points
-    own = None if points is None else points.of(scored.form.keep)
-    trial, present = linear.trial(X, own), linear.present
-    believed = linear.trial(X, own, believed_size(linear, scored))
+    X, points = _model_and_candidate_columns(linear, scored), scored.candidate.points
+    own = None if points is None else points.select(scored.form.keep)
+    trial, present = linear.trial(X, own), linear.baseline_trial
+    believed = linear.trial(X, own, prior_of_sizes(linear, scored))
     shares, weights, scatter = [], [], np.zeros((2, 0))
     for fold in linear.observation.folds():
-        touched = linear.observation.touched(fold)
+        touched = linear.observation.affected_squares(fold)
         without = [t.solve(fold) for t in (believed, present)]
         squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
         shares.append(squares[0] / max(squares[1], 1e-300))
@@ -85,7 +85,7 @@ def _left_out(linear: LinearModel, scored: Score) -> tuple[Trial, list[float], l
     return trial, shares, weights, scatter
 
 
-def believed_size(linear: LinearModel, scored: Score) -> Prior:
+def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
     """Prior for model and candidate in fits without some views.
 
     Views that carry most of an effect leave little to predict it from where they are left out. So without them the
@@ -93,12 +93,12 @@ def believed_size(linear: LinearModel, scored: Score) -> Prior:
     left to see does not count for more than that.
     """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
-    size = np.maximum(size, _NOTHING * scored.form.sizes)
+    size = np.maximum(size, _NEGLIGIBLE_SQUARE * scored.form.sizes)
     precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
-    return Prior(precision, np.zeros(len(precision)))
+    return CoefficientPrior(precision, np.zeros(len(precision)))
 
 
-def _steadiness(linear: LinearModel, trial: Trial, X: Array, whole: Array) -> float:
+def _steadiness(linear: LinearModel, trial: LinearTrial, X: Array, whole: Array) -> float:
     """A combination of parameters that one view carries alone vanishes without it."""
     size = X.shape[1] - linear.design.shape[1]
     theta = whole[-size:]

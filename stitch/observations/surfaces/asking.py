@@ -13,11 +13,11 @@ from stitch.measurement.scan import Scan
 # Two patches whose normals differ by more than 45° are not the same surface.
 _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Some of a view's sampled points.
-Part = tuple[int, slice]
+QueryPart = tuple[int, slice]
 
 
 @dataclass(frozen=True)
-class Asking:
+class NeighbourQueries:
     """V views under one set of poses, and n points of each that look for partners."""
 
     scans: Sequence[Scan]
@@ -26,12 +26,12 @@ class Asking:
     points: list[Array]  # per view (n, 3), reference frame
     normals: list[Array]  # per view (n, 3), reference frame
 
-    def together(self, parts: Sequence[Part]) -> tuple[Indices, Array, Array]:
+    def gather(self, parts: Sequence[QueryPart]) -> tuple[Indices, Array, Array]:
         """Index, point and normal of some points of several views, one view after the other."""
         points, normals = (np.concatenate([own[v][at] for v, at in parts]) for own in (self.points, self.normals))
         return np.concatenate([self.index[v][at] for v, at in parts]), points, normals
 
-    def lengths(self, parts: Sequence[Part]) -> list[int]:
+    def counts(self, parts: Sequence[QueryPart]) -> list[int]:
         """How many points each part holds."""
         return [len(range(*at.indices(len(self.index[v])))) for v, at in parts]
 
@@ -53,8 +53,10 @@ class Asking:
         return distance, partner, found & scan.usable[partner] & (cosine > _NORMAL_COSINE)
 
 
-def asking(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> Asking:
+def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
     """Sampled points of every view under T_reference_scanner (V, 4, 4)."""
     every = list(zip(scans, poses, samples, strict=True))
     points = [frames.transform(T, scan.points[index]) for scan, T, index in every]
-    return Asking(scans, poses, samples, points, [frames.rotate(T, scan.normals[index]) for scan, T, index in every])
+    return NeighbourQueries(
+        scans, poses, samples, points, [frames.rotate(T, scan.normals[index]) for scan, T, index in every]
+    )

@@ -10,16 +10,16 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model
 from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term
-from stitch.observations.surfaces.errors_by_view import CHANGING, SAME, by_view
+from stitch.observations.surfaces.errors_by_view import PER_VIEW, SHARED, view_error_likelihood
 from stitch.observations.surfaces.field_map import FieldMap, field_map
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.point_gram import PointGram, seen_twists
-from stitch.observations.surfaces.scanner_field import ALARM_SHARE, alike
-from stitch.observations.surfaces.shown_errors import SHARES, ShownErrors
-from stitch.observations.surfaces.smooth_errors import COARSE, smooth_sums
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.point_gram import PointGram, apparent_twists
+from stitch.observations.surfaces.scanner_field import ALARM_SHARE, shared_error_likelihood
+from stitch.observations.surfaces.shown_errors import SHARE_BOUNDS, SmoothErrorLikelihood
+from stitch.observations.surfaces.smooth_errors import COARSE, sum_smooth_errors
 from stitch.statistics.tails import chi2_tail
 
-_ORDERS = 999
+_PERMUTATIONS = 999
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class FieldError:
     """Errors along the ray that are smooth over the scanner's field; rms in length_unit, 0 where not unusual."""
 
     rms: float  # of what is the same in every view
-    changing: float  # of what every view has for itself
+    rms_by_view: float  # of what every view has for itself
     gain: float  # nats by which the clearer of both is likelier than the largest that every scanner has
     over_noise: bool  # one of the two is more systematic than random
     by_view: bool = False  # the second is the clearer
@@ -37,28 +37,34 @@ class FieldError:
     @property
     def unusual(self) -> bool:
         """Larger than every scanner's."""
-        return self.rms > 0 or self.changing > 0
+        return self.rms > 0 or self.rms_by_view > 0
 
 
 def field_error(
-    measurement: Measurement, model: Model, freed: FreePoses, alpha: float, beside: Sequence[Term] = ()
+    measurement: Measurement,
+    model: Model,
+    unconstrained: UnconstrainedPoses,
+    alpha: float,
+    nuisance_effects: Sequence[Term] = (),
 ) -> FieldError:
     """What the overlaps show of it; what it exceeds at the level `alpha`.
 
     Args:
-        beside: effects of points that may have any size there.
+        nuisance_effects: effects of points that may have any size there.
     """
-    sums, noise = smooth_sums(measurement, freed, PointSlopes.of(measurement, model, beside), apart=True)
+    sums, noise = sum_smooth_errors(
+        measurement, unconstrained, PointSlopes.about_model(measurement, model, nuisance_effects), per_view=True
+    )
     if not np.isfinite(noise):
         return FieldError(0.0, 0.0, 0.0, over_noise=False)
-    further = sum(len(term.parameters) for term in beside)
-    apart = by_view(sums, freed, noise, further)
+    further = sum(len(term.parameters) for term in nuisance_effects)
+    apart = view_error_likelihood(sums, unconstrained, noise, further)
     # Two questions, each at half of the level.
-    changing = _size(apart, CHANGING, alpha / 2)
+    changing = _cause_size(apart, PER_VIEW, alpha / 2)
     # What all views have in common comes first: large errors of that kind move points to other partners, which looks
     # like errors of single views.
-    alone = changing.share > 0 and changing.gain > _gain_of_common(apart)
-    same = _size(apart if alone else _coarse(sums, freed, noise, further), SAME, alpha / 2)
+    alone = changing.share > 0 and changing.gain > _shared_error_gain(apart)
+    same = _cause_size(apart if alone else _coarse_likelihood(sums, unconstrained, noise, further), SHARED, alpha / 2)
     own = alone or (changing.share > 0 and not same.share)
     return FieldError(
         noise * same.share,
@@ -66,13 +72,13 @@ def field_error(
         max(same.gain, changing.gain),
         same.over_noise or changing.over_noise,
         own,
-        changing.share > 0 and _with_time(apart.estimate(CHANGING, changing.shares), alpha),
-        field_map(measurement, sums, freed, noise, further) if same.share and not own else None,
+        changing.share > 0 and _follows_time(apart.estimate(PER_VIEW, changing.shares), alpha),
+        field_map(measurement, sums, unconstrained, noise, further) if same.share and not own else None,
     )
 
 
 @dataclass(frozen=True)
-class _Size:
+class _CauseSize:
     """Of errors of one cause, in units of the noise."""
 
     share: float  # 0 where not unusual
@@ -81,50 +87,54 @@ class _Size:
     over_noise: bool
 
 
-def _size(shown: ShownErrors, cause: int, alpha: float) -> _Size:
+def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> _CauseSize:
     """The likeliest size of errors of one cause beside the others, if it is unusual."""
 
     def clear(gain: float) -> bool:
         # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         return 0.5 * chi2_tail(2 * gain, 1) < alpha
 
-    shares, free = shown.likeliest(_most(shown, {}))
+    shares, free = likelihood.ml_shares(_share_limits(likelihood, {}))
 
     def nats(share: float) -> float:
-        return 0.5 * (shown.likeliest(_most(shown, {cause: share}))[1] - free)
+        return 0.5 * (likelihood.ml_shares(_share_limits(likelihood, {cause: share}))[1] - free)
 
     gain = nats(ALARM_SHARE)
     if not clear(gain):
-        return _Size(0.0, shares, gain, over_noise=False)
-    return _Size(float(shares[cause]), shares, gain, clear(nats(1.0)))
+        return _CauseSize(0.0, shares, gain, over_noise=False)
+    return _CauseSize(float(shares[cause]), shares, gain, clear(nats(1.0)))
 
 
-def _gain_of_common(apart: ShownErrors) -> float:
+def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
     """Nats that errors of all views gain over usual ones where those of single views are usual."""
-    usual = {CHANGING: ALARM_SHARE}
-    deviances = [apart.likeliest(_most(apart, limits))[1] for limits in (usual | {SAME: ALARM_SHARE}, usual)]
+    usual = {PER_VIEW: ALARM_SHARE}
+    deviances = [
+        likelihood.ml_shares(_share_limits(likelihood, limits))[1] for limits in (usual | {SHARED: ALARM_SHARE}, usual)
+    ]
     return 0.5 * (deviances[0] - deviances[1])
 
 
-def _most(shown: ShownErrors, limits: dict[int, float]) -> list[float]:
+def _share_limits(likelihood: SmoothErrorLikelihood, limits: dict[int, float]) -> list[float]:
     """The largest share of each cause."""
-    return [limits.get(cause, SHARES[1]) for cause in range(len(shown.told))]
+    return [limits.get(cause, SHARE_BOUNDS[1]) for cause in range(len(likelihood.design))]
 
 
-def _coarse(sums: PointGram, freed: FreePoses, noise: float, beside: int) -> ShownErrors:
+def _coarse_likelihood(
+    sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int
+) -> SmoothErrorLikelihood:
     """The same in every view, without the finer ones: what is known of it where no view has errors for itself."""
-    together = sums.together(apart=COARSE)
+    together = sums.merge_sides(per_view=COARSE)
     column = np.arange(together.residual.shape[1])
-    coarse = together.of((column <= COARSE) | (column >= len(column) - beside))
-    return alike(coarse, seen_twists(coarse, freed), freed, noise, beside)
+    coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
+    return shared_error_likelihood(coarse, apparent_twists(coarse, unconstrained), unconstrained, noise, nuisance)
 
 
-def _with_time(errors: Array, alpha: float) -> bool:
+def _follows_time(errors: Array, alpha: float) -> bool:
     """True where errors of the views, part after part, follow their order more than other orders would have it."""
     parts = len(errors) // COARSE
     errors = errors.reshape(parts, -1)
     order = np.arange(parts) - (parts - 1) / 2
     generator = np.random.default_rng(parts)
-    others = np.array([generator.permutation(order) for _ in range(_ORDERS)])
+    others = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
     trend = np.linalg.norm(order @ errors)
-    return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _ORDERS) < alpha)
+    return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS) < alpha)

@@ -13,25 +13,25 @@ import numpy as np
 
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
 from stitch.observations.surfaces.overlaps import Overlaps
-from stitch.observations.surfaces.point_gram import PointGram, seen_twists
-from stitch.observations.surfaces.scanner_field import alike
-from stitch.observations.surfaces.shown_errors import SHARES, ShownErrors
-from stitch.observations.surfaces.smooth_errors import COARSE, FINE, half_field, over_field
+from stitch.observations.surfaces.point_gram import PointGram, apparent_twists
+from stitch.observations.surfaces.scanner_field import shared_error_likelihood
+from stitch.observations.surfaces.shown_errors import SHARE_BOUNDS, SmoothErrorLikelihood
+from stitch.observations.surfaces.smooth_errors import COARSE, FINE, half_field, legendre_products
 from stitch.statistics.identifiability import project_out
 from stitch.statistics.robust import tukey
 
 # Places along either way across the field.
-_PLACES = 25
+_GRID_PLACES = 25
 # A place is drawn where the scans have at least this share of the points that it would have if all were spread evenly.
-_SEEN = 0.05
+_MIN_POINT_DENSITY = 0.05
 # Of what smooth errors leave in the overlaps, squared: the share that those along the ray over the field have to
 # explain. Axes askew or of another scale leave less than 0.2 to them, laws along the ray more than 0.8.
-_MOST = 0.7
+_MIN_FIELD_SHARE = 0.7
 # Maps of simulated scanners were off by 1.2 to 2.2 times what chance alone makes of them: normals are measured too, and
 # a scanner's law is no polynomial.
-_BEYOND_CHANCE = 2.0
+_SIGMA_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,43 +55,47 @@ class FieldMap:
 
 
 def field_map(
-    measurement: Measurement, sums: PointGram, freed: FreePoses, noise: float, beside: int = 0
+    measurement: Measurement, sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
 ) -> FieldMap | None:
     """The likeliest error, as far as the overlaps tell it; None where it is not most of what they show.
 
     Args:
         sums: of `smooth_sums`, apart.
         noise: of the scanner, length_unit.
-        beside: so many of the last parameters may have any size.
+        nuisance: so many of the last parameters may have any size.
     """
-    shown, sizes = _likeliest(_coarse_and_fine(sums, freed, noise, beside))
+    shown, sizes = _merge_coarse_fine(_coarse_fine_likelihood(sums, unconstrained, noise, nuisance))
     values = shown.estimate(0, np.ones(2))
-    if _share_along(shown, values) < _MOST:
+    if _field_share(shown, values) < _MIN_FIELD_SHARE:
         return None
-    half, forward = half_field(measurement), _forward(measurement)
-    x, y = (np.linspace(-h, h, _PLACES) for h in half)
-    seen = _seen(measurement, x, y, forward)
+    half, forward = half_field(measurement), _viewing_sign(measurement)
+    x, y = (np.linspace(-h, h, _GRID_PLACES) for h in half)
+    seen = _observed_places(measurement, x, y, forward)
     a, b = (way[seen] for way in np.meshgrid(x, y))
     rays = np.stack([a, b, np.ones_like(a)], axis=1)
     # Coarse ones stand for what undoes the error, finer ones for the error itself.
-    size = np.where(np.arange(FINE) < COARSE, -1.0, 1.0) * sizes[:FINE] * noise / kept_share(freed.overlaps)
-    shapes = np.array(over_field(rays * [forward, forward, 1.0], half)).T * size
+    size = (
+        np.where(np.arange(FINE) < COARSE, -1.0, 1.0) * sizes[:FINE] * noise / robust_pass_share(unconstrained.overlaps)
+    )
+    shapes = np.array(legendre_products(rays * [forward, forward, 1.0], half)).T * size
     shapes = project_out(np.column_stack([rays, a**2 + b**2]), shapes)
     error, sigma = (np.full(seen.shape, np.nan) for _ in range(2))
     error[seen] = shapes @ values[:FINE]
-    sigma[seen] = _BEYOND_CHANCE * np.sqrt(np.sum((shapes @ shown.left(0, np.ones(2))[:FINE, :FINE]) * shapes, axis=1))
+    sigma[seen] = _SIGMA_FACTOR * np.sqrt(
+        np.sum((shapes @ shown.posterior_covariance(0, np.ones(2))[:FINE, :FINE]) * shapes, axis=1)
+    )
     return FieldMap(x, y, error, sigma)
 
 
-def _share_along(shown: ShownErrors, values: Array) -> float:
+def _field_share(likelihood: SmoothErrorLikelihood, values: Array) -> float:
     """How much of what the errors (K,) leave in the overlaps, squared, those along the ray over the field explain."""
-    whole = shown.told[0] @ values
-    rest = whole - shown.told[0][:, :FINE] @ values[:FINE]
-    squares = [float(np.sum(left**2 / shown.scatter)) for left in (rest, whole)]
+    whole = likelihood.design[0] @ values
+    rest = whole - likelihood.design[0][:, :FINE] @ values[:FINE]
+    squares = [float(np.sum(left**2 / likelihood.scatter)) for left in (rest, whole)]
     return 1 - squares[0] / squares[1] if squares[1] > 0 else 0.0
 
 
-def kept_share(overlaps: Overlaps) -> float:
+def robust_pass_share(overlaps: Overlaps) -> float:
     """How much of a small error robust weights let through, as a share of what fixed weights would.
 
     They fall as the error grows: Σ dψ/de over Σ ψ/e of Tukey's ψ (Huber & Ronchetti 2009, 7.6), 0.83 for normal noise.
@@ -102,34 +106,36 @@ def kept_share(overlaps: Overlaps) -> float:
     return float(np.sum(weight * root * (5 * root - 4)) / np.sum(weight * root**2))
 
 
-def _coarse_and_fine(sums: PointGram, freed: FreePoses, noise: float, beside: int) -> ShownErrors:
+def _coarse_fine_likelihood(
+    sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int
+) -> SmoothErrorLikelihood:
     """What the overlaps show of errors that all views share: coarse over the field, finer, and over incidence."""
-    together = sums.together(apart=COARSE)
+    together = sums.merge_sides(per_view=COARSE)
     column = np.arange(together.residual.shape[1])
     # The one over incidence stands after the coarse ones; it is to come last.
     order: Any = np.concatenate(
-        [np.delete(column[: len(column) - beside], COARSE), [COARSE], column[len(column) - beside :]]
+        [np.delete(column[: len(column) - nuisance], COARSE), [COARSE], column[len(column) - nuisance :]]
     )
-    shared = together.of(order)
-    shown = alike(shared, seen_twists(shared, freed), freed, noise, beside)
-    field, incidence = shown.told
-    return replace(shown, told=(field[:, :COARSE], field[:, COARSE:], incidence))
+    shared = together.select(order)
+    shown = shared_error_likelihood(shared, apparent_twists(shared, unconstrained), unconstrained, noise, nuisance)
+    field, incidence = shown.design
+    return replace(shown, design=(field[:, :COARSE], field[:, COARSE:], incidence))
 
 
-def _likeliest(shown: ShownErrors) -> tuple[ShownErrors, Array]:
+def _merge_coarse_fine(likelihood: SmoothErrorLikelihood) -> tuple[SmoothErrorLikelihood, Array]:
     """Coarse and finer errors as one cause of unit size beside incidence, and the sizes (K,) that they have."""
-    shares = shown.likeliest([SHARES[1]] * len(shown.told))[0]
-    coarse, fine, incidence = (share * told for share, told in zip(shares, shown.told, strict=True))
+    shares = likelihood.ml_shares([SHARE_BOUNDS[1]] * len(likelihood.design))[0]
+    coarse, fine, incidence = (share * told for share, told in zip(shares, likelihood.design, strict=True))
     sizes = np.repeat(shares[:2], [coarse.shape[1], fine.shape[1]])
-    return replace(shown, told=(np.hstack([coarse, fine]), incidence)), sizes
+    return replace(likelihood, design=(np.hstack([coarse, fine]), incidence)), sizes
 
 
-def _forward(measurement: Measurement) -> float:
+def _viewing_sign(measurement: Measurement) -> float:
     """1 where the scanner looks along its z, −1 where against it."""
     return float(np.sign(np.median([np.median(scan.points[:, 2] - scan.eye[2]) for scan in measurement.capture.scans])))
 
 
-def _seen(measurement: Measurement, x: Array, y: Array, forward: float) -> Mask:
+def _observed_places(measurement: Measurement, x: Array, y: Array, forward: float) -> Mask:
     """(Y, X) True at places about which the scans have points."""
     edges = [np.append(at, at[-1] + at[1] - at[0]) - (at[1] - at[0]) / 2 for at in (y, x)]
     counts = np.zeros((len(y), len(x)))
@@ -137,4 +143,4 @@ def _seen(measurement: Measurement, x: Array, y: Array, forward: float) -> Mask:
         away = scan.points - scan.eye
         slopes = forward * away[:, :2] / away[:, 2:]
         counts += np.histogram2d(slopes[:, 1], slopes[:, 0], bins=edges)[0]
-    return np.asarray(counts > _SEEN * counts.mean())
+    return np.asarray(counts > _MIN_POINT_DENSITY * counts.mean())

@@ -13,9 +13,9 @@ from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.gram import Gram, assemble
-from stitch.observations.surfaces.match import sample
-from stitch.observations.surfaces.moved_views import LastStep, as_displacements, moved, settled
-from stitch.observations.surfaces.overlaps import Overlaps, collect, next_gate
+from stitch.observations.surfaces.match import sample_points
+from stitch.observations.surfaces.moved_views import LastStep, displacement_factors, has_converged, take_step
+from stitch.observations.surfaces.overlaps import Overlaps, collect_overlaps, next_gate
 
 # Queries per view.
 SAMPLES = 1500
@@ -30,20 +30,20 @@ _NULL = 1e-5
 
 
 @dataclass(frozen=True)
-class FreePoses:
+class UnconstrainedPoses:
     """Views moved by overlaps and common targets alone."""
 
     poses: Array  # (V, 4, 4) T_reference_scanner
     twists: Array  # (V, 6) about the centre of `overlaps.gram`: from the model's poses to these
     overlaps: Overlaps  # at `poses`
 
-    def seen_from(self, model_poses: Array) -> "FreePoses":
+    def relative_to(self, model_poses: Array) -> "UnconstrainedPoses":
         """The same views against another model, (V, 4, 4): where they are freed to does not depend on it."""
         to_centre = frames.make(np.eye(3), -self.overlaps.gram.centre)
         return replace(self, twists=frames.log(to_centre @ self.poses @ frames.inverse(to_centre @ model_poses)))
 
 
-def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
+def unconstrained_poses(capture: Capture, model_poses: Array, gate: float) -> UnconstrainedPoses:
     """Move all views until overlaps and common targets agree, without regard to the robot.
 
     Args:
@@ -53,18 +53,18 @@ def free_poses(capture: Capture, model_poses: Array, gate: float) -> FreePoses:
     Raises:
         NoResultError: no two views overlap.
     """
-    picked = [sample(scan, SAMPLES) for scan in capture.scans]
+    picked = [sample_points(scan, SAMPLES) for scan in capture.scans]
     poses = np.array(model_poses)
-    overlaps = collect(capture, poses, gate, picked)
+    overlaps = collect_overlaps(capture, poses, gate, picked)
     last: LastStep = None
     for _ in range(_MAXIMUM_ITERATIONS):
         step = visible_step(overlaps.gram)
-        if settled(overlaps.gram, step, _CONVERGED):
+        if has_converged(overlaps.gram, step, _CONVERGED):
             break
-        poses, last = moved(poses, overlaps.gram, step, last)
+        poses, last = take_step(poses, overlaps.gram, step, last)
         gate = min(gate, next_gate(overlaps, capture))
-        overlaps = collect(capture, poses, gate, picked, overlaps)
-    return FreePoses(poses, np.zeros((len(poses), 6)), overlaps).seen_from(model_poses)
+        overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
+    return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps).relative_to(model_poses)
 
 
 def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
@@ -72,17 +72,17 @@ def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
 
     Twists are scale · U · z: rotations count as displacements at the correspondences' lever.
     """
-    scale = np.tile(1 / as_displacements(g), g.views)
-    values, vectors = _strong(_scaled(g, ~g.labelled, scale), _NEAR_NULL)
+    scale = np.tile(1 / displacement_factors(g), g.views)
+    values, vectors = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)
     if g.labelled.any():
-        targets = _scaled(g, g.labelled, scale)
-        basis = np.hstack([vectors, _seen_by_targets(targets, vectors)])
+        targets = _scaled_hessian(g, g.labelled, scale)
+        basis = np.hstack([vectors, _target_only_directions(targets, vectors)])
         values, within = np.linalg.eigh(basis.T @ ((vectors * values) @ vectors.T + targets) @ basis)
         vectors = basis @ within
     return values, vectors, scale
 
 
-def _seen_by_targets(H: Array, vectors: Array) -> Array:
+def _target_only_directions(H: Array, vectors: Array) -> Array:
     """(6V, k) orthonormal: what targets see of the directions in which surfaces, `vectors` (6V, n), see nothing.
 
     A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
@@ -96,39 +96,39 @@ def _seen_by_targets(H: Array, vectors: Array) -> Array:
 
 def visible_step(g: Gram) -> Array:
     """(V, 6) Gauss–Newton step of all views in the directions that overlaps and targets see."""
-    return -answer(g, g.vector[..., None]).reshape(-1, 6)
+    return -solve_views(g, g.vector[..., None]).reshape(-1, 6)
 
 
-def answer(g: Gram, pulls: Array) -> Array:
+def solve_views(g: Gram, pair_vectors: Array) -> Array:
     """(6V, K) twists H⁺b of the views when pulls (P, 6, K), Σ w Bᵀg, act on the pairs."""
 
     def on_views(keep: Mask) -> Array:
-        b = np.zeros((g.views, 6, pulls.shape[2]))
+        b = np.zeros((g.views, 6, pair_vectors.shape[2]))
         v, w = g.pairs[keep].astype(np.int64).T
-        np.add.at(b, v, pulls[keep])
-        np.subtract.at(b, w, pulls[keep])
+        np.add.at(b, v, pair_vectors[keep])
+        np.subtract.at(b, w, pair_vectors[keep])
         return b.reshape(6 * g.views, -1)
 
-    return answer_of_views(g, on_views(~g.labelled), on_views(g.labelled))
+    return solve_view_sums(g, on_views(~g.labelled), on_views(g.labelled))
 
 
-def answer_of_views(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
+def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
     """(6V, K) the same where pulls on the views are given: (6V, K) of surfaces, and of labelled points."""
     values, vectors, scale = visible_directions(g)
     b, named = scale[:, None] * by_surfaces, scale[:, None] * by_targets
     if g.labelled.any():
         # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
-        seen = _strong(_scaled(g, ~g.labelled, scale), _NEAR_NULL)[1]
+        seen = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)[1]
         b = named + seen @ (seen.T @ b)
     return np.asarray(scale[:, None] * (vectors @ ((vectors.T @ b) / values[:, None])))
 
 
-def _scaled(g: Gram, keep: Mask, scale: Array) -> Array:
+def _scaled_hessian(g: Gram, keep: Mask, scale: Array) -> Array:
     """(6V, 6V) H of some pairs in scaled twists."""
     return np.asarray(assemble(g, keep)[0] * scale[:, None] * scale[None, :])
 
 
-def _strong(H: Array, share: float) -> tuple[Array, Array]:
+def _dominant_eigenpairs(H: Array, share: float) -> tuple[Array, Array]:
     """Eigenvalues above a share of the largest, with their eigenvectors."""
     values, vectors = np.linalg.eigh(H)
     keep = values > share * values[-1]

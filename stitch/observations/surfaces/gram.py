@@ -20,7 +20,7 @@ from stitch.statistics.robust import mad_sigma, tukey
 
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
 RMS_GATE = 4.0
-_OF_PAIRS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
+_PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Gram:
 
     def only(self, keep: Mask) -> "Gram":
         """The sums of some pairs (P,)."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in _OF_PAIRS})
+        return replace(self, **{name: getattr(self, name)[keep] for name in _PAIR_FIELDS})
 
-    def followed_by(self, **sums: Any) -> "Gram":
+    def append(self, **sums: Any) -> "Gram":
         """The sums, and after them those of further pairs of labelled points (P', ...) that have no surface."""
         count = len(sums["pairs"])
         nothing = np.zeros(count)
@@ -64,7 +64,9 @@ class Gram:
             "raw_square": nothing,
             "labelled": nothing == 0,
         }
-        joined: dict[str, Any] = {name: np.concatenate([getattr(self, name), everything[name]]) for name in _OF_PAIRS}
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), everything[name]]) for name in _PAIR_FIELDS
+        }
         return replace(self, **joined)
 
     @property
@@ -87,13 +89,13 @@ def gram(
     Args:
         centre: (3,) about which twists of the views count, reference frame.
     """
-    rows = [_accumulate(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
+    rows = [_pair_sums(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
     sums = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     pairs = np.array([(m.v, m.w) for m in matches])
     return Gram(views=views, pairs=pairs, scale=scale, centre=centre, labelled=np.zeros(len(pairs), bool), **sums)
 
 
-def _accumulate(m: Match, centre: Array, scale: float, weight: Array | None) -> dict[str, Any]:
+def _pair_sums(m: Match, centre: Array, scale: float, weight: Array | None) -> dict[str, Any]:
     """The sums over one pair, by their names in `Gram`."""
     e = m.residual
     if weight is None:

@@ -14,13 +14,13 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.error_model import WHITE
-from stitch.observations.pose_errors import PoseErrors, white
+from stitch.observations.error_model import WHITE_COMPONENTS
+from stitch.observations.pose_errors import PoseErrors, white_scatter_only
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.hand_eye_solution import Columns, Solution, solved
-from stitch.observations.surfaces.pose_channel import Repeatability, estimate
-from stitch.observations.surfaces.rig_model import rig_model
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.hand_eye_solution import FittedEffects, HandEyeSolution, solve_hand_eye
+from stitch.observations.surfaces.pose_channel import Repeatability, estimate_repeatability
+from stitch.observations.surfaces.rig_model import stack_captures
 from stitch.statistics.variance_components import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 
@@ -31,7 +31,7 @@ _PLUG_IN = 300
 
 
 @dataclass(frozen=True)
-class HandEye:
+class HandEyeFit:
     """Hand-eye and its statistics; twists are right perturbations T·exp(ξ), rotation first."""
 
     T_mount: Array  # (4, 4) T_mount_scanner
@@ -53,50 +53,52 @@ class HandEye:
 
 def fit_hand_eye(
     captures: Sequence[Capture],
-    freed: Sequence[FreePoses],
+    unconstrained: Sequence[UnconstrainedPoses],
     T_mount: Array,
-    columns: Columns | None = None,
-    repeating: Mapping[str, Sequence[Array]] | None = None,
+    columns: FittedEffects | None = None,
+    scanner_errors: Mapping[str, Sequence[Array]] | None = None,
     errors: PoseErrors | None = None,
-) -> HandEye:
+) -> HandEyeFit:
     """Generalised least squares over the pose channels of all captures; covariance under all errors of the poses.
 
     Args:
-        freed: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
+        unconstrained: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
         T_mount: (4, 4) hand-eye at which that began.
         columns: effects to fit with it.
-        repeating: by source, per capture (6V, K) twists that the views show for one standard deviation of each of K
+        scanner_errors: by source, per capture (6V, K) twists that the views show for one standard deviation of each of K
             errors that all views and captures have in common; they widen the covariance and change nothing else.
         errors: how the poses may err beside white scatter; None: they do not. What joints do anew is not counted: on
             average the scatter of the flange that views show holds it already.
     """
-    found = solved(captures, freed, T_mount, columns)
-    errors = errors or white(sum(len(f.poses) for f in freed))
-    sources = _sources(found, errors.that_repeats(), repeating or {})
+    found = solve_hand_eye(captures, unconstrained, T_mount, columns)
+    errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
+    sources = _variance_sources(found, errors.repeating_only(), scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
-    return HandEye(
+    return HandEyeFit(
         T_mount=T_mount @ frames.exp(found.x[:6]),
         covariance=covariance[:6, :6],
-        inflation=_inflation(covariance, found.weighed.covariance),
+        inflation=_covariance_inflation(covariance, found.gls.covariance),
         repeatability=found.scatter,
-        heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.pull), found.x),
-        rotation_shares=_shares(sources, slice(0, 3)),
-        position_shares=_shares(sources, slice(3, 6)),
+        heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.prior_vector), found.x),
+        rotation_shares=_source_shares(sources, slice(0, 3)),
+        position_shares=_source_shares(sources, slice(3, 6)),
         values=found.values + found.x[6:],
         values_covariance=covariance[6:, 6:],
     )
 
 
-def _sources(found: Solution, errors: PoseErrors, repeating: Mapping[str, Sequence[Array]]) -> dict[str, Array]:
+def _variance_sources(
+    found: HandEyeSolution, errors: PoseErrors, scanner_errors: Mapping[str, Sequence[Array]]
+) -> dict[str, Array]:
     """What each source does to the covariance (6 + P, 6 + P)."""
-    rig, weighed = found.rig, found.weighed
+    rig, weighed = found.rig, found.gls
     mixed = rig.mixed(errors)
     sizes = fit_variances(mixed, both_starts=True)
     mean = sizes.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, sizes)
-    names = (*WHITE, *errors.names)
+    names = (*WHITE_COMPONENTS, *errors.names)
     components = zip(names, mean, mixed.components[:, 0], strict=True)
     sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in components}
-    for name, twists in repeating.items():
+    for name, twists in scanner_errors.items():
         repeated = weighed.gain @ rig.reduce(twists)
         sources[name] = repeated @ repeated.T
     # The rest is what the prior leaves where nothing is seen.
@@ -104,22 +106,24 @@ def _sources(found: Solution, errors: PoseErrors, repeating: Mapping[str, Sequen
     return sources
 
 
-def _inflation(covariance: Array, alone: Array) -> float:
-    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(alone)[1]
+def _covariance_inflation(covariance: Array, independent: Array) -> float:
+    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(independent)[1]
     return float(max(1.0, np.exp(ratio / len(covariance))))
 
 
-def _shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
+def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
     """Of every source in the variance of some axes of the hand-eye together."""
     own = {name: float(np.trace(matrix[axes, axes])) for name, matrix in sources.items()}
     return {name: square / max(sum(own.values()), 1e-300) for name, square in own.items()}
 
 
-def scatter_of(capture: Capture, freed: FreePoses, T_mount: Array) -> Repeatability:
+def capture_repeatability(capture: Capture, unconstrained: UnconstrainedPoses, T_mount: Array) -> Repeatability:
     """The repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
     nothing = np.zeros((6 * len(capture.scans), 0))
-    own = CaptureEvidence(capture, freed.overlaps.gram, freed.twists, capture.hand_eye_frames(T_mount), nothing)
-    return estimate(own.channel)
+    own = CaptureEvidence(
+        capture, unconstrained.overlaps.gram, unconstrained.twists, capture.hand_eye_frames(T_mount), nothing
+    )
+    return estimate_repeatability(own.reduced_poses)
 
 
 def _heldout_ratio(
@@ -137,7 +141,7 @@ def _heldout_ratio(
             rest = [(o, s) for i, (o, s) in enumerate(zip(parts, scatter, strict=True)) if i != k]
             rest += [(fewer, scatter[k])] if len(fewer.gram.pairs) else []
             if rest:
-                rig = rig_model([o for o, _ in rest])
-                left_out = rig.weighed([s for _, s in rest], prior[0]).solve(rig.z, prior[1])
+                rig = stack_captures([o for o, _ in rest])
+                left_out = rig.fit_gls([s for _, s in rest], prior[0]).solve(rig.z, prior[1])
                 outside += e.squares(fold, (left_out, x))
     return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")

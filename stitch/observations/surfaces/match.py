@@ -8,8 +8,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, evenly
-from stitch.observations.surfaces.asking import Asking, Part, asking
+from stitch.measurement.scan import Scan, even_indices
+from stitch.observations.surfaces.asking import NeighbourQueries, QueryPart, neighbour_queries
 from stitch.system.threads import parallel
 
 # Views in which one point of another view is asked for.
@@ -29,7 +29,7 @@ class Match:
     index_v: Indices  # (M,) point of view v
     index_w: Indices  # (M,) point of view w
 
-    def part(self, at: slice) -> "Match":
+    def subset(self, at: slice) -> "Match":
         """Some of them."""
         return Match(self.v, self.w, *(value[at] for value in self.columns))
 
@@ -38,21 +38,21 @@ class Match:
         """All arrays, in the order of the fields."""
         return list(vars(self).values())[2:]
 
-    def turned(self) -> "Match":
+    def swapped(self) -> "Match":
         """The same as the other view sees it."""
         return replace(self, v=self.w, w=self.v, residual=-self.residual, index_v=self.index_w, index_w=self.index_v)
 
 
-def sample(scan: Scan, count: int) -> Indices:
+def sample_points(scan: Scan, count: int) -> Indices:
     """(n,) indices of at most `count` usable points, evenly over the scan order; the same every time."""
     usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
     if len(usable) <= count:
         return usable
-    picked: Indices = usable[evenly(len(usable), count)]
+    picked: Indices = usable[even_indices(len(usable), count)]
     return picked
 
 
-def match(
+def match_pairs(
     scans: Sequence[Scan],
     poses: Array,
     pairs: Sequence[tuple[int, int]],
@@ -70,19 +70,19 @@ def match(
         samples: per view the indices that search (see `sample`).
     """
     turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
-    parts = [list[Part]() for _ in scans]
+    parts = [list[QueryPart]() for _ in scans]
     for v, w in pairs:
         for a, b in ((v, w), (w, v)):
             parts[b].append((a, slice(b % turns[a], None, turns[a])))
-    every = asking(scans, poses, samples)
-    answers = list(parallel(lambda w: _answers(every, w, parts[w], gate), range(len(scans))))
+    every = neighbour_queries(scans, poses, samples)
+    answers = list(parallel(lambda w: _partners_by_view(every, w, parts[w], gate), range(len(scans))))
     for v, w in pairs:
-        found = [of for of in (answers[w].pop(v), answers[v].pop(w).turned()) if len(of.residual)]
+        found = [of for of in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(of.residual)]
         if found:
             yield Match(v, w, *(np.concatenate(own) for own in zip(*(of.columns for of in found), strict=True)))
 
 
-def distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
+def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
     """(M,) signed distances of all correspondences, v less w along their normals, with the views elsewhere.
 
     Args:
@@ -97,13 +97,13 @@ def distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -
     return np.concatenate(out)
 
 
-def _answers(every: Asking, w: int, parts: Sequence[Part], gate: float) -> dict[int, Match]:
+def _partners_by_view(every: NeighbourQueries, w: int, parts: Sequence[QueryPart], gate: float) -> dict[int, Match]:
     """Per view v that asks, what its points found in view w: all that ask one view are looked for at once."""
     if not parts:
         return {}
-    index, p, n = every.together(parts)
+    index, p, n = every.gather(parts)
     _, partner, accept = every.search(w, p, n, gate)
-    bounds = np.append(0, np.cumsum(accept))[np.append(0, np.cumsum(every.lengths(parts)))]
+    bounds = np.append(0, np.cumsum(accept))[np.append(0, np.cumsum(every.counts(parts)))]
     index, p, partner, scan, T = index[accept], p[accept], partner[accept], every.scans[w], every.poses[w]
     q = frames.transform(T, scan.points[partner])
     normal = n[accept] + frames.rotate(T, scan.normals[partner])

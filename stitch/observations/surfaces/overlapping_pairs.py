@@ -7,10 +7,10 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.measurement.bounding_box import box_of, corners
+from stitch.measurement.bounding_box import bounding_box, box_corners
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.asking import asking
-from stitch.observations.surfaces.match import sample
+from stitch.observations.surfaces.asking import neighbour_queries
+from stitch.observations.surfaces.match import sample_points
 from stitch.system.threads import parallel
 
 # Queries that decide whether two views overlap, and the share that must find a partner.
@@ -26,7 +26,7 @@ def overlapping_pairs(
     Args:
         at_most: points of a view that are probed; more than 250 tell nothing new.
     """
-    every = asking(scans, poses, [sample(scan, min(at_most, _PROBES)) for scan in scans])
+    every = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
 
     def meeting(of_view: tuple[int, list[int]]) -> list[int]:
         """Of the views that ask one view, those of which enough points find a partner."""
@@ -34,8 +34,8 @@ def overlapping_pairs(
         parts = [(v, slice(None)) for v in views if len(every.index[v])]
         if not parts:
             return []
-        _, points, normals = every.together(parts)
-        agree = np.split(every.search(w, points, normals, gate)[2], np.cumsum(every.lengths(parts))[:-1])
+        _, points, normals = every.gather(parts)
+        agree = np.split(every.search(w, points, normals, gate)[2], np.cumsum(every.counts(parts))[:-1])
         return [v for (v, _), own in zip(parts, agree, strict=True) if np.mean(own) >= _MINIMUM_OVERLAP]
 
     def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
@@ -53,7 +53,7 @@ def overlapping_pairs(
 
 def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
     """Pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
-    placed = [frames.transform(T, corners(box_of(scan.points))) for scan, T in zip(scans, poses, strict=True)]
+    placed = [frames.transform(T, box_corners(bounding_box(scan.points))) for scan, T in zip(scans, poses, strict=True)]
     low, high = np.min(placed, axis=1), np.max(placed, axis=1)
     apart = (low[:, None] - high[None] > gate).any(axis=2)
     v, w = np.nonzero(np.triu(~(apart | apart.T), 1))

@@ -11,14 +11,14 @@ from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
 from stitch.measurement.scan import Scan
 from stitch.observations.surfaces.gram import Gram, gram, robust_scale
-from stitch.observations.surfaces.match import Match, match, sample
+from stitch.observations.surfaces.match import Match, match_pairs, sample_points
 from stitch.observations.surfaces.overlapping_pairs import overlapping_pairs
-from stitch.observations.surfaces.target_pairs import TargetPairs, joined, target_pairs
+from stitch.observations.surfaces.target_pairs import TargetPairs, append_targets, target_pairs
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000
 # Queries of all views together where they answer one question, a hand-eye or a scale.
-_TOGETHER = 20_000
+_TOTAL_SAMPLES = 20_000
 # Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
 _GATE_SPACINGS = 1.5
 _GATE_SIGMAS = 4.0
@@ -40,7 +40,7 @@ class Overlaps:
     probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
 
 
-def collect(
+def collect_overlaps(
     capture: Capture,
     poses: Array,
     gate: float,
@@ -56,12 +56,12 @@ def collect(
     Raises:
         NoResultError: no two views overlap.
     """
-    if before is not None and before.probed is not None and _little_moved(before, poses, gate):
+    if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
         pairs, probed = before.pairs, before.probed
     else:
         pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
         probed = np.array(poses), gate
-    matches = list(match(capture.scans, poses, pairs, gate, samples))
+    matches = list(match_pairs(capture.scans, poses, pairs, gate, samples))
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
@@ -70,10 +70,10 @@ def collect(
     centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
     surfaces = gram(matches, len(capture.scans), centre, robust_scale(matches))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
-    return Overlaps(pairs, matches, joined(surfaces, targets, capture.noise_factor), gate, targets, probed)
+    return Overlaps(pairs, matches, append_targets(surfaces, targets, capture.noise_factor), gate, targets, probed)
 
 
-def _little_moved(before: Overlaps, poses: Array, gate: float) -> bool:
+def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
     """Whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
     assert before.probed is not None
     T, probed_gate = before.probed
@@ -91,7 +91,7 @@ def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
     Args:
         most: of one view.
     """
-    return [sample(scan, min(most, _TOGETHER // len(scans))) for scan in scans]
+    return [sample_points(scan, min(most, _TOTAL_SAMPLES // len(scans))) for scan in scans]
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:

@@ -7,9 +7,9 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
-from stitch.observations.surfaces.free_poses import FreePoses, answer
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, solve_views
 from stitch.observations.surfaces.match import Match
-from stitch.observations.surfaces.target_pairs import by_pair
+from stitch.observations.surfaces.target_pairs import sum_by_pair
 from stitch.statistics.robust import tukey
 
 # Correspondences whose slopes are held at a time: some megabytes, whatever the session's size. One block after the
@@ -27,24 +27,24 @@ class PointGram:
     residual: Array  # (P, K) Σ w g e
     square: Array  # (P, K, K) Σ w g gᵀ
 
-    def of(self, keep: slice | Mask) -> "PointGram":
+    def select(self, keep: slice | Mask) -> "PointGram":
         """The sums of some of the parameters."""
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
-    def together(self, apart: int) -> "PointGram":
+    def merge_sides(self, per_view: int) -> "PointGram":
         """Of sums for either view of a pair its own, in so many parameters, those for parameters that all share."""
-        shares = np.vstack([np.eye(apart), np.eye(apart)])
-        rest = self.residual.shape[1] - 2 * apart
-        A = np.block([[shares, np.zeros((2 * apart, rest))], [np.zeros((rest, apart)), np.eye(rest)]])
+        shares = np.vstack([np.eye(per_view), np.eye(per_view)])
+        rest = self.residual.shape[1] - 2 * per_view
+        A = np.block([[shares, np.zeros((2 * per_view, rest))], [np.zeros((rest, per_view)), np.eye(rest)]])
         return PointGram(self.vector @ A, self.residual @ A, A.T @ self.square @ A)
 
 
-def streamed(
-    freed: FreePoses,
+def stream_point_sums(
+    unconstrained: UnconstrainedPoses,
     noise_factor: float,
     of_points: Callable[[int, Indices], Array],
     of_targets: Callable[[], Array],
-    apart: int = 0,
+    per_view: int = 0,
 ) -> PointGram:
     """Stream the pairs once, a block of rows at a time.
 
@@ -52,19 +52,19 @@ def streamed(
         noise_factor: of the capture, by which labelled points count beside the surfaces.
         of_points: (K, N, 3) how far some points of view v move per unit, scanner frame.
         of_targets: (K, V, S, 3) the same for all labelled points.
-        apart: so many of the K are parameters of every view: the sums hold those of the first view of a pair, then
+        per_view: so many of the K are parameters of every view: the sums hold those of the first view of a pair, then
             those of the second, then the others.
     """
-    g = freed.overlaps.gram
+    g = unconstrained.overlaps.gram
 
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
-        own = frames.rotate(frames.inverse(freed.poses[v]), normal)
+        own = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
         return np.asarray(np.einsum("kni,ni->nk", of_points(v, index), own))
 
     def of_block(block: Sequence[tuple[int, Match]]) -> list[tuple[Array, Array, Array]]:
         out, end = [], 0
-        changes = _by_side(_changes([m for _, m in block], slopes), apart)
+        changes = _split_by_view(_distance_changes([m for _, m in block], slopes), per_view)
         for _, m in block:
             start, end = end, end + len(m.residual)
             change, weight = changes[start:end], m.weight * tukey(m.residual, g.scale)
@@ -74,25 +74,28 @@ def streamed(
         return out
 
     sums = dict[int, tuple[Array, ...]]()
-    for block in _blocks(freed.overlaps.matches):
+    for block in _match_blocks(unconstrained.overlaps.matches):
         for (pair, _), more in zip(block, of_block(block), strict=True):
             sums[pair] = tuple(map(np.add, sums[pair], more)) if pair in sums else more
-    every = [*(sums[pair] for pair in sorted(sums)), *_of_targets(freed, noise_factor, of_targets, apart)]
+    every = [
+        *(sums[pair] for pair in sorted(sums)),
+        *_target_pair_sums(unconstrained, noise_factor, of_targets, per_view),
+    ]
     return PointGram(*(np.array([s[i] for s in every]) for i in range(3)))
 
 
-def _by_side(changes: Array, apart: int) -> Array:
+def _split_by_view(changes: Array, per_view: int) -> Array:
     """(…, K + apart) of changes (…, 2, K) that the two views of a pair cause."""
-    own = [changes[..., side, :apart] for side in range(2)] if apart else []
-    return np.concatenate([*own, changes[..., apart:].sum(axis=-2)], axis=-1)
+    own = [changes[..., side, :per_view] for side in range(2)] if per_view else []
+    return np.concatenate([*own, changes[..., per_view:].sum(axis=-2)], axis=-1)
 
 
-def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
+def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
     """Pairs and their numbers, square by square, as many at a time as fill a block; a larger one in parts."""
     block, rows = list[tuple[int, Match]](), 0
     for pair, m in sorted(enumerate(matches), key=lambda item: (item[1].v // _SQUARE, item[1].w // _SQUARE, item[0])):
         for start in range(0, len(m.residual), _BLOCK):
-            part = m.part(slice(start, start + _BLOCK))
+            part = m.subset(slice(start, start + _BLOCK))
             if block and rows + len(part.residual) > _BLOCK:
                 yield block
                 block, rows = [], 0
@@ -102,7 +105,7 @@ def _blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
         yield block
 
 
-def _changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
+def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
     """(N, 2, K) how the distances of all N correspondences of some pairs change by either view; each is asked once."""
     ends = np.cumsum([len(m.residual) for m in matches])
     rows = [np.arange(end - len(m.residual), end) for m, end in zip(matches, ends, strict=True)]
@@ -119,23 +122,23 @@ def _changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], A
     return out
 
 
-def _of_targets(
-    freed: FreePoses, noise_factor: float, of_targets: Callable[[], Array], apart: int
+def _target_pair_sums(
+    unconstrained: UnconstrainedPoses, noise_factor: float, of_targets: Callable[[], Array], per_view: int
 ) -> list[tuple[Array, ...]]:
     """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
-    targets, g = freed.overlaps.targets, freed.overlaps.gram
+    targets, g = unconstrained.overlaps.targets, unconstrained.overlaps.gram
     if targets is None:
         return []
-    moved = np.moveaxis(frames.rotate(freed.poses, of_targets()), 0, -1)  # (V, S, 3, K)
+    moved = np.moveaxis(frames.rotate(unconstrained.poses, of_targets()), 0, -1)  # (V, S, 3, K)
     (v, w), (slot_v, slot_w) = targets.views.T, targets.slots.T
-    change = _by_side(np.stack([moved[v, slot_v], -moved[w, slot_w]], axis=-2), apart)
+    change = _split_by_view(np.stack([moved[v, slot_v], -moved[w, slot_w]], axis=-2), per_view)
     weighted = change * (noise_factor * g.variance * targets.information)[:, None, None]
-    vector = by_pair(targets, np.einsum("nia,nik->nak", targets.lever(g.centre), weighted))[1]
-    residual = by_pair(targets, np.einsum("ni,nik->nk", targets.apart, weighted))[1]
-    square = by_pair(targets, np.einsum("nik,nil->nkl", change, weighted))[1]
+    vector = sum_by_pair(targets, np.einsum("nia,nik->nak", targets.lever(g.centre), weighted))[1]
+    residual = sum_by_pair(targets, np.einsum("ni,nik->nk", targets.difference, weighted))[1]
+    square = sum_by_pair(targets, np.einsum("nik,nil->nkl", change, weighted))[1]
     return list(zip(vector, residual, square, strict=True))
 
 
-def seen_twists(points: PointGram, freed: FreePoses) -> Array:
+def apparent_twists(points: PointGram, unconstrained: UnconstrainedPoses) -> Array:
     """(6V, K) H⁺BᵀWg: what point effects do to poses that overlaps and targets alone determine."""
-    return answer(freed.overlaps.gram, points.vector)
+    return solve_views(unconstrained.overlaps.gram, points.vector)

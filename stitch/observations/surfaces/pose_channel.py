@@ -14,19 +14,19 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.free_poses import FreePoses, visible_directions
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_directions
 from stitch.observations.surfaces.gram import Gram
 from stitch.statistics.least_squares import column_space, summed_squares
-from stitch.statistics.parameter_selection import Whitened
+from stitch.statistics.parameter_selection import WhitenedData
 from stitch.statistics.restricted_likelihood import MixedModel
 from stitch.statistics.variance_components import fit_variances
 
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
-_TOLD = 1e-6
+_OBSERVABLE_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
-class PoseChannel:
+class ReducedPoses:
     """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
 
     reduction: Array  # (n, 6V) from twists of the views to visible directions
@@ -47,12 +47,12 @@ class Repeatability:
     noise_factor: float
 
 
-def jacobian(hand_eye_frames: Array, centre: Array) -> Array:
+def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
     """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
     return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
 
 
-def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> PoseChannel:
+def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> ReducedPoses:
     """Reduce per-view twists to the directions that the overlaps see.
 
     Args:
@@ -65,43 +65,43 @@ def pose_channel(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
     values, vectors, scale = visible_directions(g)
     left = vectors.T / scale[None, :]
     to_centre = frames.make(np.eye(3), -g.centre)
-    response = left @ jacobian(hand_eye_frames, g.centre)
+    response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ T_reference_flange)
-    rotation, translation = (_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
+    rotation, translation = (_unit_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
     expansion = scale[:, None] * vectors
     z, noise = left @ twists.reshape(-1), np.diag(g.variance / values)
-    return PoseChannel(left, expansion, z, response, rotation, translation, noise)
+    return ReducedPoses(left, expansion, z, response, rotation, translation, noise)
 
 
-def _scatter(left: Array, carried: Array) -> Array:
+def _unit_scatter(left: Array, carried: Array) -> Array:
     """Covariance of the visible directions for independent unit twists of every view."""
     blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
     return summed_squares(blocks)
 
 
-def mixed_model(channel: PoseChannel, further: Array | None = None) -> MixedModel:
+def hand_eye_mixed_model(channel: ReducedPoses, further: Array | None = None) -> MixedModel:
     """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
     mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
     components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
-    return MixedModel(channel.z[None], mean_of(mean)[None], components)
+    return MixedModel(channel.z[None], mean_basis(mean)[None], components)
 
 
-def mean_of(columns: Array) -> Array:
+def mean_basis(columns: Array) -> Array:
     """(n, r) orthonormal basis of the mean's columns (n, K), less what the views cannot tell apart."""
-    return column_space(columns, _TOLD)
+    return column_space(columns, _OBSERVABLE_SHARE)
 
 
-def estimate(channel: PoseChannel, further: Array | None = None) -> Repeatability:
+def estimate_repeatability(channel: ReducedPoses, further: Array | None = None) -> Repeatability:
     """REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
-    return scatter_from(fit_variances(mixed_model(channel, further), both_starts=True).variances)
+    return repeatability_from(fit_variances(hand_eye_mixed_model(channel, further), both_starts=True).variances)
 
 
-def scatter_from(variances: Array) -> Repeatability:
+def repeatability_from(variances: Array) -> Repeatability:
     """Standard deviations (rad, length_unit) and noise factor from the three variances (3,)."""
     return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
 
 
-def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
+def pose_covariance(channel: ReducedPoses, scatter: Repeatability) -> Array:
     """(n, n) covariance of the channel's z."""
     return np.asarray(
         scatter.rotation**2 * channel.rotation
@@ -110,9 +110,9 @@ def covariance_of(channel: PoseChannel, scatter: Repeatability) -> Array:
     )
 
 
-def whitened(
-    sessions: Sequence[tuple[Capture, FreePoses, Array]], T_mount: Array, values: Array, free: Mask
-) -> Whitened:
+def whiten_captures(
+    sessions: Sequence[tuple[Capture, UnconstrainedPoses, Array]], T_mount: Array, values: Array, free: Mask
+) -> WhitenedData:
     """All captures of a rig in units of their pose scatter, stacked.
 
     Args:
@@ -122,10 +122,10 @@ def whitened(
     """
     out = []
     for capture, f, extra in sessions:
-        channel = pose_channel(f.overlaps.gram, f.twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
+        channel = reduce_poses(f.overlaps.gram, f.twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
         further = channel.reduction @ extra
-        half = np.linalg.cholesky(covariance_of(channel, estimate(channel, further[:, free])))
+        half = np.linalg.cholesky(pose_covariance(channel, estimate_repeatability(channel, further[:, free])))
         stack = np.column_stack([channel.hand_eye, further, channel.z + further @ values])
         out.append(np.linalg.solve(half, stack))
     everything = np.concatenate(out)
-    return Whitened(everything[:, :6], everything[:, 6:-1], everything[:, -1])
+    return WhitenedData(everything[:, :6], everything[:, 6:-1], everything[:, -1])

@@ -9,8 +9,8 @@ from scipy.linalg import block_diag
 from stitch.frames import Array
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.capture_evidence import CaptureEvidence
-from stitch.observations.surfaces.pose_channel import Repeatability, covariance_of, mean_of
-from stitch.statistics.least_squares import Generalised, generalised
+from stitch.observations.surfaces.pose_channel import Repeatability, mean_basis, pose_covariance
+from stitch.statistics.least_squares import GeneralisedFit, generalised_fit
 from stitch.statistics.restricted_likelihood import MixedModel
 
 
@@ -22,26 +22,26 @@ class RigModel:
     z: Array  # (N,)
     columns: Array  # (N, 6 + P) of hand-eye and effects
 
-    def weighed(self, scatter: Sequence[Repeatability], prior: Array) -> Generalised:
+    def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> GeneralisedFit:
         """Generalised least squares under the scatter of every session alone, with a prior (6 + P, 6 + P)."""
-        noise = [covariance_of(e.channel, s) for e, s in zip(self.parts, scatter, strict=True)]
-        return generalised(block_diag(*noise), self.columns, prior)
+        noise = [pose_covariance(e.reduced_poses, s) for e, s in zip(self.parts, scatter, strict=True)]
+        return generalised_fit(block_diag(*noise), self.columns, prior)
 
     def mixed(self, errors: PoseErrors) -> MixedModel:
         """All sessions as one block: what the arm does wrong it does wrong in all of them."""
-        channels = [e.channel for e in self.parts]
+        channels = [e.reduced_poses for e in self.parts]
         own = zip(*((c.rotation, c.translation, c.noise) for c in channels), strict=True)
         R = block_diag(*(c.reduction for c in channels))
         components = np.array([*(block_diag(*c) for c in own), *(R @ C @ R.T for C in errors.components)])
-        mean = mean_of(self.columns)
+        mean = mean_basis(self.columns)
         return MixedModel(self.z[None], mean[None], components[:, None], further=errors.prior)
 
     def reduce(self, twists: Sequence[Array]) -> Array:
         """(N, K) visible directions of twists (6V, K) of every session."""
-        return np.concatenate([e.channel.reduction @ t for e, t in zip(self.parts, twists, strict=True)])
+        return np.concatenate([e.reduced_poses.reduction @ t for e, t in zip(self.parts, twists, strict=True)])
 
 
-def rig_model(parts: Sequence[CaptureEvidence]) -> RigModel:
+def stack_captures(parts: Sequence[CaptureEvidence]) -> RigModel:
     """All sessions stacked."""
-    columns = [np.column_stack([e.channel.hand_eye, e.channel.reduction @ e.extra]) for e in parts]
-    return RigModel(parts, np.concatenate([e.channel.z for e in parts]), np.concatenate(columns))
+    columns = [np.column_stack([e.reduced_poses.hand_eye, e.reduced_poses.reduction @ e.effect_twists]) for e in parts]
+    return RigModel(parts, np.concatenate([e.reduced_poses.z for e in parts]), np.concatenate(columns))

@@ -6,8 +6,8 @@ import numpy as np
 
 from stitch.frames import Array, Indices
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.response import PointSums, Prior
-from stitch.observations.surfaces.free_poses import FreePoses
+from stitch.observations.response import CoefficientPrior, PointSums
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
 from stitch.observations.surfaces.gram import pair_squares
 from stitch.observations.surfaces.point_gram import PointGram
 from stitch.statistics.least_squares import column_space, fit_columns
@@ -18,17 +18,17 @@ class SurfaceTrial:
     """Columns X (6V, k) of twists; `points` are the sums of the last ones if these change the points themselves."""
 
     linear: LinearModel
-    freed: FreePoses
+    unconstrained: UnconstrainedPoses
     X: Array
     points: PointSums | None = None
-    prior: Prior | None = None
+    prior: CoefficientPrior | None = None
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) by generalised least squares without some views."""
         white, z = self._white(self.X), self.linear.white_z
         if self.prior is not None:
             half = np.sqrt(self.prior.precision)
-            white, z = np.vstack([white, np.diag(half)]), np.append(z, half * self.prior.middle)
+            white, z = np.vstack([white, np.diag(half)]), np.append(z, half * self.prior.mean)
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
             free = self._white(self._twists_of(left_out))
@@ -37,7 +37,7 @@ class SurfaceTrial:
 
     def squares(self, coefficients: Array) -> Array:
         """(pairs,) Σ w e² after the model moved; point effects change e itself and do not move the views."""
-        g, points = self.freed.overlaps.gram, self.points
+        g, points = self.unconstrained.overlaps.gram, self.points
         if not isinstance(points, PointGram):
             return pair_squares(g, self._moved(self.X, coefficients))
         k = points.residual.shape[1]
@@ -56,7 +56,7 @@ class SurfaceTrial:
 
     def influential_views(self, coefficients: Array) -> Indices:
         """(V,) all views."""
-        return np.arange(self.freed.overlaps.gram.views, dtype=np.int64)
+        return np.arange(self.unconstrained.overlaps.gram.views, dtype=np.int64)
 
     def _white(self, response: Array) -> Array:
         return self.linear.whiten(self.linear.reduce(response))
@@ -66,4 +66,4 @@ class SurfaceTrial:
         return np.eye(len(self.X))[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
 
     def _moved(self, X: Array, coefficients: Array) -> Array:
-        return np.asarray((X @ coefficients).reshape(-1, 6) - self.freed.twists)
+        return np.asarray((X @ coefficients).reshape(-1, 6) - self.unconstrained.twists)

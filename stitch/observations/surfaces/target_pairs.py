@@ -28,7 +28,7 @@ class TargetPairs:
     views: Indices  # (N, 2) v < w
     slots: Indices  # (N, 2) of these views
     place: Array  # (N, 3) x̄, weighted mean of all views that see the target
-    apart: Array  # (N, 3) x_v − x_w
+    difference: Array  # (N, 3) x_v − x_w
     information: Array  # (N,) w_v w_w / Σw, 1/length²
 
     def lever(self, centre: Array) -> Array:
@@ -63,7 +63,7 @@ def target_pairs(sightings: Sightings, poses: Array) -> TargetPairs | None:
     return TargetPairs(np.concatenate(views), np.concatenate(slots), *of_pairs)
 
 
-def joined(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
+def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
     """The sums of the surfaces, followed by those of the labelled points in the same unit of variance.
 
     Args:
@@ -75,13 +75,13 @@ def joined(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
     lever = targets.lever(g.centre)
     weight = g.variance * noise_factor * targets.information
     weighted = lever * weight[:, None, None]
-    pairs, matrix = by_pair(targets, np.einsum("nia,nib->nab", weighted, lever))
-    vector = by_pair(targets, np.einsum("nia,ni->na", weighted, targets.apart))[1]
-    square = by_pair(targets, weight * np.einsum("ni,ni->n", targets.apart, targets.apart))[1]
-    return g.followed_by(pairs=pairs, matrix=matrix, vector=vector, square=square)
+    pairs, matrix = sum_by_pair(targets, np.einsum("nia,nib->nab", weighted, lever))
+    vector = sum_by_pair(targets, np.einsum("nia,ni->na", weighted, targets.difference))[1]
+    square = sum_by_pair(targets, weight * np.einsum("ni,ni->n", targets.difference, targets.difference))[1]
+    return g.append(pairs=pairs, matrix=matrix, vector=vector, square=square)
 
 
-def by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:
+def sum_by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:
     """Pairs of views (P, 2), and rows (N, ...) summed over all targets that the two have in common, (P, ...)."""
     pairs, number = np.unique(targets.views, axis=0, return_inverse=True)
     out = np.zeros((len(pairs), *rows.shape[1:]))

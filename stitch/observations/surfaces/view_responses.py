@@ -11,27 +11,29 @@ import numpy as np
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import moves_points
-from stitch.model.jacobian import twists
+from stitch.model.jacobian import pose_derivatives
 from stitch.model.model import Model
 from stitch.model.point_slopes import PointSlopes
 from stitch.model.term import Term
 from stitch.observations.response import Response
-from stitch.observations.surfaces.free_poses import FreePoses
-from stitch.observations.surfaces.point_gram import PointGram, seen_twists, streamed
+from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.point_gram import PointGram, apparent_twists, stream_point_sums
 
 
-def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term], freed: FreePoses) -> list[Response]:
+def view_responses(
+    measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
+) -> list[Response]:
     """Per term the twists (6V, P) of the views, and the sums over pairs of those that change the points."""
     of_points = [term for term in terms if moves_points([term])]
-    sums = _point_gram(measurement, model, of_points, freed) if of_points else None
-    seen = seen_twists(sums, freed) if sums else None
+    sums = _point_effect_sums(measurement, model, of_points, unconstrained) if of_points else None
+    seen = apparent_twists(sums, unconstrained) if sums else None
     of_views = [term for term in terms if not moves_points([term])]
-    moved = twists(measurement, model, of_views, freed.overlaps.gram.centre)
+    moved = pose_derivatives(measurement, model, of_views, unconstrained.overlaps.gram.centre)
     out, at = [], 0
     for term in terms:
         if sums is not None and seen is not None and moves_points([term]):
             own = slice(at, at + len(term.parameters))
-            out.append(Response(seen[:, own], sums.of(own)))
+            out.append(Response(seen[:, own], sums.select(own)))
             at = own.stop
         else:
             found = next(moved)
@@ -39,21 +41,23 @@ def view_responses(measurement: Measurement, model: Model, terms: Sequence[Term]
     return out
 
 
-def view_columns(measurement: Measurement, model: Model, freed: FreePoses) -> Array:
+def view_columns(measurement: Measurement, model: Model, unconstrained: UnconstrainedPoses) -> Array:
     """(6V, P) twists of the views for all parameters of the effects in use."""
-    found = [r.columns for r in view_responses(measurement, model, model.terms, freed)]
-    return np.hstack([np.zeros((6 * len(freed.poses), 0)), *found])
+    found = [r.columns for r in view_responses(measurement, model, model.terms, unconstrained)]
+    return np.hstack([np.zeros((6 * len(unconstrained.poses), 0)), *found])
 
 
-def _point_gram(measurement: Measurement, model: Model, terms: Sequence[Term], freed: FreePoses) -> PointGram:
+def _point_effect_sums(
+    measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
+) -> PointGram:
     """Sums over the correspondences for all parameters of point effects."""
 
-    slopes = PointSlopes.of(measurement, model, terms)
+    slopes = PointSlopes.about_model(measurement, model, terms)
 
     def of_points(v: int, index: Indices) -> Array:
-        return slopes.at(v, freed.poses[v], index)
+        return slopes.at(v, unconstrained.poses[v], index)
 
     def of_targets() -> Array:
-        return slopes.at_targets(freed.poses)
+        return slopes.at_targets(unconstrained.poses)
 
-    return streamed(freed, measurement.capture.noise_factor, of_points, of_targets)
+    return stream_point_sums(unconstrained, measurement.capture.noise_factor, of_points, of_targets)

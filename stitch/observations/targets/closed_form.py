@@ -18,7 +18,7 @@ _REWEIGHTED = 12
 _DEGENERATE = 1e-6
 
 
-def closed_form(capture: Capture) -> Array:
+def closed_form_hand_eye(capture: Capture) -> Array:
     """T_mount_sensor (4, 4) of a capture with sightings.
 
     Raises:
@@ -32,12 +32,12 @@ def closed_form(capture: Capture) -> Array:
     L, p, target = capture.T_reference_mount[v], s.points[v, slot], s.target[v, slot]
     scale = float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()) or 1.0
     offset = p.mean(axis=0)
-    R = _solve(L, (p - offset) / scale, target, len(s.targets), None)
-    t = _solve(L, p - offset, target, len(s.targets), R)[:, 0]
+    R = _solve_rotation_translation(L, (p - offset) / scale, target, len(s.targets), None)
+    t = _solve_rotation_translation(L, p - offset, target, len(s.targets), R)[:, 0]
     return frames.make(R, t - R @ offset)
 
 
-def _solve(L: Array, p: Array, target: Indices, targets: int, R: Array | None) -> Array:
+def _solve_rotation_translation(L: Array, p: Array, target: Indices, targets: int, R: Array | None) -> Array:
     """The rotation (3, 3) from all unknowns, or the translation (3, 1) with the rotation known.
 
     Args:

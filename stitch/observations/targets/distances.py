@@ -6,10 +6,10 @@ from stitch.frames import Array
 from stitch.measurement.sightings import Sightings
 
 # More targets hold each other, so that a wrong one pulls little; to compare all their pairs takes minutes.
-MANY = 24
+COMPARED_TARGETS = 24
 
 
-def places_of(sightings: Sightings) -> Array:
+def target_positions(sightings: Sightings) -> Array:
     """(V, K, 3) targets in the frame of the sensor, NaN where a view does not show one."""
     places = np.full((len(sightings.target), len(sightings.targets), 3), np.nan)
     view, slot = np.nonzero(sightings.used)
@@ -17,7 +17,7 @@ def places_of(sightings: Sightings) -> Array:
     return places
 
 
-def distances(places: Array) -> Array:
+def target_distances(places: Array) -> Array:
     """(V, K, K) between targets, NaN where a view does not show both."""
     return np.asarray(np.linalg.norm(places[:, :, None] - places[:, None], axis=3))
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
-from stitch.measurement.labelled_points import Nominal
+from stitch.measurement.labelled_points import NominalTargets
 from stitch.measurement.sightings import Sightings
 
 
@@ -35,7 +35,7 @@ class Landmarks:
         """Number of unknowns."""
         return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
 
-    def moved(self, by: Array) -> "Landmarks":
+    def updated(self, by: Array) -> "Landmarks":
         """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing."""
         split = self.positions.size
         orientation, T, at = self.orientation, self.T_reference_part, split
@@ -49,7 +49,7 @@ class Landmarks:
         )
 
 
-def drawing_of(nominal: Nominal | None, sightings: Sightings) -> Drawing | None:
+def drawing_of(nominal: NominalTargets | None, sightings: Sightings) -> Drawing | None:
     """The drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
     if nominal is None:
         return None
@@ -82,11 +82,11 @@ def initial_landmarks(own: Capture, T_mount: Array, drawing: Drawing | None = No
         # The middle of the turns against a first guess: medians of matrices lean.
         off = Rotation.from_matrix(turned @ first.T).as_rotvec()
         orientation = Rotation.from_rotvec(np.median(off, axis=0)).as_matrix() @ first
-    T = None if drawing is None else best_fit(drawing.points, positions[drawing.target])
+    T = None if drawing is None else fit_rigid_motion(drawing.points, positions[drawing.target])
     return Landmarks(positions, orientation, drawing, T)
 
 
-def best_fit(points: Array, targets: Array) -> Array:
+def fit_rigid_motion(points: Array, targets: Array) -> Array:
     """(4, 4) the rigid motion that brings points (N, 3) closest to targets (N, 3), least squares (Kabsch 1976)."""
     known = np.isfinite(targets).all(axis=1)
     a, b = points[known], targets[known]

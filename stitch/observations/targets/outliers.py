@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.frames import Array, Indices, Mask
-from stitch.observations.targets.rows import Rows, mixed_model_of_rows
+from stitch.observations.targets.rows import TargetRows, mixed_model_of_rows
 
 # Six times the usual deviation: one in a thousand million of honest Gaussian errors. Pose errors of an arm whose
 # model lacks something have longer tails: six times the median happens.
@@ -30,7 +30,7 @@ class Outlier:
     times: float  # the deviation over what is usual here
 
 
-def find_outliers(rows: Rows, variances: Array) -> list[Outlier]:
+def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
     """The worst of every view that is off, one target at a time, under a fitted model.
 
     Args:
@@ -75,7 +75,7 @@ def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
     return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
 
 
-def outside(used: Mask, found: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
+def mask_outliers(used: Mask, found: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
     """(V, S) bool: what is in use without the outliers."""
     used = used.copy()
     for o in found:

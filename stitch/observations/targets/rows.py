@@ -19,7 +19,7 @@ from stitch.statistics.restricted_likelihood import MixedModel
 
 
 @dataclass(frozen=True)
-class Rows:
+class TargetRows:
     """V views, B ≥ V blocks of m rows; U unknowns of the landmarks."""
 
     capture: Capture  # without the effects in use
@@ -50,7 +50,7 @@ class Rows:
         away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
         return float(max(np.median(away), 1e-9))
 
-    def by_twists(self, moved: Array) -> Array:
+    def from_twists(self, moved: Array) -> Array:
         """(B, m, P) of left twists (6V, P) of the views about the centre."""
         out = np.zeros((*self.residual.shape, moved.shape[1]))
         out[: len(self.lever)] = self.lever @ moved.reshape(-1, 6, moved.shape[1])
@@ -63,7 +63,7 @@ class Rows:
         return np.where(self.used[:, : self.positions : 3], d, np.nan)
 
 
-def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
+def target_rows(own: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRows:
     """Linearise labelled points about hand-eye and landmarks.
 
     Args:
@@ -73,16 +73,16 @@ def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
     assert s is not None
     poses = own.poses(T_mount)
     centre = np.asarray(frames.transform(poses, s.points)[s.used].mean(axis=0))
-    parts = [_coordinates(s, poses, centre, landmarks)]
+    parts = [_coordinate_rows(s, poses, centre, landmarks)]
     if s.rotation is not None:
-        parts.append(_turns(s, poses, landmarks))
+        parts.append(_orientation_rows(s, poses, landmarks))
     left, noise, lever, columns = (np.concatenate(blocks, axis=1) for blocks in zip(*parts, strict=True))
     absent = noise == 0
     left[absent], lever[absent], columns[absent] = 0.0, 0.0, 0.0
-    of_drawing, moved_in_drawing, known = _drawn(landmarks, left.shape[1])
+    of_drawing, moved_in_drawing, known = _drawing_rows(landmarks, left.shape[1])
     nothing = np.zeros_like(of_drawing)
     hand_eye = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
-    return Rows(
+    return TargetRows(
         capture=own,
         T_mount=T_mount,
         centre=centre,
@@ -96,7 +96,9 @@ def rows_of(own: Capture, T_mount: Array, landmarks: Landmarks) -> Rows:
     )
 
 
-def _coordinates(s: Sightings, poses: Array, centre: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
+def _coordinate_rows(
+    s: Sightings, poses: Array, centre: Array, landmarks: Landmarks
+) -> tuple[Array, Array, Array, Array]:
     """What is left (V, 3S), its variance, (V, 3S, 6) per twist of the view and (V, 3S, U) per landmark."""
     V, S = s.used.shape
     known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
@@ -113,7 +115,7 @@ def _coordinates(s: Sightings, poses: Array, centre: Array, landmarks: Landmarks
     return left, noise, lever, columns
 
 
-def _turns(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
+def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
     """The same of the three rows (rad) of a probe's turn; zeros where nobody knows how it is held."""
     V, at = len(poses), landmarks.positions.size
     left, noise, lever, columns = (np.zeros((V, 3, *more)) for more in ((), (), (6,), (landmarks.size,)))
@@ -126,7 +128,7 @@ def _turns(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Arr
     return left, noise, lever, columns
 
 
-def _drawn(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
+def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
     """Of D nominal targets less their places in the drawing: what is left (D, m), (D, m, U) per landmark, and the
     variance (D, m) that is known; three rows each, the others absent."""
     count = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
@@ -142,7 +144,7 @@ def _drawn(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
     return left, columns, fixed
 
 
-def mixed_model_of_rows(rows: Rows, A: Array) -> MixedModel:
+def mixed_model_of_rows(rows: TargetRows, A: Array) -> MixedModel:
     """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
     V, (B, m) = len(rows.lever), rows.residual.shape
     to_centre = frames.make(np.eye(3), -rows.centre)

@@ -7,11 +7,11 @@ import numpy as np
 from stitch.frames import Array
 from stitch.model.model import Model
 from stitch.observations.targets.landmarks import Landmarks
-from stitch.observations.targets.rows import Rows
+from stitch.observations.targets.rows import TargetRows
 
 
 @dataclass(frozen=True)
-class TargetFit:
+class TargetModelFit:
     """Model, places of the targets and scatter of the poses; lengths in length_unit, angles in rad."""
 
     model: Model
@@ -19,7 +19,7 @@ class TargetFit:
     landmarks: Landmarks
     landmarks_covariance: Array  # (U, U)
     variances: Array  # (3,) of rotation scatter, translation scatter, factor on the sensor's noise
-    rows: Rows  # at the solution
+    rows: TargetRows  # at the solution
     heldout: Array  # (V, S) distances of targets predicted without their own views; NaN where none was seen
     history: tuple[float, ...]  # 3D rms per iteration
 
@@ -43,7 +43,9 @@ class TargetFit:
     def target_rms(self) -> Array:
         """(K,) rms distance of the views from every target; NaN for one that nobody sees."""
         s, distances = self.rows.sightings, self.rows.distances(self.rows.residual)
-        return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.seen)])
+        return np.array(
+            [rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.view_counts)]
+        )
 
     @property
     def view_squares(self) -> Array:
@@ -53,16 +55,16 @@ class TargetFit:
         return np.where(seen > 0, np.nansum(distances**2, axis=1) / np.maximum(seen, 1), np.nan)
 
     @property
-    def alone(self) -> tuple[str, ...]:
+    def single_view_targets(self) -> tuple[str, ...]:
         """Targets that say nothing of the poses: fewer than two views show them, and no other run knows them."""
         s = self.rows.sightings
-        few = [name for name, n in zip(s.targets, s.seen, strict=True) if n < 2]
+        few = [name for name, n in zip(s.targets, s.view_counts, strict=True) if n < 2]
         return tuple(name for name in few if name not in self.model.targets)
 
     @property
-    def shows_nothing(self) -> bool:
+    def uninformative(self) -> bool:
         """True if no target says anything of the poses."""
-        return len(self.alone) == len(self.rows.sightings.targets)
+        return len(self.single_view_targets) == len(self.rows.sightings.targets)
 
     @property
     def landmark_sigmas(self) -> Array:

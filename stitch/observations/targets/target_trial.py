@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 
 from stitch.frames import Array, Indices
-from stitch.observations.response import Prior
-from stitch.observations.targets.rows import Rows
-from stitch.statistics.block_least_squares import Blocks
+from stitch.observations.response import CoefficientPrior
+from stitch.observations.targets.rows import TargetRows
+from stitch.statistics.block_least_squares import BlockLeastSquares
 
 # Views of largest influence on the estimates: if one alone carries them, it is among these.
 _CARRIERS = 20
@@ -18,16 +18,16 @@ _CARRIERS = 20
 class TargetTrial:
     """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
 
-    rows: Rows
+    rows: TargetRows
     covariance: Array  # (B, m, m)
     X: Array
-    prior: Prior | None = None
+    prior: CoefficientPrior | None = None
 
     @cached_property
-    def blocks(self) -> Blocks:
+    def blocks(self) -> BlockLeastSquares:
         zero = np.zeros(self.X.shape[2])
-        precision, middle = (zero, zero) if self.prior is None else (self.prior.precision, self.prior.middle)
-        return Blocks(-self.rows.residual, self.X, self.covariance, precision, precision * middle)
+        precision, middle = (zero, zero) if self.prior is None else (self.prior.precision, self.prior.mean)
+        return BlockLeastSquares(-self.rows.residual, self.X, self.covariance, precision, precision * middle)
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) without some views."""
@@ -47,6 +47,6 @@ class TargetTrial:
         """(n,) the views without which the coefficients would move most, to first order."""
         b = self.blocks
         inverse = np.linalg.pinv(b.information * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
-        moves = b.pulls(coefficients) * b.scale @ inverse
+        moves = b.residual_vectors(coefficients) * b.scale @ inverse
         sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
         return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)

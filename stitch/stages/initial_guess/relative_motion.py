@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.closed_form import feature_matching
-from stitch.closed_form.axxb import SOLVERS
+from stitch.closed_form.axxb import AXXB_SOLVERS
 from stitch.closed_form.feature_matching import FeaturedSurface
 from stitch.errors import NoResultError
 from stitch.frames import Array
@@ -35,13 +35,13 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
     for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
         robot, scanner = [], []
         for capture in captures:
-            A, B = consistent(*motions(capture))
+            A, B = consistent_motions(*motions(capture))
             robot.append(A)
             scanner.append(B)
         A, B = np.concatenate(robot), np.concatenate(scanner)
         if len(A) < _MINIMUM_MOTIONS:
             continue
-        for name, solver in SOLVERS.items():
+        for name, solver in AXXB_SOLVERS.items():
             try:
                 T_mount = solver(A, B)
             except (NoResultError, np.linalg.LinAlgError):
@@ -57,7 +57,7 @@ def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
     return np.array([frames.inverse(T[v]) @ T[w] for v, w in pairs]).reshape(-1, 4, 4)
 
 
-def consistent(A: Array, B: Array) -> tuple[Array, Array]:
+def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
     """The motions whose rotation angles agree."""
     if not len(A):
         return A, B
@@ -71,15 +71,17 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
     size = _FEATURE_SPACINGS * capture.spacing
 
     def described(scan: Scan) -> FeaturedSurface:
-        points, normals = feature_matching.thin(scan.points, scan.normals, max(size / 2, _even_size(scan.points)))
-        return feature_matching.describe(points, normals, 2.5 * size)
+        points, normals = feature_matching.voxel_downsample(
+            scan.points, scan.normals, max(size / 2, _even_grid_size(scan.points))
+        )
+        return feature_matching.compute_fpfh(points, normals, 2.5 * size)
 
     surfaces = list(parallel(described, capture.scans))
 
     def motion(pair: tuple[int, int]) -> Array:
         target, source = (surfaces[v] for v in pair)
-        T = feature_matching.register(source, target, reach=1.5 * size, draws=_DRAWS)
-        return feature_matching.align(source, target, T, reach=size)
+        T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
+        return feature_matching.align_icp(source, target, T, reach=size)
 
     pairs = _neighbours(len(capture.scans))
     return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
@@ -90,7 +92,7 @@ def _neighbours(views: int) -> list[tuple[int, int]]:
     return steps if views > 2 else [(0, 1)]
 
 
-def _even_size(points: Array) -> float:
+def _even_grid_size(points: Array) -> float:
     """Grid size that leaves about `_POINTS` points of a surface."""
     extent = np.ptp(points, axis=0)
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
@@ -115,17 +117,17 @@ def sequence_motions(capture: Capture) -> tuple[Array, Array]:
     B = []
     for v, w in pairs:
         voxel_map = get_voxel_hash_map(config)
-        voxel_map.add_points(_thinned(capture.scans[v].points))
+        voxel_map.add_points(_thin_points(capture.scans[v].points))
         start = np.eye(4)
         start[:3, 3] = capture.scans[v].points.mean(axis=0) - capture.scans[w].points.mean(axis=0)
         B.append(
             get_registration(config).align_points_to_map(
-                _thinned(capture.scans[w].points), voxel_map, start, 0.2 * size, (0.03 * size) ** 2
+                _thin_points(capture.scans[w].points), voxel_map, start, 0.2 * size, (0.03 * size) ** 2
             )
         )
     return robot_motions(capture, pairs), np.array(B).reshape(-1, 4, 4)
 
 
-def _thinned(points: Array) -> Array:
+def _thin_points(points: Array) -> Array:
     step = max(1, len(points) // _POINTS)
     return np.ascontiguousarray(points[::step])

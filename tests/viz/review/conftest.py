@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stitch.comparison.compare_surfaces import compare
+from stitch.comparison.compare_surfaces import compare_surfaces
 from stitch.comparison.tables import comparison_document
 from stitch.stored.load_state import load_state
 from stitch.writing.json_file import write_json
@@ -94,7 +94,7 @@ def served(run, *options):
 
 def compare_without_picture(run):
     """compare.json as `stitch compare` writes it."""
-    write_json(comparison_document(compare(load_state(run))), run / "compare.json")
+    write_json(comparison_document(compare_surfaces(load_state(run))), run / "compare.json")
 
 
 @pytest.fixture(scope="package")
